@@ -1,7 +1,6 @@
 """The referee of interceptions, on plans worked out by hand: no planner has a part in this."""
 
 import math
-from dataclasses import fields
 from types import SimpleNamespace
 
 import jax
@@ -9,21 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
+from referees import checks, tree
 from scipy.integrate import solve_ivp
 
-from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import LaterPath, PointState, PolynomialPath, TurningPath
 from planner_jax.referee.clearance import clearances
 from planner_jax.referee.intercept import (
-    LIMITS,
     InterceptVerdict,
     referee_intercepts,
     target_positions_of,
 )
-from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.intercept.api import by_own_class
-from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.plan import InterceptPlan
 
 LENGTH, WIDTH, WHEELBASE, REAR = 0.4, 0.25, 0.3, 0.05
 MIDDLE, FRONT = 0.5 * LENGTH - REAR, LENGTH - REAR  # ahead of the rear axle
@@ -92,38 +87,12 @@ def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(),
     return leaves
 
 
-def tree(leaves, root=""):
-    """The object whose fields are the leaves named `root<field>`, and so on inwards."""
-    inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
-    parts = {k.split(".")[0] for k in inside if "." in k}
-    plain = {k: v for k, v in inside.items() if "." not in k}
-    return SimpleNamespace(**plain, **{part: tree(inside, f"{part}.") for part in parts})
-
-
 def judge(leaves, **options) -> InterceptVerdict:
     case = tree(leaves)
     return referee_intercepts(case, case.plan, **options)
 
 
-def stack(*cases):
-    return {name: np.concatenate([case[name] for case in cases]) for name in cases[0]}
-
-
-def assert_good(leaves, **options):
-    verdict = judge(leaves, **options)
-    assert verdict.success[0], verdict.sentence(0)
-    return verdict
-
-
-def assert_fails(leaves, name, *, excess=None, time=None, says="", **options):
-    verdict = judge(leaves, **options)
-    assert not verdict.success[0] and verdict.failed_limit[0] == name, verdict.sentence(0)
-    assert verdict.sentence(0).startswith(f"{name}: ") and says in verdict.sentence(0)
-    if excess is not None:
-        assert verdict.failed_excess[0] == pytest.approx(excess, rel=1e-6, abs=1e-9)
-    if time is not None:
-        assert verdict.failed_time[0] == pytest.approx(time, abs=1e-9)
-    return verdict
+assert_good, assert_fails = checks(judge)
 
 
 def test_a_straight_drive_meets_its_target():
@@ -424,112 +393,33 @@ def unequal_lanes():
     ]
 
 
-def assert_same(a: InterceptVerdict, b: InterceptVerdict, lanes=slice(None)):
-    for name, left in vars(a).items():
-        np.testing.assert_array_equal(left[lanes], getattr(b, name)[lanes], err_msg=name)
+# What `test_referees` judges, and how.
+FAILED = ["", "wall", "mover", "meeting", "time", ""]
+UNKNOWN = ("miss",)
+ABSURD = ("plan.speed", "plan.curvature", "plan.time", "plan.start", "target.vel", "walls.centre")
+AWAY = "walls.centre"
+WRONG = [
+    ({}, {"step": 0.05}, "step must be > 0 and <= 0.02, got 0.05"),
+    ({}, {"step": 0.0}, "step must be > 0 and <= 0.02, got 0.0"),
+    ({"plan.speed": np.zeros(4)}, {}, r"plan.speed must be \(B, K \+ 1\), K >= 1, got \(4,\)"),
+    ({"plan.curvature": np.zeros((1, 4))}, {}, r"plan.curvature must be \(1, 11\)"),
+    ({"limits.speed": np.array(1.0)}, {}, r"limits.speed must be \(1,\), got \(\)"),
+    ({"walls.corners": np.zeros((1, 3, 2))}, {}, r"walls.corners must be \(1, N, V >= 3, 2\)"),
+    ({"movers.present": np.ones((1, 2))}, {}, r"movers.present must be \(1, 3\), got \(1, 2\)"),
+    ({"target.vel": np.zeros(2)}, {}, r"target.vel must be \(1, 2\), got \(2,\)"),
+]
 
 
-@pytest.mark.parametrize("chunk", [1, 4, 512])
-def test_batch_equals_loop(chunk):
-    lanes = unequal_lanes()
-    batch = judge(stack(*lanes), chunk=chunk)
-    for i, lane in enumerate(lanes):
-        own = {k: v[i : i + 1] for k, v in vars(batch).items()}
-        assert_same(judge(lane), InterceptVerdict(**own))
-    names = ["", "wall", "mover", "meeting", "time", ""]
-    np.testing.assert_array_equal(batch.failed_limit, names)
-
-
-FLOATS = sorted(name for name, leaf in good().items() if leaf.dtype.kind == "f")
-
-
-@pytest.mark.parametrize("name", FLOATS)
-def test_a_nan_fails_its_own_lane_and_no_other(name):
-    leaves = stack(*unequal_lanes())
-    clean = judge(leaves)
-    leaves[name][(0,) + (0,) * (leaves[name].ndim - 1)] = np.nan  # the good one's
-    verdict = judge(leaves)
-    assert not verdict.success[0] and verdict.failed_limit[0] == "not finite"
-    assert verdict.sentence(0) == "not finite: the plan or its case is not finite"
-    assert np.isnan(verdict.miss[0]) and verdict.nearest_wall[0] == -1
-    assert_same(clean, verdict, lanes=slice(1, None))
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["plan.speed", "plan.curvature", "plan.time", "plan.start", "target.vel", "walls.centre"],
-)
-@pytest.mark.parametrize("value", [1e300, -1e30, np.inf])
-def test_absurd_numbers_fail_without_a_warning(name, value):
-    leaves = good(walls=[square(6.0, 1.0, 0.3)])
-    leaves[name] = np.full_like(leaves[name], value)
-    assert judge(leaves).success[0] == (name == "walls.centre" and np.isfinite(value))
-
-
-def test_float32_structs_of_the_planner_are_taken_as_they_are():
-    leaves = stack(*unequal_lanes()[:2])
-    leaves = {
-        k: jnp.asarray(leaf, None if leaf.dtype == bool else jnp.float32)
-        for k, leaf in leaves.items()
-    }
-    plain, blank = tree(leaves), np.full(2, np.nan)  # what the plan claims is not read
-    parts = {
-        "target": TurningPath(**vars(plain.target)),
-        "walls": Obstacles(**vars(plain.walls)),
-        "movers": Obstacles(**vars(plain.movers)),
-        "body": CarBody(**vars(plain.body)),
-        "limits": CarLimits(**vars(plain.limits)),
-    }
-    own = {k: leaf for k, leaf in vars(plain).items() if k != "plan"}
-    case = InterceptCase(**own | parts)
-    claims = dict.fromkeys(("cost", "violation", "iterations", "status", "meeting"), blank)
-    plan = InterceptPlan(**vars(plain.plan), **claims)
-    verdict = referee_intercepts(case, plan)
-    np.testing.assert_array_equal(verdict.failed_limit, ["", "wall"])
-    assert verdict.miss.dtype == np.float64
-    truth = PolynomialPath(
-        coeffs=jnp.stack([plain.target.pos, plain.target.vel], axis=1), origin=jnp.zeros(2)
-    )
-    np.testing.assert_allclose(referee_intercepts(case, plan, truth=truth).miss, 0.0, atol=1e-5)
-
-
-def test_an_empty_batch_has_an_empty_verdict():
-    verdict = judge({name: leaf[:0] for name, leaf in good().items()})
-    assert verdict.success.shape == verdict.miss.shape == (0,)
+def test_a_broken_plan_has_no_nearest_wall():
+    leaves = unequal_lanes()[0]
+    leaves["plan.time"][:] = np.nan
+    assert judge(leaves).nearest_wall[0] == -1
 
 
 def test_there_may_be_no_room_for_obstacles():
     leaves = good()
     leaves |= {f"walls.{k}": leaf for k, leaf in group(room=(0, 4)).items()}
     assert np.isposinf(assert_good(leaves).wall_clearance[0])
-
-
-@pytest.mark.parametrize(
-    ("changes", "options", "says"),
-    [
-        ({}, {"step": 0.05}, r"step must be > 0 and <= 0.02, got 0.05"),
-        ({}, {"step": 0.0}, r"step must be > 0 and <= 0.02, got 0.0"),
-        ({}, {"chunk": 0}, r"chunk must be >= 1, got 0"),
-        ({"plan.speed": np.zeros(4)}, {}, r"plan.speed must be \(B, K \+ 1\), K >= 1, got \(4,\)"),
-        ({"plan.curvature": np.zeros((1, 4))}, {}, r"plan.curvature must be \(1, 11\)"),
-        ({"limits.speed": np.array(1.0)}, {}, r"limits.speed must be \(1,\), got \(\)"),
-        ({"walls.corners": np.zeros((1, 3, 2))}, {}, r"walls.corners must be \(1, N, V >= 3, 2\)"),
-        ({"movers.present": np.ones((1, 2))}, {}, r"movers.present must be \(1, 3\), got \(1, 2\)"),
-        ({"target.vel": np.zeros(2)}, {}, r"target.vel must be \(1, 2\), got \(2,\)"),
-    ],
-)  # fmt: skip
-def test_wrong_arguments_are_named(changes, options, says):
-    with pytest.raises(ValueError, match=says) as caught:
-        judge(good() | changes, **options)
-    assert "\n" not in str(caught.value)
-
-
-def test_every_limit_has_its_sentence():
-    lanes = len(LIMITS)
-    blank = {field.name: np.zeros(lanes) for field in fields(InterceptVerdict)}
-    verdict = InterceptVerdict(**blank | {"failed_limit": np.array(LIMITS)})
-    for lane, name in enumerate(LIMITS):
-        assert verdict.sentence(lane).startswith(f"{name}: ")
 
 
 def test_referee_and_planner_agree_where_a_target_is():

@@ -1,0 +1,65 @@
+"""What the tests of all referees share: leaves by name, batches of them, and verdicts compared."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+
+def tree(leaves, root="", **optional):
+    """Return the object whose fields are the leaves named `root<field>`, and so on inwards."""
+    inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
+    parts = {k.split(".")[0] for k in inside if "." in k}
+    plain = {k: v for k, v in inside.items() if "." not in k}
+    nested = {part: tree(inside, f"{part}.") for part in parts}
+    return SimpleNamespace(**optional | plain | nested)
+
+
+def flight(leaves, **optional):
+    """Return the case and plan of a quadrotor from leaves; `optional` are fields of the case."""
+    case = tree(leaves, extras=(), **optional)
+    limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors"))
+    case.limits = SimpleNamespace(**limits | vars(case.limits))
+    case.trajectory = SimpleNamespace(coeffs=case.coeffs, durations=case.durations)
+    case.recovery = None
+    return case
+
+
+def stack(*lanes):
+    return {name: np.concatenate([lane[name] for lane in lanes]) for name in lanes[0]}
+
+
+def rows(verdict, lanes=slice(None)):
+    return {name: value[lanes] for name, value in vars(verdict).items()}
+
+
+def assert_same(left, right):
+    """Compare two verdicts' fields by name: numbers to rounding, everything else exactly."""
+    for name, value in left.items():
+        if value.dtype.kind == "f":
+            np.testing.assert_allclose(value, right[name], rtol=1e-12, atol=1e-12, err_msg=name)
+        else:
+            np.testing.assert_array_equal(value, right[name], err_msg=name)
+
+
+def checks(judge):
+    """Return `assert_good` and `assert_fails`, which judge the first of some plans."""
+
+    def assert_good(leaves, **options):
+        verdict = judge(leaves, **options)
+        assert verdict.success[0], verdict.sentence(0)
+        return verdict
+
+    def assert_fails(
+        leaves, name, *, excess=None, time=None, rel=1e-6, apart=1e-9, says="", **options
+    ):
+        verdict = judge(leaves, **options)
+        assert not verdict.success[0] and verdict.failed_limit[0] == name, verdict.sentence(0)
+        assert verdict.sentence(0).startswith(f"{name}: ") and says in verdict.sentence(0)
+        if excess is not None:
+            assert verdict.failed_excess[0] == pytest.approx(excess, rel=rel, abs=1e-9)
+        if time is not None:
+            assert verdict.failed_time[0] == pytest.approx(time, abs=apart)
+        return verdict
+
+    return assert_good, assert_fails
