@@ -10,7 +10,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.core.plan_files import named_leaves
+from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.referee.arm_clearance import KINDS
 from planner_jax.referee.arm_clearance import clearances as referee_clearances
@@ -155,7 +155,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     case = dataclasses.replace(case, scene=dataclasses.replace(case.scene, **moved))
     each = jax.jit(jax.vmap(lambda case: clearances(case.arm, case.scene, case.angles[None])[:, 0]))
     least = each(case).min(axis=1)
-    leaves = {name: np.asarray(leaf, float) for name, leaf in named_leaves(case).items()}
+    leaves = {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(case).items()}
     angles = np.asarray(case.angles, float).T[:, :, None]
     kinds = referee_clearances(leaves, arm.capsule_link, angles, np.ones((num, 1), bool))
     distances = np.array([kinds[kind][0] for kind in KINDS])

@@ -255,4 +255,4 @@ def test_an_error_is_the_same_in_another_process(error):
     assert vars(copied).keys() == vars(error).keys()
     if isinstance(error, (errors.ArgumentError, errors.MissingExtra)):
         name = {getattr(error, "feature", error.name): "--other"}
-        assert str(copied.renamed(name)) == str(error.renamed(name))
+        assert str(copied.with_names(name)) == str(error.with_names(name))

@@ -37,7 +37,7 @@ def fail(
     `flags` are the options of the command by the names of their arguments.
     """
     if isinstance(error, ArgumentError | MissingExtra):
-        error = error.renamed(flags or {})
+        error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
     return code
 

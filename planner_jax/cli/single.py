@@ -120,7 +120,7 @@ def _export(given: Options) -> None:
         else:
             told = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
     except PlanFileError as error:
-        raise error.renamed({"path": "RUN"}) from None
+        raise error.with_names({"path": "RUN"}) from None
     if against:
         print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
     if lacks:

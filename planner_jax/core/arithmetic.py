@@ -1,7 +1,7 @@
-"""Arithmetic in the forms that compile to few loops on a CPU.
+"""Arithmetic written so that XLA compiles it to few loops on a CPU.
 
-XLA compiles a division, a root or a sum into a loop of its own, and one small problem waits
-for the number of loops, not for what they compute.
+XLA compiles each division, root or sum to a loop of its own. The time of one small problem depends
+on the number of loops, not on what they compute.
 """
 
 from types import ModuleType
@@ -14,9 +14,9 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array that is a leaf of a case or plan, typed as its other leaves.
+    """Return a value as a NumPy array, typed as a leaf of a case or plan.
 
-    Leaves are jax arrays inside compiled programs and may be NumPy arrays outside.
+    Such leaves are jax arrays inside compiled programs and may be NumPy arrays outside.
     """
     return np.asarray(value, dtype)  # type: ignore[return-value]
 
@@ -31,7 +31,7 @@ def numpy_of(*arrays: object) -> ModuleType:
 
 @jax.custom_jvp
 def reciprocal(x: Array) -> Array:
-    """1 / x for x (...) other than zero."""
+    """Return 1 / x for x (...) != 0."""
     return 1.0 / x
 
 
@@ -43,7 +43,7 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
 
 @jax.custom_jvp
 def inverse_sqrt(x: Array) -> Array:
-    """1 / sqrt(x) for x (...) > 0."""
+    """Return 1 / sqrt(x) for x (...) > 0."""
     return lax.rsqrt(jnp.asarray(x))
 
 
@@ -54,9 +54,9 @@ def _inverse_sqrt_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
 
 
 def at_least(x: Array, floor: float) -> Array:
-    """The larger of x (...) and a constant; at a tie the slope is one.
+    """Return max(x, floor) with slope 1 where x == floor.
 
-    The slope of `jnp.maximum` divides by the number of arguments that tie.
+    The slope of `jnp.maximum` is 1/2 there.
     """
     return jnp.where(x < floor, floor, x)
 
@@ -65,9 +65,9 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 
 
 def components(x: Components) -> list[Array]:
-    """The n components of vectors (..., n), each (...); a tuple of them is what it is.
+    """Return the n components (...) of vectors (..., n), or the entries of a tuple.
 
-    As one split, whose derivative is one concatenation and not n paddings to be added.
+    They come from one split, whose derivative is one concatenation instead of n paddings.
     """
     if isinstance(x, tuple):
         return [*x]

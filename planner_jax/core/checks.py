@@ -1,7 +1,7 @@
 """Checks of single arguments: numbers, switches, arrays, paths, instances of a class.
 
-Each check raises one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for another kind of
-value, `ArgumentError` for a value that breaks the rule.
+Each check raises one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for a value of the
+wrong kind, `ArgumentError` for a value that breaks the rule.
 """
 
 import functools
@@ -20,7 +20,7 @@ from planner_jax.core.rules import FINITE, Rule
 
 
 def format_shapes(tree: PyTree) -> str:
-    """Return names and shapes of the leaves of a pytree in one line, for a message."""
+    """Return one line with the names and shapes of the leaves of a pytree."""
     parts = jax.tree_util.tree_leaves_with_path(tree)
     names = (jax.tree_util.keystr(place, simple=True, separator=".") for place, _ in parts)
     return ", ".join(f"{n} {np.shape(leaf)}" for n, (_, leaf) in zip(names, parts, strict=True))
@@ -29,11 +29,12 @@ def format_shapes(tree: PyTree) -> str:
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
     """Raise unless an argument is one finite number that keeps a rule.
 
+    Of a jax array, which may be traced or on another device, only shape and kind are checked.
+
     Args:
-        name: of the argument, for the message.
-        value: number, or array without axes. Only shape and kind are checked of jax arrays, which
-            may be traced or lie on another device.
-        rule: of a finite number.
+        name: name of the argument, for the message.
+        value: a number, or an array without axes.
+        rule: rule for the finite number.
     """
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
@@ -42,11 +43,7 @@ def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
 
 
 def require_scalar(name: str, value: object) -> Numbers:
-    """Return an argument as an array () of one number, finite or not.
-
-    Raises:
-        ArgumentTypeError: it is something else.
-    """
+    """Return a number, finite or not, as an array (); raise `ArgumentTypeError` otherwise."""
     number = numeric(value)
     if number is None or number.shape or number.dtype == np.bool_:
         raise ArgumentTypeError(name, "a number", value)
@@ -54,9 +51,15 @@ def require_scalar(name: str, value: object) -> Numbers:
 
 
 def require_switch(name: str, value: object) -> None:
-    """Raise `ArgumentTypeError` unless an argument is true or false."""
+    """Raise `ArgumentTypeError` unless an argument is True or False."""
     if not isinstance(value, bool | np.bool_):
         raise ArgumentTypeError(name, "True or False", value)
+
+
+def require_numbers(name: str, value: object) -> None:
+    """Raise `ArgumentTypeError` unless an argument is a tuple of numbers."""
+    if not isinstance(value, tuple) or any(numeric(each) is None for each in value):
+        raise ArgumentTypeError(name, "a tuple of numbers", value)
 
 
 def require_kind(name: str, value: object, *kinds: type) -> None:
@@ -67,16 +70,20 @@ def require_kind(name: str, value: object, *kinds: type) -> None:
 
 
 def require_path_name(name: str, value: object) -> None:
-    """Raise `ArgumentTypeError` unless an argument may be the path of a file."""
+    """Raise `ArgumentTypeError` unless an argument can be the path of a file."""
     if not isinstance(value, str | os.PathLike):
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-_HOSTS = (np.ndarray, np.generic, float)  # kinds that are quickly told from JAX's arrays
+_HOSTS = (
+    np.ndarray,
+    np.generic,
+    float,
+)  # types that `isinstance` quickly separates from JAX's arrays
 
 
 def numeric(value: object) -> Numbers | None:
-    """Return real numbers as an array, jax arrays as they are; None of anything else."""
+    """Return real numbers as an array, a jax array unchanged, or None for any other value."""
     try:
         if not isinstance(value, _HOSTS) and isinstance(value, Tracer | jax.Array):
             array: Numbers = value
@@ -92,41 +99,40 @@ def numeric(value: object) -> Numbers | None:
 def numbers_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Return a number or vector that all cases of a batch share, or one for each, batch + shape.
+    """Return numbers for every case of a batch, an array of the shape batch + shape.
 
     Args:
-        name: of the argument, for the message.
-        value: of the shape, or with the batch's axes in front. Other shapes raise, so that no axis
-            is stretched by accident.
+        name: name of the argument, for the message.
+        value: an array of the shape `shape`, shared by all cases, or batch + shape. Other shapes
+            raise, so that no axis is stretched by accident.
         batch: () or (B,).
-        shape: of one case.
+        shape: shape for one case.
 
     Raises:
         ArgumentError: the value has another shape.
         ArgumentTypeError: the value does not hold numbers.
     """
-    given, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
-    if given.shape not in (shape, whole):
+    array, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
+    if array.shape not in (shape, whole):
         rule = f"{shape}" if whole == shape else f"{shape} or {whole}"
-        raise ArgumentError(name, f"the shape {rule}", given.shape, verb="have")
-    return given if given.shape == whole else np.broadcast_to(given, whole)
+        raise ArgumentError(name, f"the shape {rule}", array.shape, verb="have")
+    return array if array.shape == whole else np.broadcast_to(array, whole)
 
 
 def shape_of(name: str, value: object) -> tuple[int, ...]:
-    """Return the shape of an argument that holds numbers; raise `ArgumentTypeError` of others."""
+    """Return the shape of an argument; raise `ArgumentTypeError` unless it holds numbers."""
     return _require_numeric(name, value).shape
 
 
 def _require_numeric(name: str, value: object) -> Numbers:
-    """Return an argument as an array; raise `ArgumentTypeError` unless it holds numbers."""
-    given = numeric(value)
-    if given is None:
+    array = numeric(value)
+    if array is None:
         raise ArgumentTypeError(name, "numbers", value)
-    return given
+    return array
 
 
 def floating(dtype: object) -> np.dtype:
-    """Return a type of floating-point numbers that is enabled in JAX.
+    """Return a floating-point type that is enabled in JAX, as NumPy's type.
 
     Raises:
         ArgumentTypeError: another type, or float64 while JAX computes in float32.
@@ -143,17 +149,17 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return the leaves of an argument as arrays, the shapes of which begin with a shape.
+    """Return the leaves of an argument as arrays whose shapes begin with a shape.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the message.
         tree: the argument, a pytree of arrays.
-        shape: beginning of the shapes of its leaves.
-        words: for this beginning, for the message.
+        shape: required first axes of every leaf.
+        words: description of these axes, for the message.
 
     Raises:
         ArgumentTypeError: there is no leaf, or a leaf is not an array of numbers.
-        ArgumentError: the shape of a leaf begins otherwise.
+        ArgumentError: a leaf has other first axes.
     """
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
@@ -177,18 +183,18 @@ class _Path(Protocol):
 def require_path(
     name: str, path: object, axes: tuple[int, ...], dimensions: int, whose: str = ""
 ) -> None:
-    """Raise unless an argument is a target's path, or an array of them.
+    """Raise unless an argument is a target's path, or an array of paths.
 
     Args:
-        name: of the argument, for the message.
+        name: name of the argument, for the message.
         path: a pytree with a method `at(time)`.
-        axes: that its leaves have in front of the axes of one path.
-        dimensions: of the positions, 2 or 3.
+        axes: axes that every leaf has in front of the axes of one path.
+        dimensions: dimension of the positions, 2 or 3.
         whose: argument that determines the axes, for the message.
 
     Raises:
-        ArgumentTypeError: it has no such method, or the method returns no positions.
-        ArgumentError: it has other axes.
+        ArgumentTypeError: the path has no such method, or the method returns no positions.
+        ArgumentError: the path has other axes.
     """
     if isinstance(path, type) or not isinstance(path, _Path):
         raise ArgumentTypeError(name, "a path, with a method at(time)", path)
@@ -198,17 +204,17 @@ def require_path(
     try:
         found = _shape_of_positions(jax.tree.structure(path), layout, axes)
     except (TypeError, ValueError, IndexError, AttributeError) as error:
-        rule = f"a path of which at(time) gives a position, with the axes {axes}{of}"
+        rule = f"a path whose at(time) returns a position, with the axes {axes}{of}"
         shown = f"a {type(path).__name__} with {format_shapes(path)}"
         raise ArgumentTypeError(name, rule, shown=shown) from error
     if found != (*axes, dimensions):
         rule = f"positions of the shape {(*axes, dimensions)}"
-        raise ArgumentError(name, rule, found, verb="give")
+        raise ArgumentError(name, rule, found, verb="return")
 
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of paths' positions; cached, since tracing `at` takes a millisecond."""
+    """Return the shape of the paths' positions; cached, since tracing `at` takes a millisecond."""
 
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)

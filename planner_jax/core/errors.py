@@ -1,7 +1,7 @@
 """The exceptions of the library: one tree, whose base is `PlannerJaxError`.
 
-An error of an argument holds its parts as fields. Code that needs another name for the argument,
-such as the command line, calls `renamed`; nothing reads the text. Nothing here imports JAX.
+An error of an argument stores its parts as fields. Code that uses another name for the argument,
+such as the command line, calls `with_names`; nothing parses the text. Nothing here imports JAX.
 """
 
 import copy
@@ -14,14 +14,26 @@ from typing import ClassVar, Self
 class PlannerJaxError(Exception):
     """Base of the exceptions that the library defines; the text is one line."""
 
+    _names: ClassVar[tuple[str, ...]] = ()  # fields that hold names of arguments
+
+    def with_names(self, names: Mapping[str, str]) -> Self:
+        """Return the same error with arguments under other names.
+
+        Args:
+            names: new names by old ones; a name that is missing stays.
+        """
+        error = copy.copy(self)
+        vars(error).update({k: names.get(v, v) for k, v in vars(self).items() if k in self._names})
+        return error
+
 
 class ArgumentError(PlannerJaxError, ValueError):
     """An argument breaks a rule: "NAME must be RULE, got VALUE".
 
     Args:
         name: argument, or field of an argument, such as "limits.speed".
-        rule: what the argument must be, such as "> 0".
-        value: what it is.
+        rule: condition on the argument, such as "> 0".
+        value: value of the argument.
         index: first entry, or first case of a batch, that breaks the rule, if there are several.
         verb: word between "must" and the rule.
         other: argument to which the rule compares this one; it follows the rule.
@@ -29,6 +41,7 @@ class ArgumentError(PlannerJaxError, ValueError):
         more: number of further elements of the batch that break the rule.
     """
 
+    _names = ("name", "other")
     _where: ClassVar[str] = "at index"
 
     def __init__(
@@ -58,17 +71,6 @@ class ArgumentError(PlannerJaxError, ValueError):
             text += f" ({self.more} more such lane{'s' if self.more > 1 else ''})"
         return " ".join(text.split())
 
-    def renamed(self, names: Mapping[str, str]) -> Self:
-        """Return the same error with arguments under other names.
-
-        Args:
-            names: new names by old ones; a name that is missing stays.
-        """
-        error = copy.copy(self)
-        error.name = names.get(self.name, self.name)
-        error.other = names.get(self.other, self.other)
-        return error
-
 
 class ArgumentTypeError(ArgumentError, TypeError):
     """An argument is of a kind that its rule excludes, such as text in the place of a number."""
@@ -93,6 +95,8 @@ class MissingExtra(PlannerJaxError, ModuleNotFoundError):
         extra: extra of `planner-jax` that installs the package.
     """
 
+    _names = ("feature",)
+
     def __init__(self, feature: str, package: str | None, extra: str):
         super().__init__(feature, package, extra)
         self.feature, self.name = feature, package
@@ -101,15 +105,9 @@ class MissingExtra(PlannerJaxError, ModuleNotFoundError):
     def __str__(self) -> str:
         return f"{self.feature} needs {self.name}: {self.install}"
 
-    def renamed(self, names: Mapping[str, str]) -> Self:
-        """Return the same error with the feature under another name, if `names` has one."""
-        error = copy.copy(self)
-        error.feature = names.get(self.feature, self.feature)
-        return error
-
 
 class NoRecovery(PlannerJaxError, ValueError):
-    """No trajectory to a standstill behind a plan keeps every limit; the text says which fails."""
+    """No trajectory to standstill after a plan keeps every limit; the text names the limit."""
 
 
 def install_line(extra: str) -> str:

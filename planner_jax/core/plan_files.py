@@ -1,4 +1,4 @@
-"""Dataclasses of arrays as NumPy's .npz files: names of the fields, a version, and no pickle."""
+"""Dataclasses of arrays in NumPy's .npz files: arrays by field names, a version, and no pickle."""
 
 import contextlib
 import dataclasses
@@ -20,7 +20,7 @@ from planner_jax.core.rules import nodes_of
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
-# Exceptions of NumPy and of the archive's reader on a damaged file.
+# Exceptions that NumPy and the archive's reader raise on a damaged file.
 UNREADABLE = (
     *(OSError, ValueError, KeyError, TypeError, EOFError, RuntimeError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, struct.error),
@@ -30,14 +30,14 @@ Kind = TypeVar("Kind")
 
 
 class PlanFileError(ArgumentError):
-    """A file cannot be read as plans; one line that names the file."""
+    """A file that cannot be read as plans; one line that names the file."""
 
 
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
     """Write a dataclass, whose leaves are arrays or such dataclasses, whole or not at all.
 
     Args:
-        path: of the file; its name is taken as it is.
+        path: path of the file; no suffix is added.
         tree: the dataclass.
 
     Raises:
@@ -45,9 +45,9 @@ def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
     """
     require_path_name("path", path)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
-    arrays = {name: np.asarray(leaf) for name, leaf in named_leaves(tree).items()}
+    arrays = {name: np.asarray(leaf) for name, leaf in leaves_by_name(tree).items()}
     for name, array in arrays.items():
-        if array.dtype.kind in "OSU":  # objects NumPy would pickle
+        if array.dtype.kind in "OSU":  # NumPy would pickle objects
             raise ArgumentTypeError(name, "an array of numbers", shown=str(array.dtype))
     with replacing(path) as scratch, open(scratch, "wb") as file:
         np.savez(file, **{_HEADER: np.array(header), **arrays})  # type: ignore[arg-type]
@@ -57,17 +57,13 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
     """Return the dataclass that `save_arrays` wrote, with NumPy leaves.
 
     Raises:
-        PlanFileError: the file is something else, of another class or of another version.
+        PlanFileError: the file holds something else, another class or another version.
         ArgumentTypeError: `path` is not a path.
     """
     require_path_name("path", path)
     version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:
-        raise PlanFileError(
-            "path",
-            f"a file of {kind.__name__} of version {VERSION}",
-            shown=f"{name} of version {version} in {str(path)!r}",
-        )
+        raise _other_file(path, kind.__name__, version, name)
     try:
         tree = build_tree(kind, "", arrays)
     except KeyError as error:
@@ -78,32 +74,30 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 
 
 def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
-    """Return the first of some classes whose fields are all in a file of `save_arrays`.
+    """Return the first of several classes whose fields are all in a file of `save_arrays`.
 
     A file of a derived class is read as its base class, without the fields of the derived class.
 
     Raises:
-        PlanFileError: the file is something else, of none of the classes or of another version.
+        PlanFileError: the file holds something else, none of the classes or another version.
     """
     version, name, arrays = _read(path)
     if version == VERSION:
         for kind in kinds:
             with contextlib.suppress(KeyError):
                 return build_tree(kind, "", dict(arrays))
-    names = " or ".join(kind.__name__ for kind in kinds)
-    raise PlanFileError(
-        "path",
-        f"a file of {names} of version {VERSION}",
-        shown=f"{name} of version {version} in {str(path)!r}",
-    )
+    raise _other_file(path, " or ".join(kind.__name__ for kind in kinds), version, name)
+
+
+def _other_file(
+    path: str | os.PathLike, names: str, version: object, name: object
+) -> PlanFileError:
+    shown = f"{name} of version {version} in {str(path)!r}"
+    return PlanFileError("path", f"a file of {names} of version {VERSION}", shown=shown)
 
 
 def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray]]:
-    """Return version and name of the class in a file, and its arrays.
-
-    Raises:
-        PlanFileError: the file is something else.
-    """
+    """Return the version and the class name in a file, and its arrays."""
     try:
         # NumPy leaves open a broken file that it has opened itself.
         with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
@@ -119,8 +113,8 @@ def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray
     return version, name, arrays
 
 
-def named_leaves(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
-    """Return the arrays of a dataclass by names joined by dots, without static fields and None."""
+def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
+    """Return the arrays of a dataclass by dotted names, without static fields and None."""
     leaves = {}
     defaults = {field.name: field.default for field in dataclasses.fields(tree)}
     for name, value in nodes_of(tree).items():
@@ -128,7 +122,7 @@ def named_leaves(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
         if value is None and defaults[name] is None:
             continue
         inner = dataclasses.is_dataclass(value)
-        leaves |= named_leaves(value, f"{place}.") if inner else {place: value}
+        leaves |= leaves_by_name(value, f"{place}.") if inner else {place: value}
     return leaves
 
 

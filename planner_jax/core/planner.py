@@ -1,14 +1,14 @@
 """The base class of every planner: what `plan`, `solve`, `replan` and `gradient` may call.
 
-A planner is a pytree: sizes and switches are static, arrays such as a library of motions or the
-weights of a network are leaves, so that other arrays of the same shapes compile nothing anew. A
-frozen dataclass of sizes and switches alone becomes a pytree by `jax.tree_util.register_static`.
+A planner is a pytree. Sizes and switches are static. Arrays, such as a library of motions or the
+weights of a network, are leaves, so that other arrays of the same shapes compile nothing anew. A
+frozen dataclass without arrays becomes a pytree by `jax.tree_util.register_static`.
 """
 
 import enum
 import functools
 from collections.abc import Callable, Sequence
-from typing import ClassVar, Generic, Protocol, TypeVar
+from typing import ClassVar, Generic, Protocol, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,7 @@ from jax import Array, lax
 from jax.extend.backend import backends
 from jaxtyping import PyTree
 
+from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt, Plan
 from planner_jax.core.rules import Case
@@ -25,24 +26,24 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 
 class Kind(enum.Enum):
-    """How a planner makes its plans."""
+    """The method of a planner that makes its plans."""
 
     COMPILED = "compiled"  # `solve`, a pure function of one case
-    HOST = "host"  # `solve_on_host`, of a batch of NumPy arrays
-    COMPOSITE = "composite"  # `plan_by`, with plans of other planners
+    HOST = "host"  # `solve_on_host`, a function of a batch of NumPy arrays
+    COMPOSITE = "composite"  # `plan_by`, which calls other planners
 
 
 class Drive(Protocol):
-    """Has planners plan, for the `plan_by` of a composite planner."""
+    """Runs planners on behalf of the `plan_by` of a composite planner."""
 
     @property
     def is_pure(self) -> bool:
-        """Whether this happens inside a compiled program, where arrays have no values yet."""
+        """Whether this runs inside a compiled program, where arrays have no values yet."""
         ...
 
     @property
     def is_over(self) -> bool:
-        """Whether the caller's time has passed, so that no further attempt may start."""
+        """Whether the caller's time limit has passed, so that no further attempt may start."""
         ...
 
     def __call__(
@@ -58,13 +59,13 @@ class Drive(Protocol):
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after one more try at the cases that are left, with the better plans.
+        """Return plans (B,) after another try at some cases, each the better of old and new.
 
         Args:
             plan_of: makes plans of a batch of the cases.
             cases: (B,).
-            plans: of the cases; those with NumPy leaves are changed in place.
-            left: (B,) bool. When the caller's time has passed, they are not tried again.
+            plans: plans so far; NumPy leaves are changed in place.
+            left: (B,) bool, the cases to try again. None is tried after the caller's time limit.
         """
         ...
 
@@ -72,15 +73,16 @@ class Drive(Protocol):
 class Planner(Generic[CaseT, PlanT]):
     """A planner of one class of cases.
 
-    A subclass implements one of `solve`, `solve_on_host` and `plan_by`, which settles its `kind`,
-    and whatever else it can do. Abilities that it leaves out raise a one-line error.
+    A subclass implements one of `solve`, `solve_on_host` and `plan_by`, which determines its
+    `kind`. The other methods are optional abilities; those without a default raise a one-line
+    error.
     """
 
     kind: ClassVar[Kind | None] = None
     case_type: ClassVar[type] = Case  # cases of other classes are rejected
-    plan_type: ClassVar[type[Plan]] = Plan  # of the plans that `begin` takes
-    # Whether a CPU solves a batch case after case. It should where one case may take many times as
-    # long as another: in step, all cases would wait for the slowest one.
+    plan_type: ClassVar[type[Plan]] = Plan  # class of the plans that `begin` takes
+    # Whether a CPU solves a batch case after case. This suits planners whose cases differ much in
+    # computing time: in step, all cases would wait for the slowest one.
     is_sequential: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -99,7 +101,7 @@ class Planner(Generic[CaseT, PlanT]):
 
     @property
     def inner(self) -> "Planner":
-        """The planner that a planner around another one calls; otherwise the planner itself."""
+        """The planner inside a planner that wraps another one; otherwise the planner itself."""
         return self
 
     def solve(self, case: CaseT, attempt: PyTree, /) -> PlanT:
@@ -111,7 +113,7 @@ class Planner(Generic[CaseT, PlanT]):
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
-        if has_only_cpu():  # the program of other devices is not even traced, which takes longer
+        if has_only_cpu():  # which spares tracing the program for other devices
             return in_turn(cases)
         return lax.platform_dependent(
             cases, cpu=in_turn, default=lambda cases: self.solve_at_once(cases, attempt)
@@ -126,7 +128,7 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
-        """Return the plans of a batch, made of plans of other planners by `drive`."""
+        """Return the plans of a batch, made from plans of other planners by `drive`."""
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
@@ -138,10 +140,10 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
-        """Return what is left of cases some time into their plans; see `pj.replan`.
+        """Return the remainders of cases some time into their plans; see `pj.replan`.
 
-        A re-planner takes the cases, the previous plans, the time since these began, and by name
-        what has changed.
+        A re-planner takes the cases, the previous plans, the time since those started, and changed
+        quantities by name.
 
         Raises:
             TypeError: the planner is no re-planner.
@@ -158,8 +160,8 @@ class Planner(Generic[CaseT, PlanT]):
 
         Args:
             cases: one case, or a batch.
-            plan_of: plans cases by a planner. By default the first decision and the first search
-                count, which is pure, and constant to derivatives.
+            plan_of: plans cases by a planner, to determine the decision. By default the decision is
+                its first proposal, and no plan is made: that is pure, and constant to derivatives.
 
         Raises:
             TypeError: the planner minimises nothing.
@@ -169,14 +171,20 @@ class Planner(Generic[CaseT, PlanT]):
             "a planner that does, such as hits' and catches' exact or intercepts' spacetime"
         )
 
-    def with_effort(self, effort: str) -> "Planner":
-        """Return the planner with a longer search; see `planner_jax.core.choices`.
+    def with_effort(self, effort: str) -> Self:
+        """Return the planner with a first round, made for all cases, that searches for longer.
+
+        "feasible" returns the planner itself, which leaves a case as soon as every limit holds,
+        mostly far from the least cost. See `OptimisedPlanner.with_effort` for the other efforts.
 
         Raises:
-            ValueError: the planner minimises nothing.
+            ArgumentError: the effort is unknown, or the planner minimises nothing.
         """
-        rule = f"feasible for a {type(self).__name__}, which minimises nothing"
-        raise ArgumentError("effort", rule, effort)
+        require_one_of(EFFORTS, "effort", effort)
+        if effort != EFFORTS[0]:
+            rule = f"feasible for a {type(self).__name__}, which minimises nothing"
+            raise ArgumentError("effort", rule, effort)
+        return self
 
 
 def require_planner(planner: object) -> None:
@@ -188,11 +196,11 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless the planner is one, a pytree with an attempt, and the cases are of its class.
+    """Raise unless a planner is complete and plans cases of the class of these.
 
     Raises:
-        TypeError: it is none, or the cases are of another class.
-        ValueError: it has no attempt.
+        TypeError: the planner is no planner or no pytree, or the cases are of another class.
+        ValueError: the planner has no attempt.
     """
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
@@ -211,14 +219,14 @@ def require_fit(planner: Planner, cases: object) -> None:
 
 
 def has_only_cpu() -> bool:
-    """Return whether all devices that JAX has are CPUs."""
+    """Return whether all devices of JAX are CPUs."""
     return set(backends()) == {"cpu"}
 
 
 def solve_in_turn(solve: Callable[[PyTree], PyTree], cases: PyTree) -> PyTree:
-    """Return what a function makes of every case of a batch, one after another; pure.
+    """Return the results of a function for every case of a batch, one after another; pure.
 
-    A case that equals the one before, such as those that fill up a batch, is not solved again.
+    A case equal to the one before it, such as the padding of a batch, is not solved again.
     """
     first = jax.tree.map(lambda leaf: leaf[0], cases)
     nothing = jax.tree.map(

@@ -1,4 +1,4 @@
-"""Plans, the rule that selects one of them, and attempts and decisions of planners."""
+"""Plans, the rule that selects one of several plans, and attempts and decisions of planners."""
 
 import dataclasses
 import enum
@@ -14,20 +14,14 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import Numbers, numpy_of
-from planner_jax.core.checks import numeric, require_kind, require_number, require_switch
+from planner_jax.core.checks import require_kind, require_number, require_numbers, require_switch
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import (
-    NOT_NEGATIVE,
-    POSITIVE,
-    fields_of,
-    has_rules,
-    is_sound,
-)
+from planner_jax.core.rules import FINITE, NOT_NEGATIVE, POSITIVE, fields_of, has_rules, is_sound
 
 
 class Status(enum.IntEnum):
-    """Outcome of one case; `message` explains it and names a remedy."""
+    """Outcome of one case; `message` explains it and states a remedy."""
 
     CONVERGED = 0
     FEASIBLE = 1
@@ -48,7 +42,7 @@ class Status(enum.IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Status | None":
-        """Return the status in a jax array of one number, which cannot be a key of the lookup."""
+        """Return the status in a jax array of one number, which is not hashable."""
         return next((status for status in cls if status == value), None)
 
 
@@ -59,10 +53,10 @@ _MESSAGES = {
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
     Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
     Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
-    Status.NO_PATH: "no way was found through the obstacles in time; allow more time",
+    Status.NO_PATH: "no path through the obstacles was found in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
-    Status.BAD_INPUT: "a number of the case is absurd; `pj.require_sound(cases)` names it",
-    Status.TOO_FAR: "no plan exists: at no time is a target where the robot can be by then; allow "
+    Status.BAD_INPUT: "a number of the case breaks its rule; `pj.require_sound(cases)` names it",
+    Status.TOO_FAR: "no plan exists: the robot cannot be at a target's position at any time; allow "
     "more speed or acceleration, or start nearer",
     Status.OUT_OF_TIME: "a limit is exceeded, and `time_limit` ended the search; allow more time",
 }
@@ -74,12 +68,12 @@ def is_solved(status: Numbers | int) -> Array:
 
 
 def is_unsolved(status: Numbers | int) -> Array:
-    """Return which statuses are worth another attempt: not solved, not broken, not hopeless."""
+    """Return which statuses are worth another attempt: unsolved, finite and not hopeless."""
     worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
     return worth | (status == Status.OUT_OF_REACH)  # type: ignore[return-value]
 
 
-# Plans are refereed to 1e-3 of a limit; half of that is left for peaks between samples.
+# The referee accepts an excess of 1e-3 of a limit; half of it is left for peaks between samples.
 FEASIBILITY_TOLERANCE = 5e-4
 
 
@@ -96,11 +90,11 @@ def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
 
 
 def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -> dict[str, PyTree]:
-    """Return the fields that every `Plan` has, of a planner that does not iterate.
+    """Return the fields that every `Plan` has, for a planner that does not iterate.
 
     Args:
         cost: (), the planner's own objective.
-        violation: (), largest relative excess over a limit that the planner saw.
+        violation: (), largest relative excess over a limit that the planner checks.
         stationary: () bool, whether another attempt could not change the plan.
     """
     return {
@@ -119,12 +113,14 @@ class Plan:
     """
 
     cost: Array  # (), the planner's own objective
-    violation: Array  # (), largest relative excess over a limit that the planner saw; <= 0 is good
+    violation: (
+        Array  # (), largest relative excess over a limit that the planner checks; feasible if <= 0
+    )
     iterations: Array  # () int32
     status: Array  # () int32, a `Status`
 
     def save(self, path: str | os.PathLike) -> None:
-        """Write the plan, or the batch, as NumPy's .npz; `load` of the same class reads it."""
+        """Write the plan, or the batch, as NumPy's .npz, for `load` of the same class."""
         from planner_jax.core.plan_files import save_arrays
 
         save_arrays(path, self)
@@ -134,7 +130,7 @@ class Plan:
         """Return the plan or batch that `save` wrote, with NumPy leaves.
 
         Raises:
-            PlanFileError: the file does not hold plans, or plans of another class or version.
+            PlanFileError: the file holds no plans, or plans of another class or version.
         """
         from planner_jax.core.plan_files import load_arrays
 
@@ -142,10 +138,10 @@ class Plan:
 
 
 def require_settings(planner: PyTree) -> None:
-    """Raise unless every field of a planner, a dataclass, is of the kind of its default.
+    """Raise unless every field of a planner, a dataclass, has the kind of its default value.
 
-    Sizes are whole numbers of 1 or more, 0 only where that is the default; weights and times are
-    finite, and not negative where the default is not; attempts are one or more.
+    Sizes are whole numbers >= 1, or >= 0 if the default is 0. Weights and times are finite, and >=
+    0 unless the default is negative. Attempts are one or more.
 
     Raises:
         ArgumentTypeError: a field is of another kind.
@@ -153,31 +149,23 @@ def require_settings(planner: PyTree) -> None:
     """
     defaults = {field.name: field.default for field in dataclasses.fields(planner)}
     for name, value in fields_of(planner).items():
-        usual = defaults[name]
-        if isinstance(usual, bool):
+        default = defaults[name]
+        if isinstance(default, bool):
             require_switch(name, value)
-        elif isinstance(usual, int):
-            require_size(name, value, min(usual, 1))
-        elif isinstance(usual, float) and usual >= 0.0:
-            require_number(name, value, NOT_NEGATIVE)
-        elif isinstance(usual, float):
-            require_number(name, value)
-        elif isinstance(usual, tuple) and usual and isinstance(usual[0], Attempt):
-            require_attempts(name, value, type(usual[0]))
-        elif isinstance(usual, tuple):
-            if not isinstance(value, tuple) or any(numeric(x) is None for x in value):
-                raise ArgumentTypeError(name, "a tuple of numbers", value)
-        elif dataclasses.is_dataclass(usual):
-            require_kind(name, value, type(usual))
+        elif isinstance(default, int):
+            require_size(name, value, min(default, 1))
+        elif isinstance(default, float):
+            require_number(name, value, NOT_NEGATIVE if default >= 0.0 else FINITE)
+        elif isinstance(default, tuple) and default and isinstance(default[0], Attempt):
+            require_attempts(name, value, type(default[0]))
+        elif isinstance(default, tuple):
+            require_numbers(name, value)
+        elif dataclasses.is_dataclass(default):
+            require_kind(name, value, type(default))
 
 
 def require_attempts(name: str, value: object, kind: type) -> None:
-    """Raise unless a setting is a tuple of one or more attempts of a class.
-
-    Raises:
-        ArgumentTypeError: it is something else.
-        ArgumentError: it is empty.
-    """
+    """Raise `ArgumentError` unless a setting is a tuple of one or more attempts of a class."""
     if not isinstance(value, tuple) or not all(isinstance(each, kind) for each in value):
         raise ArgumentTypeError(name, f"a tuple of {kind.__name__}", value)
     if not value:
@@ -186,10 +174,10 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Attempt:
-    """One try at the cases that earlier tries left unsolved; static under jit."""
+    """One try at the cases that earlier attempts left unsolved; static under jit."""
 
-    starts: int = 1  # lanes that one case takes in a batch
-    # Cases that earlier attempts left with a greater violation are not tried; None: all are.
+    starts: int = 1  # lanes of a batch that one case takes
+    # Greatest violation after earlier attempts with which a case is tried; None for any.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -198,7 +186,7 @@ class Attempt:
             require_number("within", self.within, POSITIVE)
 
     def is_due(self, plans: "Plan") -> Array:
-        """Return which of the plans so far this attempt may improve."""
+        """Return which of the plans so far this attempt may improve, bool."""
         unsolved = is_unsolved(plans.status)
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
@@ -214,7 +202,7 @@ class Decision(Protocol):
     """
 
     def check(self, cases: PyTree, /) -> None:
-        """Raise `ArgumentError` for a batch about which this cannot decide; on the host."""
+        """Raise `ArgumentError` for a batch that this cannot decide; on the host."""
         ...
 
     def propose(self, case: PyTree, /) -> PyTree:
@@ -222,7 +210,7 @@ class Decision(Protocol):
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
-        """Return one number a plan, which is least for the plan that is selected; pure.
+        """Return one number for each plan; the plan with the least number is selected; pure.
 
         The plans have any batch shape, in NumPy or jax arrays.
         """
@@ -237,18 +225,18 @@ Tree = TypeVar("Tree")
 
 
 def out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
-    """Return the plans, with the status `OUT_OF_TIME` where one is left unsolved."""
+    """Return the plans with the status `OUT_OF_TIME` where `left` is true."""
     status = numpy_of(plans.status).where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
 def is_resident(tree: PyTree) -> bool:
-    """Return whether all leaves are jax arrays, which may lie on other devices than the host."""
+    """Return whether all leaves are jax arrays, which may be on other devices than the host."""
     return all(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(tree))
 
 
 def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
-    """Return one case, plan or verdict of a batch, or some of them: entry `k` of every leaf.
+    """Return one case, plan or verdict of a batch, or several: entry `k` of every leaf.
 
     Args:
         tree: a pytree, or a dataclass of arrays such as a verdict, with a leading axis.
@@ -270,12 +258,12 @@ def solved(plans: Plan) -> np.ndarray:
     return np.asarray(is_solved(plans.status))
 
 
-def marked(plans: PlanT, cases: PyTree) -> PlanT:
-    """Return the plans, with the status `BAD_INPUT` where a number of the case breaks a rule; pure.
+def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:
+    """Return plans with the status `BAD_INPUT` where a number of the case breaks a rule; pure.
 
     Args:
-        plans: one plan, or a batch; the same plans are returned if the cases have no `rules`.
-        cases: of the plans.
+        plans: one plan, or a batch; returned unchanged if the cases have no `rules`.
+        cases: cases of the plans.
     """
     if not has_rules(cases):
         return plans
@@ -284,21 +272,21 @@ def marked(plans: PlanT, cases: PyTree) -> PlanT:
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
 
 
-# Which of several plans of a case is selected is one rule for every planner. A plan that keeps
-# every limit is selected before one that does not. Of two that keep them the cheaper one is
-# selected, and of two that do not the one that exceeds them less. The functions below take NumPy or
-# jax arrays, and anything with `cost`, `violation` and, without a `tolerance`, `status`.
+# One rule selects among several plans of a case, for every planner. A plan that keeps every limit
+# comes before a plan that does not. Among plans that keep every limit the cheapest is selected,
+# otherwise the plan with the least violation. The functions below take NumPy or jax arrays, and any
+# object with `cost`, `violation` and, without a `tolerance`, `status`.
 def is_better(
     later: PyTree, before: PyTree, *, tolerance: float | None = None, share: float = 1.0
 ) -> PyTree:
-    """Return whether later plans are selected in the place of earlier ones, bool.
+    """Return whether later plans are selected instead of earlier ones, bool.
 
     Args:
         later: plans of any batch shape.
         before: plans of the same cases.
-        tolerance: the greatest violation at which a plan counts as keeping every limit. By default
-            its status says so.
-        share: of the earlier cost, below which a plan that keeps limits, too, is cheaper.
+        tolerance: greatest violation of a plan that keeps every limit. By default the plan's
+            status decides.
+        share: factor on the earlier cost; the later plan must cost less than this product.
     """
     if tolerance is None:
         is_good, was_good = is_solved(later.status), is_solved(before.status)
@@ -312,7 +300,7 @@ def is_better(
 
 
 def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
-    """Return the plans, with later ones where these are better; pure.
+    """Return the better of later and earlier plans, case by case; pure.
 
     Args:
         later: plans of any batch shape.
@@ -328,11 +316,11 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
 
 
 def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
-    """Return plans with NumPy leaves, changed in place where later plans of some lanes are better.
+    """Return plans, NumPy leaves changed in place where later plans of some lanes are better.
 
     Args:
         plans: a batch.
-        later: plans of `lanes`, or of more lanes than these.
+        later: plans of `lanes`; further plans behind these are padding.
         lanes: indices of the batch.
     """
     later = jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], later)
@@ -346,11 +334,11 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
 
 
 def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index along the first axis of the plan that is selected of each case's.
+    """Return the index along the first axis of the selected plan of each case.
 
     Args:
-        plans: the plans of a case one after another, (K, ...).
-        cost: (K, ...), in the place of the planner's own.
+        plans: plans of the same cases, (K, ...).
+        cost: (K, ...), used instead of the planner's own cost.
     """
     xp = numpy_of(plans.status)
     good = is_solved(plans.status)
@@ -361,12 +349,12 @@ def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
 
 
 def first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
-    """Return the first of a line of plans of one case that is solved, or else the best; pure.
+    """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
 
     Args:
-        plan_of: makes the plan at a position () int32 of the line.
-        num: () int32, of plans in the line.
-        best: the plan that there is already; if it is solved, no other is made.
+        plan_of: makes the plan at a position () int32 of the sequence.
+        num: () int32, length of the sequence.
+        best: an existing plan; if it is solved, no other is made.
     """
 
     def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:

@@ -38,7 +38,7 @@ _OWN = {
 class Task:
     """A task: its four functions, planners, suites, and settings of its runs.
 
-    Objects are named as "module:attribute" and imported when they are needed.
+    Objects are named as "module:attribute" and imported on first use.
     """
 
     name: str  # on the command line
@@ -46,29 +46,29 @@ class Task:
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
     planners: Mapping[str, str]  # name -> class or function that makes the planner; default first
     suites: Mapping[str, str]  # name -> a sentence about its cases; default first
-    # Planners that are read from a file, as in "library:motions.bin" -> the command that makes it.
+    # Planners read from a file, as in "library:motions.bin" -> the command that writes the file.
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
     # Classes of the settings of its sweeps, and of its flights in `sims`.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
     # Class of the settings of one case that is specified by a few numbers.
     single: str | None = None
-    # Options of `planner` where its speed is measured.
+    # Options of `planner` in benchmarks of its speed.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
-    contact: str | None = None  # name in a plan of its times of contact, such as "stroke.time"
-    # The planner whose costs are the reference for planners that have no longer search.
+    contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
+    # Planner whose costs are the reference for planners without a long search.
     yardstick: str | None = None
 
     @property
     def case(self) -> "Callable[..., PyTree]":
-        """Function that makes one case, or a batch, of physical quantities."""
+        """Function that makes one case, or a batch, from physical quantities."""
         return self._function("case")
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
         """`draw(num, suite=None, seed=0, *, first=0)`: a batch of a suite.
 
-        Case k of a seed is always the same one: `first` is the k of the first case.
+        Case k of a seed is always the same case; `first` is the k of the first case.
         """
         return self._function("draw")
 
@@ -83,19 +83,19 @@ class Task:
         return self._function("judge")
 
     def all_planners(self) -> dict[str, str | metadata.EntryPoint]:
-        """Return planners by name, the task's own before the planners of other packages."""
-        return {**self.planners, **_offered("planners", self.name, self.planners)}
+        """Return planners by name, the task's own before planners of other packages."""
+        return {**self.planners, **_other_entries("planners", self.name, self.planners)}
 
     def all_suites(self) -> dict[str, str]:
-        """Return sentences on suites by name, the task's own before suites of other packages."""
-        others = _offered("suites", self.name, self.suites)
+        """Return descriptions of suites by name, the task's own before other packages' suites."""
+        others = _other_entries("suites", self.name, self.suites)
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
     def split_planner(self, name: object) -> tuple[str, str]:
         """Return the key of `all_planners` in a planner's name, and its file or "".
 
         Raises:
-            UnknownName: there is no planner of that name, or it needs a file or takes none.
+            UnknownName: no planner has this name, or it needs a file or takes none.
         """
         planner, file = split_name(self.all_planners(), "planner", name, self.from_file)
         if planner in self.from_file and not file:
@@ -111,15 +111,15 @@ class Task:
         """Return the planner of a name.
 
         Args:
-            name: a key of `all_planners`; keys in `from_file` with ":" and the file behind them.
-            options: keyword arguments of the planner's class or function, behind the file.
+            name: a key of `all_planners`; a key of `from_file` is followed by ":" and its file.
+            options: keyword arguments of the planner's class or function, after the file.
 
         Raises:
-            UnknownName: there is no planner of that name, or it needs a file or takes none.
+            UnknownName: no planner has this name, or it needs a file or takes none.
             ArgumentTypeError: the planner has no such option.
         """
         planner, file = self.split_planner(name)
-        maker = _resolved(self.all_planners()[planner])
+        maker = _load(self.all_planners()[planner])
         _require_options(planner, maker, options)
         return maker(*filter(None, [file]), **options)
 
@@ -127,10 +127,10 @@ class Task:
         """Return the function `draw(num, seed, first)` of a suite of another package.
 
         Raises:
-            UnknownName: there is no suite of that name.
+            UnknownName: no suite has this name.
         """
         suite = require_name(self.all_suites(), "suite", name)
-        return _resolved(_offered("suites", self.name, self.suites)[suite])
+        return _load(_other_entries("suites", self.name, self.suites)[suite])
 
     def _function(self, name: str) -> "Callable[..., PyTree]":
         return pkgutil.resolve_name(f"{self.home}:{name}")
@@ -146,7 +146,7 @@ def require_name(known: Collection[str], kind: str, name: object) -> str:
 
 
 def _require_options(planner: str, maker: object, options: Collection[str]) -> None:
-    """Raise `ArgumentTypeError` unless a planner's class, if it is a dataclass, has the fields."""
+    """Raise `ArgumentTypeError` unless a planner's class, if a dataclass, has these fields."""
     if isinstance(maker, type) and dataclasses.is_dataclass(maker):
         known = [field.name for field in dataclasses.fields(maker) if field.init]
         for option in options:
@@ -156,11 +156,7 @@ def _require_options(planner: str, maker: object, options: Collection[str]) -> N
 
 
 def suite_named(name: object, default: str) -> str:
-    """Return the name of a suite, the default instead of None.
-
-    Raises:
-        UnknownName: it is no name.
-    """
+    """Return the name of a suite, or the default for None; raise `UnknownName` for no name."""
     if name is not None and not isinstance(name, str):
         raise UnknownName("suite", "a name", name)
     return name or default
@@ -169,16 +165,16 @@ def suite_named(name: object, default: str) -> str:
 def split_name(
     known: Collection[str], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
-    """Return a known name and the file behind it, as in "policy:FILE", or "".
+    """Return a known name and the file after it, as in "policy:FILE", or "".
 
     Args:
-        known: names.
+        known: known names.
         kind: noun for the named objects, for the message.
-        name: one of the names, with or without ":" and a file behind it.
+        name: one of the names, perhaps followed by ":" and a file.
         from_file: names that may have a file.
 
     Raises:
-        UnknownName: it is not known, or takes no file.
+        UnknownName: the name is not known, or takes no file.
     """
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     own = require_name(known, kind, own)
@@ -190,18 +186,14 @@ def split_name(
 
 
 def task_named(name: object) -> Task:
-    """Return the task of a name, of the library or of another package.
-
-    Raises:
-        UnknownName: there is none; one line.
-    """
+    """Return the task of a name, of the library or of another package; raise `UnknownName`."""
     tasks = all_tasks()
     return tasks[require_name(tasks, "task", name)]
 
 
 @functools.cache
 def all_tasks() -> dict[str, Task]:
-    """Return tasks by name, without tasks of other packages that fail, with a warning."""
+    """Return tasks by name; tasks of other packages that fail are left out with a warning."""
     tasks = {name: pkgutil.resolve_name(path) for name, path in _OWN.items()}
     for entry in metadata.entry_points(group=f"{_GROUP}.tasks"):
         problem = f"the name is taken by {tasks[entry.name].home}" if entry.name in tasks else ""
@@ -209,7 +201,7 @@ def all_tasks() -> dict[str, Task]:
         if not problem:
             try:
                 found = entry.load()
-            except Exception as error:  # whatever it is, it is the other package's
+            except Exception as error:  # of any class: the other package raises it
                 problem = f"{type(error).__name__}: {error}"
             else:
                 if not isinstance(found, Task) or found.name != entry.name:
@@ -223,8 +215,8 @@ def all_tasks() -> dict[str, Task]:
     return tasks
 
 
-def _offered(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
-    """Return other packages' entry points for a task by name, without names that are taken."""
+def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
+    """Return other packages' entry points for a task by name, except names that are taken."""
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")
@@ -238,12 +230,12 @@ def _offered(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.E
     return found
 
 
-def _resolved(place: str | metadata.EntryPoint) -> "Callable[..., PyTree]":
-    if isinstance(place, str):
-        return pkgutil.resolve_name(place)
+def _load(source: str | metadata.EntryPoint) -> "Callable[..., PyTree]":
+    if isinstance(source, str):
+        return pkgutil.resolve_name(source)
     try:
-        return place.load()
-    except Exception as error:  # whatever it is, it is the other package's
+        return source.load()
+    except Exception as error:  # of any class: the other package raises it
         why = f"{type(error).__name__}: {error}"
-        name = f"{place.name} of {place.value}"
+        name = f"{source.name} of {source.value}"
         raise UnknownName(name, "one that can be loaded", shown=why) from error

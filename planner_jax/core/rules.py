@@ -1,9 +1,9 @@
 """Rules on the numbers of cases: one table serves the host and compiled programs.
 
-A class of cases, or of parts of cases such as a target's path, has its table as `rules`. Every
-number of such a case must be finite and keep the rule that the table has for it. On the host
-`require_sound` names the first number that breaks its rule. Inside compiled programs `is_sound`
-evaluates every lane, and `planner_jax.planning` gives unsound lanes the status `BAD_INPUT`.
+A class of cases, or of parts of cases such as a target's path, lists its arrays and their rules in
+`rules`. Every number must be finite and keep the rule of its array. On the host `require_sound`
+raises for the first number that breaks its rule. Inside compiled programs `is_sound` evaluates
+every case, and `planner_jax.planning` assigns the status `BAD_INPUT` to unsound cases.
 """
 
 import dataclasses
@@ -26,21 +26,23 @@ class Rule:
     """A condition on every number of an array."""
 
     words: str  # as in "limits.speed must be WORDS, got -1"
-    # Returns where the condition holds, number by number, of an array with any leading axes and
-    # of the case, or part of it, whose table has the rule.
+    # Takes an array with any leading axes, and the case or part of it whose table has the rule.
+    # Returns where the condition holds, number by number.
     holds: Callable[[Numbers, PyTree], Numbers]
     infinite: bool = False  # whether the number may be infinite
-    other: str = ""  # the array of the same part that the number is compared with
+    other: str = ""  # array of the same part with which the number is compared
 
 
 FINITE = Rule("finite", lambda value, part: abs(value) < np.inf)
 POSITIVE = Rule("> 0", lambda value, part: value > 0.0)
 NOT_NEGATIVE = Rule(">= 0", lambda value, part: value >= 0.0)
-NOT_ZERO = Rule(  # of a vector
+NOT_ZERO = Rule(  # for a vector
     "other than zero",
     lambda value, part: (value != 0.0) | (value != 0.0).any(-1, keepdims=True),
 )
-POSITIVE_OR_NONE = Rule("> 0", lambda value, part: value > 0.0, infinite=True)  # infinite: no limit
+POSITIVE_OR_NONE = Rule(
+    "> 0", lambda value, part: value > 0.0, infinite=True
+)  # infinity means no limit
 
 
 def within(low: float, high: float, words: str) -> Rule:
@@ -50,11 +52,11 @@ def within(low: float, high: float, words: str) -> Rule:
 
 def below(other: str) -> Rule:
     """Return the rule that an array is less than another array of the same part and shape."""
-    return Rule("<", lambda value, part: value < named(part, other), other=other)
+    return Rule("<", lambda value, part: value < part_at(part, other), other=other)
 
 
 def _is_permutation(value: Numbers, part: PyTree) -> Numbers:
-    """Return where an entry along the last axis is an index of it that no other entry has."""
+    """Return where an entry along the last axis is an index of it that occurs only once."""
     alike = (value[..., :, None] == value[..., None, :]).sum(axis=-1)
     return (alike == 1) & (value >= 0) & (value < value.shape[-1])
 
@@ -66,11 +68,11 @@ PERMUTATION = Rule("a permutation", _is_permutation)
 class Field:
     """One array of a case: its name, its shape in one case, its rule, and its kind of numbers.
 
-    An array that is None, or that belongs to a part that is None, is not checked.
+    An array that is None, or in a part that is None, is not checked.
     """
 
-    name: str  # joined by dots, as in "limits.speed"
-    shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None: any shape
+    name: str  # dotted, as in "limits.speed"
+    shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None is any shape
     rule: Rule = FINITE
     kind: type = np.floating
 
@@ -80,7 +82,7 @@ Table = tuple[Field, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Ruled:
-    """One array of a case, and one rule that it has to keep."""
+    """One array of a case, and one rule that it must keep."""
 
     name: str
     value: Numbers
@@ -88,7 +90,7 @@ class Ruled:
     part: PyTree
 
     def holds(self) -> Numbers:
-        """Return where the array keeps the rule, bool of its shape."""
+        """Return where the array keeps the rule, a bool array of the same shape."""
         return self.rule.holds(self.value, self.part)
 
 
@@ -103,19 +105,18 @@ class Case(Protocol):
 
 
 def fields_of(tree: PyTree) -> dict[str, PyTree]:
-    """Return the fields of a dataclass by name, without copies."""
+    """Return the fields of a dataclass by name, without copying them."""
     return {field.name: getattr(tree, field.name) for field in dataclasses.fields(tree)}
 
 
 def nodes_of(tree: PyTree) -> dict[str, PyTree]:
     """Return the fields of a dataclass by name, without its static fields."""
-    values = fields_of(tree)
-    fields = dataclasses.fields(tree)
-    return {f.name: values[f.name] for f in fields if f.metadata.get("pytree_node", True)}
+    static = {f.name for f in dataclasses.fields(tree) if not f.metadata.get("pytree_node", True)}
+    return {name: value for name, value in fields_of(tree).items() if name not in static}
 
 
-def named(tree: PyTree, name: str) -> PyTree:
-    """Return the part of a tree under a name with dots, such as "limits.speed"."""
+def part_at(tree: PyTree, name: str) -> PyTree:
+    """Return the part of a tree with a dotted name, such as "limits.speed"."""
     for each in name.split("."):
         tree = None if tree is None else getattr(tree, each)
     return tree
@@ -132,44 +133,39 @@ def require_sound(cases: object, names: Mapping[str, str] | None = None) -> None
     Args:
         cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass. Of traced
             arrays, which have no values yet, only shape and kind are checked.
-        names: the caller's arguments by the fields that they become, for the message.
+        names: the caller's argument names by field names, for the message.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
             first such case of the batch.
-        ArgumentError: an array has not the shape of its field.
-        ArgumentTypeError: an array has not the kind of numbers of its field.
+        ArgumentError: an array does not have the shape of its field.
+        ArgumentTypeError: an array does not have the kind of numbers of its field.
     """
-    try:
-        _require_sound(cases)
-    except ArgumentError as error:
-        raise error.renamed(names or {}) from None
-
-
-def _require_sound(cases: object) -> None:
-    """Raise for the first rule that a case breaks, with the names of fields."""
     if isinstance(cases, type) or not isinstance(cases, Case):
         raise ArgumentTypeError("cases", "a case or a batch", shown=f"a {type(cases).__name__}")
-    require_shapes(cases)
-    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
-        return
-    for ruled in all_ruled(jax.tree.map(np.asarray, cases)):
-        words, other = ruled.rule.words, ruled.rule.other
-        require_rule(ruled.name, ruled.value, ruled.holds(), words, cases.batch_shape, other)
+    try:
+        require_shapes(cases)
+        if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(cases)):
+            return
+        for ruled in all_ruled(jax.tree.map(np.asarray, cases)):
+            words, other = ruled.rule.words, ruled.rule.other
+            require_rule(ruled.name, ruled.value, ruled.holds(), words, cases.batch_shape, other)
+    except ArgumentError as error:
+        raise error.with_names(names or {}) from None
 
 
 def require_rule(
     name: str, value: Numbers, holds: Numbers, words: str, batch: tuple[int, ...], other: str = ""
 ) -> None:
-    """Raise `CaseError` for the first case where a rule does not hold.
+    """Raise `CaseError` for the first case that breaks a rule.
 
     Args:
-        name: of the value, for the message.
+        name: name of the value, for the message.
         value: batch + shape.
         holds: batch + shape, bool, where the rule holds.
-        words: what the value must be.
+        words: the rule in words.
         batch: () or (B,).
-        other: name of the array that the value is compared with.
+        other: name of the array with which the value is compared.
     """
     broken = ~np.asarray(holds)
     if not broken.any():
@@ -192,20 +188,19 @@ def require_shapes(cases: PyTree) -> None:
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
         batch = _usual_batch(part)
-        values = fields_of(part)
-        for each in dataclasses.fields(part):
-            if values[each.name] is None and each.default is not None:
-                raise ArgumentTypeError(f"{place}{each.name}", "given", shown="None")
+        defaults = {field.name: field.default for field in dataclasses.fields(part)}
+        for name, value in fields_of(part).items():
+            if value is None and defaults[name] is not None:
+                raise ArgumentTypeError(f"{place}{name}", "given", shown="None")
         for field in type(part).rules:
-            value, name = named(part, field.name), place + field.name
+            value, name = part_at(part, field.name), place + field.name
             if value is None:
                 continue
             kind = np.asarray(value).dtype if isinstance(value, _PLAIN) else jnp.result_type(value)
-            if not jnp.issubdtype(kind, field.kind):
-                wanted = _KINDS[field.kind]
-                raise ArgumentTypeError(name, wanted, shown=f"an array of {kind}")
-            if kind == np.float16:
-                raise ArgumentTypeError(name, "in float32 or float64", shown=f"an array of {kind}")
+            if not jnp.issubdtype(kind, field.kind) or kind == np.float16:
+                is_half = kind == np.float16 and field.kind is np.floating
+                rule = "in float32 or float64" if is_half else _KINDS[field.kind]
+                raise ArgumentTypeError(name, rule, shown=f"an array of {kind}")
             if field.shape is None:
                 continue
             shape = np.shape(value)
@@ -224,15 +219,15 @@ def require_shapes(cases: PyTree) -> None:
 
 
 def _usual_batch(part: PyTree) -> tuple[int, ...]:
-    """Return the axes that most arrays of a part have in front of the axes of one case."""
+    """Return the most common axes in front of the axes of one case, among a part's arrays."""
     fronts: Counter[tuple[int, ...]] = Counter()
-    for name, size in {field.name: field.shape for field in type(part).rules}.items():
-        if size is not None and (value := named(part, name)) is not None:
-            fronts[np.shape(value)[: max(np.ndim(value) - len(size), 0)]] += 1
+    for name, shape in {field.name: field.shape for field in type(part).rules}.items():
+        if shape is not None and (value := part_at(part, name)) is not None:
+            fronts[np.shape(value)[: max(np.ndim(value) - len(shape), 0)]] += 1
     return fronts.most_common(1)[0][0] if fronts else ()
 
 
-_PLAIN = (np.ndarray, str, bytes)  # of which NumPy knows the kind, numbers or not
+_PLAIN = (np.ndarray, str, bytes)  # types whose kind NumPy finds quickly
 _KINDS = {
     np.floating: "floating-point numbers",
     np.integer: "whole numbers",
@@ -248,19 +243,19 @@ def is_sound(cases: PyTree) -> PyTree:
     """
     batch = cases.batch_shape
     held = [ruled.holds() for ruled in all_ruled(cases)]
-    # Joined before they are reduced: one loop of a compiled program, not one for every array.
+    # Joined before the reduction: one loop of a compiled program instead of one for each array.
     xp = numpy_of(*held)
     return xp.concatenate([each.reshape(*batch, -1) for each in held], axis=-1).all(axis=-1)
 
 
 def all_ruled(cases: PyTree) -> Iterator[Ruled]:
-    """Yield the rules of all arrays of a case, first the rule that they are finite."""
+    """Yield every rule of every array of a case, first the rule that its numbers are finite."""
     parts = list(_parts(cases))
     tables = [
         (place + field.name, field, part) for place, part in parts for field in type(part).rules
     ]
     free = {name for name, field, _ in tables if field.rule.infinite}
-    whole: list[str] = []  # places of parts whose numbers have been yielded
+    whole: list[str] = []  # prefixes of parts whose numbers have been yielded
     for place, part in parts:
         if any(place.startswith(outer) for outer in whole):
             continue
@@ -270,13 +265,13 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
             if name not in free and jnp.issubdtype(jnp.result_type(leaf), np.floating):
                 yield Ruled(name, leaf, FINITE, part)
     for name, field, part in tables:
-        value = named(part, field.name)
+        value = part_at(part, field.name)
         if field.rule is not FINITE and value is not None:
             yield Ruled(name, value, field.rule, part)
 
 
 def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
-    """Yield the places and parts of a case whose class has a table, outer ones first."""
+    """Yield dotted prefixes and parts of a case whose class has a table, outer parts first."""
     if getattr(type(tree), "rules", None):
         yield place, tree
     children: Mapping[str, PyTree] = {}

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.plan_files import PlanFileError, load_fitting, named_leaves
+from planner_jax.core.plan_files import PlanFileError, leaves_by_name, load_fitting
 from planner_jax.core.protocol import Plan, Status, is_solved, take
 from planner_jax.robot.arm import ArmPlan, ArmSetpoints
 from planner_jax.robot.car import CarPlan, CarSetpoints
@@ -85,7 +85,7 @@ def robot_of(plan: Plan) -> Robot:
 def _require_shapes(plan: Plan, robot: Robot) -> None:
     """Raise unless the leaves of one plan have the shapes of its robot."""
     sizes: dict[int | str, int] = {}
-    leaves = named_leaves(plan)
+    leaves = leaves_by_name(plan)
     for name, wanted in robot.shapes.items():
         shape = np.shape(leaves[name])
         fits = len(shape) == len(wanted) and all(
@@ -158,7 +158,7 @@ def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
     if row is None or not 0 <= row < shape[0]:
         shown = "nothing" if row is None else str(row)
         raise ArgumentError("row", f"from 0 to {shape[0] - 1}", shown=shown)
-    sizes = {np.shape(leaf)[:1] for leaf in named_leaves(plans).values()}
+    sizes = {np.shape(leaf)[:1] for leaf in leaves_by_name(plans).values()}
     if len(shape) != 1 or len(sizes) != 1:
         raise PlanFileError("path", "as much of every plan", str(path), verb="hold")
     return take(plans, row)

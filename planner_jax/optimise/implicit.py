@@ -18,7 +18,7 @@ from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import require_fit
-from planner_jax.core.protocol import marked, status_of
+from planner_jax.core.protocol import mark_bad_input, status_of
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Objective
@@ -163,4 +163,4 @@ def optimal_plan(
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
     plan = planner.decode(point, context).replace(cost=cost(point))
     plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
-    return marked(plan, case)
+    return mark_bad_input(plan, case)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
 
+from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.planner import CaseT, Planner, PlanT
 from planner_jax.optimise.multistart import solve_batch, solve_round
 from planner_jax.optimise.settings import (
@@ -165,14 +166,17 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.changed((("rounds", (first, *others)),))
 
     def with_effort(self, effort: str) -> Self:
-        """Return the planner with a first round that searches on after every limit holds.
+        """Return the planner with a first round that continues after every limit holds.
+
+        The rounds after the first one, for the cases that it leaves unsolved, stay as they are.
 
         Args:
-            effort: "good" for an iteration of Newton's method, "best" for 8, and more of the cases
-                that still have something to gain: 2 % of the cost for "good", 1e-7 for "best".
-                The rounds behind it, for what it leaves unsolved, stay as they are.
+            effort: "good" adds one iteration of Newton's method, "best" adds 8. Some of the cases
+                get more while they expect a decrease of the cost by more than 2 % ("good") or
+                1e-7 ("best"). "feasible" returns the planner itself.
         """
-        return self.polished(self._suited(_EFFORTS[effort]))
+        require_one_of(EFFORTS, "effort", effort)
+        return self.polished(self._suited(_EFFORTS[effort])) if effort in _EFFORTS else self
 
     def _suited(self, solver: NewtonConfig) -> NewtonConfig:
         """Return the settings with the number of vectors that the preconditioner needs."""

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.core.checks import numeric, require_kind, require_number
+from planner_jax.core.checks import require_kind, require_number, require_numbers
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
@@ -64,8 +64,7 @@ class LbfgsConfig:
         for name in ("step_cap", "tolerance"):
             require_number(name, vars(self)[name], NOT_NEGATIVE)
         steps = self.trial_steps
-        if not isinstance(steps, tuple) or any(numeric(each) is None for each in steps):
-            raise ArgumentTypeError("trial_steps", "a tuple of numbers", steps)
+        require_numbers("trial_steps", steps)
         if not steps or not all(0.0 < each < jnp.inf for each in steps):
             raise ArgumentError("trial_steps", "finite and > 0, one or more", steps)
 
@@ -102,8 +101,7 @@ class NewtonConfig:
         for name in ("damping", "ease", "tighten", "step_cap", "tolerance", "trusted", "slack"):
             require_number(name, vars(self)[name], NOT_NEGATIVE)
         trials = self.trial_dampings
-        if not isinstance(trials, tuple) or any(numeric(each) is None for each in trials):
-            raise ArgumentTypeError("trial_dampings", "a tuple of numbers", trials)
+        require_numbers("trial_dampings", trials)
         if not trials or not all(0.0 <= each < jnp.inf for each in trials):
             raise ArgumentError("trial_dampings", "finite and >= 0, one or more", trials)
         later = self.stragglers

@@ -25,7 +25,7 @@ from planner_jax.core.protocol import (
     Status,
     is_resident,
     is_unsolved,
-    marked,
+    mark_bad_input,
     out_of_time,
     select,
     select_into,
@@ -164,7 +164,7 @@ def plan_on_host(
     def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: PyTree) -> PyTree:
         watch.tell(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf: leaf[lanes], cases)
-        later = marked(planner.solve_on_host(some, attempt), some)
+        later = mark_bad_input(planner.solve_on_host(some, attempt), some)
         watch.tell(planner, attempt, lanes.size, lanes.size)
         return jax.tree.map(np.array, later) if plans is None else select_into(plans, later, lanes)
 

@@ -21,7 +21,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDev
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, is_unsolved, marked
+from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 
 # Lanes of a device in one call. Few sizes, because every one is a program of its own to compile.
@@ -161,7 +161,7 @@ def solve_cases(planner: Planner, cases: PyTree, attempt: Attempt) -> PyTree:
     require_shapes(cases)
     alone = cases.batch_shape == ()
     plans = planner.solve(cases, attempt) if alone else planner.solve_lanes(cases, attempt)
-    return marked(plans, cases)
+    return mark_bad_input(plans, cases)
 
 
 @functools.partial(jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS)

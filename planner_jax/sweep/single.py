@@ -109,7 +109,7 @@ class Single(abc.ABC, Generic[SingleT]):
             planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
             found = plan(planner, case)
         except CaseError as error:
-            raise error.renamed(dict(map(self._setting_of, (error.name, error.other)))) from None
+            raise error.with_names(dict(map(self._setting_of, (error.name, error.other)))) from None
         return Answer(case, found, self.task.judge(case, found))
 
     def _setting_of(self, field: str) -> tuple[str, str]:

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.plan_files import named_leaves
+from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
@@ -223,7 +223,7 @@ def require_arm(world: World, cases: BlockCase) -> None:
 
 def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
     """Return all leaves of cases (B, ...) in float64 by dotted names, as in the referee."""
-    return {name: np.asarray(leaf, float) for name, leaf in named_leaves(cases).items()}
+    return {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(cases).items()}
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import strategies as st
 
 import planner_jax as pj
-from planner_jax.core.rules import named
+from planner_jax.core.rules import part_at
 from planner_jax.policies.policy import Policy, policy
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock
@@ -62,7 +62,7 @@ def having(tree, name, value):
 
 def filled(tree, name, value):
     """A case with one number all over a place."""
-    return having(tree, name, np.full_like(named(tree, name), value))
+    return having(tree, name, np.full_like(part_at(tree, name), value))
 
 
 def first(num, plans):

@@ -1,4 +1,4 @@
-"""Absurd cases in a batch: each is marked, and no other case loses a bit."""
+"""Absurd cases in a batch: each is mark_bad_input, and no other case loses a bit."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.poisoned_batches import compare, poisoned, poisons
-from planner_jax.core.rules import is_sound, named
+from planner_jax.core.rules import is_sound, part_at
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
@@ -31,7 +31,7 @@ def test_a_table_names_arrays_of_its_case_and_every_rule_can_be_broken(name):
     case = pj.take(jax.tree.map(np.asarray, drawn), 0)
     fields = [field.name for field in type(case).rules]
     for field in fields:
-        named(case, field)
+        part_at(case, field)
     assert {place for place, _ in poisons(case)} >= {
         field.name for field in type(case).rules if field.kind is np.floating
     }
@@ -55,7 +55,7 @@ def test_the_host_names_field_rule_value_and_lane(name):
     cases = CASES[name]
     for place, value in poisons(pj.take(cases, 0))[::5]:
         broken = jax.tree.map(np.array, cases)
-        leaf = named(broken, place.replace("extras.", "extras."))
+        leaf = part_at(broken, place.replace("extras.", "extras."))
         leaf[1] = value
         with pytest.raises(pj.CaseError) as caught:
             pj.require_sound(broken)
@@ -90,6 +90,6 @@ def test_groups_of_too_many_targets_are_refused():
 @pytest.mark.parametrize(("name", "num"), [("hit", 20_000), ("catch", 2_000)])
 def test_poisoned_lanes_are_marked_and_all_others_keep_their_bits(name, num):
     found = compare(pj.task_named(name), num, 100, 1)
-    assert found["marked"] == found["poisoned"] == num // 100
+    assert found["mark_bad_input"] == found["poisoned"] == num // 100
     assert found["marked_others"] == 0
     assert found["unchanged"] == found["others"]

@@ -7,7 +7,6 @@ from jax import Array
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.prediction import PathTable
 from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath
-from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
@@ -58,7 +57,7 @@ def planner(
         TypeError: the planner has no such field.
     """
     decision = find_decision(DECISIONS, decide, TRAINED)
-    own = with_effort(TASK.make_planner(name, options), effort)
+    own = TASK.make_planner(name, options).with_effort(effort)
     decided = DecidedPlanner(own, decision)
     if recovery is None:
         return decided

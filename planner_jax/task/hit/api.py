@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jax.typing import DTypeLike
 
-from planner_jax.core.choices import with_effort
 from planner_jax.core.planner import Planner
 from planner_jax.core.registry import suite_named
 from planner_jax.referee.hit import HitVerdict, referee_hits
@@ -93,7 +92,7 @@ def planner(
         TypeError: the planner has no such field.
         ModuleNotFoundError: the planner needs an extra that is not installed.
     """
-    made = with_effort(TASK.make_planner(name, options), effort)
+    made = TASK.make_planner(name, options).with_effort(effort)
     if recovery is None:
         return made
     from planner_jax.recovery.with_recovery import add_recovery  # few hits need it

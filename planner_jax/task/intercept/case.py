@@ -222,5 +222,5 @@ def _for_batch(
         one = obstacles(given, velocities, dtype=dtype)
     except ArgumentError as error:
         names = {"polygons": name, "velocities": "mover_velocities"}
-        raise error.renamed(names) from None
+        raise error.with_names(names) from None
     return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, batch + leaf.shape), one)

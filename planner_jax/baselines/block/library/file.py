@@ -25,7 +25,7 @@ from planner_jax.baselines.block.library.table import (
     pieces_of,
 )
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.plan_files import UNREADABLE, build_tree, named_leaves
+from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
@@ -42,7 +42,7 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
     """
     table, setting = library.table, library.setting
     arrays = {"rows": np.asarray(table.rows, "<f4"), "homes": np.asarray(table.homes, "<f4")}
-    arrays |= {name: _plain(leaf) for name, leaf in named_leaves(setting).items()}
+    arrays |= {name: _plain(leaf) for name, leaf in leaves_by_name(setting).items()}
     header: dict[str, object] = {
         "fingerprint": fingerprint(setting),
         "layout": dataclasses.asdict(table.layout),
