@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from matplotlib.figure import Figure
@@ -20,6 +21,7 @@ from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
+from planner_jax.runs.dataset import ROW_GROUP, Dataset, encode
 from planner_jax.runs.run_folder import LOCK, RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import CompileClock
@@ -166,6 +168,15 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
 def test_rows_are_picked_across_parts(finished):
     picked = RunFolder(finished[0]).plans.pick([BATCH, 0, NUM - 1, BATCH], ["index"])
     assert [row["index"] for row in picked] == [0, BATCH, NUM - 1]
+
+
+def test_rows_are_picked_across_the_row_groups_of_parts(tmp_path):
+    plans, num = Dataset(tmp_path), 2 * ROW_GROUP + 10
+    for part in range(2):
+        indices = np.arange(part * num, (part + 1) * num)
+        plans.write(part, encode(pa.table({"index": indices}), {}))
+    rows = [0, ROW_GROUP - 1, ROW_GROUP, num - 1, num, num + 2 * ROW_GROUP, 2 * num - 1]
+    assert [row["index"] for row in plans.pick(rows)] == rows
 
 
 def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):

@@ -150,7 +150,7 @@ class Dataset:
             size = fragment.metadata.num_rows
             if any(first <= row < first + size for row in wanted):
                 for group in fragment.split_by_row_group():
-                    num = group.count_rows()
+                    num = sum(info.num_rows for info in group.row_groups)
                     local = [row - first for row in wanted if first <= row < first + num]
                     if local:
                         picked += group.to_table(columns=columns).take(local).to_pylist()
