@@ -32,8 +32,8 @@ from planner_jax.optimise.settings import LbfgsConfig
 from planner_jax.planning.decided import first_choice
 from planner_jax.trajectory.proportional_minco import (
     Chain,
-    chain_motion,
     chain_rows,
+    sample_motion,
     trajectory_energy,
 )
 
@@ -112,7 +112,8 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
     rows = chain_rows(case.head_state, ends.tail_states, durations)
     chain = Chain(rows=rows, offsets=offsets, piece_durations=durations)
     active = planner.active(context)
-    motion = chain_motion(planner.maps, planner.nodes, chain, along.orders)
+    sample = functools.partial(sample_motion, planner.maps, planner.nodes, orders=along.orders)
+    motion = jax.vmap(sample)(chain.columns, durations)
     excess = jnp.stack(limits_along(motion, (case.gravity, case.limits, case.extras)))
     excess = jnp.where(active[:, None], excess, -1.0)
     inside = jnp.maximum(excess + jnp.asarray(along.margins, point.dtype)[:, None, None], 0.0)

@@ -22,7 +22,6 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.trajectory.polynomial import derivative_factors
 from planner_jax.trajectory.proportional_minco import (
-    equal_pieces,
     proportional_minco,
     proportional_trajectory,
     trajectory_energy,
@@ -127,7 +126,7 @@ def test_energy_gradient_at_the_catch_is_the_papers():
     The gradients by coefficients and durations are pulled back to the catching state, the
     waypoints and the duration.
     """
-    maps = proportional_minco(4, equal_pieces(4))
+    maps = proportional_minco(4, (1.0,) * 4)
     rng = np.random.default_rng(1)
     given = rng.normal(size=(8, 3)), rng.normal(size=(3, 3)), np.asarray(0.31)
     pieces, pull = jax.jit(lambda *x: jax.vjp(lambda *y: proportional_trajectory(maps, *y), *x))(

@@ -8,7 +8,6 @@ from jax import lax
 from jaxpr import assert_full_precision
 
 from planner_jax.trajectory.proportional_minco import (
-    equal_pieces,
     proportional_minco,
     proportional_trajectory,
     sample_motion,
@@ -30,7 +29,7 @@ def custom_derivative(product):
 
 def proportional_values(rows, offsets, duration):
     """One number of everything that the maps of fixed proportions give."""
-    args = proportional_minco(4, equal_pieces(4)), rows, offsets, duration
+    args = proportional_minco(4, (1.0,) * 4), rows, offsets, duration
     parts = (
         proportional_trajectory(*args),
         sample_motion(args[0], 5, jnp.concatenate(args[1:3]), args[3]),

@@ -15,7 +15,7 @@ from jax import Array
 
 from planner_jax.core.arithmetic import Components, at_least, components, inverse_sqrt, reciprocal
 from planner_jax.core.protocol import Plan
-from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, joined
+from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
 # By how much limits may be exceeded here, far more than in any plan that is solved: how closely
 # peaks are looked at must not matter to a bound.
@@ -288,7 +288,7 @@ class QuadrotorPlan(Plan):
     @property
     def whole(self) -> PiecewisePolynomial:
         """The trajectory and the recovery in one, of a plan or of a batch."""
-        return self.trajectory if self.recovery is None else joined(self.trajectory, self.recovery)
+        return self.trajectory if self.recovery is None else join(self.trajectory, self.recovery)
 
     def sample(self, rate: float) -> QuadrotorSetpoints:
         """Sample the plan, or the batch, at a rate [Hz] up to its end, `recovery` included.

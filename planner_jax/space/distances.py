@@ -1,18 +1,26 @@
-"""How far segments and rectangles in space are from each other, from boxes and from poles.
+"""Distances between segments and rectangles in space, and of both from boxes, poles and the ground.
 
-Closed forms for ONE pair of bodies, without loops or branches; `jax.vmap` makes many. A capsule is
-a segment with a radius: its distance is that of the segment less the radius. World frame or any
-other, SI units; the ground is the plane of x and y.
+Every function is a closed form for ONE pair of bodies, without loops or branches; `jax.vmap` makes
+many. The distance of a capsule is the distance of its segment less its radius. Any frame, SI units;
+the ground is the plane of x and y. The bodies are:
 
-Each distance is |gap| at the nearest points, and these are where the gap is shortest. Moving them
-along their bodies therefore changes the distance only in second order, so its slope is that of the
-gap between points that are held (the envelope theorem). `_shortest` says so to JAX: slopes cost
-little more than values, and need no division by the sine of two bodies that are nearly parallel.
-Bodies that cross have distance 0 and slope 0. Where several points are nearest, as between
-parallel bodies, the slope is that for one pair of them. `approach` gives the line through both,
-from which the slopes by many turns and moves follow in a few products.
+* a segment: `ends` (2, 3) [m], which may coincide;
+* a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
+  middle, at right angles and longer than zero;
+* a box along the axes: its corners `lower` and `upper` (3,) [m], `lower` <= `upper`;
+* a vertical line of infinite length, such as the axis of a pole: its `place` (2,) [m] on the
+  ground.
 
-Vectors are tuples of components here, so that everything is one elementwise loop over the lanes.
+A distance is the least length |gap| of a vector between points of both bodies. Moving the nearest
+points along their bodies changes it only in second order, so the derivative of the distance is the
+derivative of |gap| at fixed nearest points (the envelope theorem). `_shortest` declares this rule
+to JAX: derivatives cost little more than values, and need no division by the sine of the angle
+between nearly parallel bodies. Bodies that cross have distance 0 and derivative 0. If several pairs
+of points are nearest, as between parallel bodies, the derivative belongs to one of them. `approach`
+returns the line through the nearest points, from which the derivatives by many rotations and
+translations follow in a few products.
+
+Vectors are tuples of components here, so that XLA compiles one elementwise loop over the batch.
 """
 
 from collections.abc import Callable
@@ -25,113 +33,70 @@ from jax import Array, lax
 
 Vector = tuple[Array, ...]
 
-# [m^2] and its like: what is below is zero, such as the square of a segment without length.
-_TINY = 1e-24
+_TINY = 1e-24  # smaller squares of lengths [m^2] or areas [m^4] count as zero
 
 
 def segment_to_segment(ends_a: Array, ends_b: Array) -> Array:
-    """Distance of two segments.
-
-    Args:
-        ends_a: (2, 3) [m], which may be the same point twice.
-        ends_b: likewise.
-
-    Returns:
-        () [m].
-    """
+    """Return the distance () [m] of two segments."""
     return _shortest(_nearest_of_segments, _gap_of_segments, (ends_a, ends_b))
 
 
 def segment_to_rectangle(ends: Array, middle: Array, edges: Array) -> Array:
-    """Distance of a segment and a flat rectangle, 0 where they cross.
-
-    Args:
-        ends: (2, 3) [m], which may be the same point twice.
-        middle: (3,) [m], of the rectangle.
-        edges: (2, 3) [m], halves of its edges as vectors from the middle, at right angles and
-            longer than zero.
-
-    Returns:
-        () [m].
-    """
+    """Return the distance () [m] of a segment and a flat rectangle, 0 if they cross."""
     return _shortest(_nearest_of_rectangle, _gap_to_rectangle, (ends, middle, edges))
 
 
 def segment_to_box(ends: Array, lower: Array, upper: Array) -> Array:
-    """Distance of a segment and a box along the axes, 0 where any of the segment is inside.
-
-    Args:
-        ends: (2, 3) [m], which may be the same point twice.
-        lower: (3,) [m], the box's corner of the least coordinates.
-        upper: (3,) [m], that of the greatest, none below the least.
-
-    Returns:
-        () [m].
-    """
+    """Return the distance () [m] of a segment and a box, 0 if a point of the segment is inside."""
     return _shortest(_nearest_of_box, _gap_to_box, (ends, lower, upper))
 
 
 def segment_to_vertical_line(ends: Array, place: Array) -> Array:
-    """Distance of a segment and an endless vertical line, such as the axis of a tall pole.
-
-    Args:
-        ends: (2, 3) [m], which may be the same point twice or stand upright.
-        place: (2,) [m], where the line goes through the ground.
-
-    Returns:
-        () [m], within the plane of x and y.
-    """
+    """Return the horizontal distance () [m] of a segment and a vertical line."""
     return _shortest(_nearest_to_line, _gap_to_line, (ends, place))
 
 
 def rectangle_to_vertical_line(middle: Array, edges: Array, place: Array) -> Array:
-    """Distance of a flat rectangle and an endless vertical line, 0 where the line crosses it.
+    """Return the horizontal distance () [m] of a rectangle and a vertical line, 0 if they cross.
 
-    Args:
-        middle: (3,) [m], of the rectangle.
-        edges: (2, 3) [m], halves of its edges as vectors from the middle, in any directions: any
-            parallelogram will do, also one that stands upright.
-        place: (2,) [m], where the line goes through the ground.
-
-    Returns:
-        () [m], within the plane of x and y.
+    The edges need not be at right angles: any parallelogram is valid, also an upright one.
     """
     return _shortest(_nearest_of_projection, _gap_of_projection, (middle, edges, place))
 
 
 def lowest_of_segment(ends: Array) -> Array:
-    """Height () [m] of the lowest point of a segment (2, 3) [m]."""
+    """Return the height () [m] of the lowest point of a segment."""
     return jnp.minimum(ends[0, 2], ends[1, 2])
 
 
 def lowest_of_rectangle(middle: Array, edges: Array) -> Array:
-    """Height () [m] of the lowest point of a rectangle, given as for `segment_to_rectangle`."""
+    """Return the height () [m] of the lowest point of a rectangle."""
     return middle[2] - jnp.abs(edges[0, 2]) - jnp.abs(edges[1, 2])
 
 
 class Approach(NamedTuple):
-    """The line through the nearest points of two bodies, in Pluecker's coordinates."""
+    """The line through the nearest points of two bodies, in Pluecker coordinates."""
 
-    direction: Vector  # 3 times (), unit, from the second body to the first; 0 where they cross
-    moment: Vector  # 3 times () [m], point x direction, of any point of the line
+    direction: Vector  # 3 times (), unit, from the second body to the first; 0 if they cross
+    moment: Vector  # 3 times () [m], p x direction for any point p of the line
 
 
 def approach(distance: Callable, *bodies: Array) -> Approach:
-    """Where bodies have a distance of this module.
+    """Return the line through the nearest points of two bodies.
 
-    If the first body turns about an axis a through a point o, its distance changes by
-    a . (moment - o x direction) a radian; if the second one does, by as much the other way.
+    If the first body turns about an axis a through a point o, the derivative of the distance by the
+    angle is a . (moment - o x direction). If the second body turns, the sign is the opposite.
 
     Args:
-        distance: a function of this module. Of the lowest points, the second body is the ground.
-        bodies: its arguments.
+        distance: a distance or a height of this module; for a height the second body is the ground.
+        bodies: the arguments of `distance`.
     """
-    nearest_of, gap_of, point_of = _SIDES[distance]
+    nearest_of, gap_of, point_of = _PARTS[distance]
     nearest = nearest_of(*bodies)
     point, gap = point_of(nearest, *bodies), gap_of(nearest, *bodies)
-    # Within the plane of x and y it has two components.
+    # A horizontal gap has two components.
     gap = (*gap, *[jnp.zeros_like(gap[0])] * (3 - len(gap)))
-    # Quotients in the end: XLA works such out once, and what is no division once for each use.
+    # Divide last: XLA computes a quotient once, but other arithmetic once for each use.
     length = _length(gap)
     length = jnp.where(length > 0.0, length, jnp.inf)
     direction, moment = (tuple(x / length for x in each) for each in (gap, cross(point, gap)))
@@ -140,10 +105,10 @@ def approach(distance: Callable, *bodies: Array) -> Approach:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Array:
-    """Return the distance () [m] of bodies.
+    """Return the distance () [m] of two bodies.
 
-    `nearest` returns what names the nearest points, such as shares of segments, and `gap` the
-    vector between these points, to the first body's.
+    `nearest` returns the parameters of the nearest points, such as shares of segments. `gap`
+    returns the vector from the second body's nearest point to the first body's.
     """
     return _length(gap(nearest(*bodies), *bodies))
 
@@ -151,18 +116,18 @@ def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Ar
 @_shortest.defjvp
 def _shortest_jvp(nearest: Callable, gap: Callable, primals: Any, tangents: Any) -> Any:
     (bodies,) = primals
-    # Held, since every slope would work it out anew.
-    held = lax.optimization_barrier(nearest(*bodies))
-    return jax.jvp(lambda bodies: _length(gap(held, *bodies)), primals, tangents)
+    # Without the barrier XLA would compute the nearest points again for every derivative.
+    fixed = lax.optimization_barrier(nearest(*bodies))
+    return jax.jvp(lambda bodies: _length(gap(fixed, *bodies)), primals, tangents)
 
 
 def _nearest_of_segments(ends_a: Array, ends_b: Array) -> tuple[Array, Array]:
-    """Shares of both segments where they are nearest.
+    """Return the shares of both segments at which they are nearest.
 
-    First the share at which the lines are nearest, then for each segment in turn that nearest to
-    the point of the other, which ends at the optimum (C. Ericson, Real-Time Collision Detection,
-    2005, 5.1.9). The first is computed from the normal u x v and not from products of dots, so
-    that in float32 it is right for lines at any angle.
+    The first share is where the infinite lines are nearest. Then each segment in turn takes its
+    point nearest to the other's point, which ends at the optimum (C. Ericson, Real-Time Collision
+    Detection, 2005, 5.1.9). The first share is computed from the normal u x v, not from products of
+    dot products, so that it is accurate in float32 for lines at any angle.
     """
     (start_a, end_a), (start_b, end_b) = _rows(ends_a), _rows(ends_b)
     u, v, between = _minus(end_a, start_a), _minus(end_b, start_b), _minus(start_b, start_a)
@@ -178,29 +143,29 @@ def _gap_of_segments(shares: tuple[Array, Array], ends_a: Array, ends_b: Array) 
     return _minus(_point(ends_a, shares[0]), _point(ends_b, shares[1]))
 
 
-def _nearest_of_box(ends: Array, lower: Array, upper: Array) -> Array:
-    """The share of the segment that is nearest to the box."""
+def _nearest_of_box(ends: Array, lower: Array, upper: Array) -> tuple[Array]:
+    """Return the share of the segment at which it is nearest to the box."""
     start, end = _rows(ends)
-    return _share_nearest_to_slabs(
-        [
-            _slab(low - x, high - x, speed, speed * speed)
-            for x, speed, low, high in zip(start, _minus(end, start), lower, upper, strict=True)
-        ]
-    )
+    slabs = [
+        _slab(low - x, high - x, speed, speed * speed)
+        for x, speed, low, high in zip(start, _minus(end, start), lower, upper, strict=True)
+    ]
+    return (_share_nearest_to_slabs(slabs),)
 
 
-def _gap_to_box(share: Array, ends: Array, lower: Array, upper: Array) -> Vector:
-    point = _point(ends, share)
+def _gap_to_box(shares: tuple[Array], ends: Array, lower: Array, upper: Array) -> Vector:
+    point = _point(ends, shares[0])
     return tuple(
         x - jnp.clip(x, low, high) for x, low, high in zip(point, lower, upper, strict=True)
     )
 
 
 def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
-    """Shares of the segment and of both half-edges, from -1 to 1, and whether the bodies part.
+    """Return the shares of the segment and the half-edges, and whether the bodies are apart.
 
-    The rectangle is a box without thickness along axes of its own: of the half-edges e and f and
-    of e x f. Squared lengths are all in units of |e|^2 |f|^2, which saves divisions.
+    Shares of half-edges are from -1 to 1. The rectangle is a box without thickness along axes of
+    its own: the half-edges e and f, and e x f. Squared lengths are in units of |e|^2 |f|^2, which
+    saves divisions.
     """
     (start, end), (e, f) = _rows(ends), _rows(edges)
     step, away = _minus(end, start), _minus(start, tuple(middle))
@@ -235,18 +200,22 @@ def _gap_to_rectangle(nearest: Any, ends: Array, middle: Array, edges: Array) ->
 
 
 class _Slab(NamedTuple):
-    """What lies between two parallel planes, as a segment meets it."""
+    """The intersection of a segment's line with the space between two parallel planes."""
 
     enters: Array  # () share of the segment at which its line enters
-    leaves: Array  # () the same where it leaves, at least `enters`
-    weight: Array  # () squared length of the segment across the slab; 0 if it lies along
+    leaves: Array  # () share at which the line leaves, at least `enters`
+    weight: Array  # () squared length of the segment across the slab; 0 if it is parallel
 
 
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
-    """A slab by the ways () from a segment's start to both planes, and its length across."""
+    """Make a slab from the distances () of both planes from a segment's start.
+
+    `speed` and `weight` are the segment's length across the slab, and its square.
+    """
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)
-    # Not times the inverse: a product may be fused with a later difference, which then is not 0.
+    # Do not multiply by the inverse: a product may be fused with a later difference, which then
+    # is not exactly 0.
     first, last = to_low / step, to_high / step
     return _Slab(
         enters=jnp.minimum(first, last),
@@ -256,56 +225,56 @@ def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
 
 
 def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
-    """Share () of a segment that is nearest to what three slabs at right angles have in common.
+    """Return the share () of a segment nearest to the intersection of three orthogonal slabs.
 
-    The squared distance of the segment's points is a sum over the slabs of squared ways back into
-    them. It is convex, and half its slope by the share s,
+    The squared distance of a point of the segment is the sum over the slabs of its squared distance
+    from each. It is convex in the share s, and half its derivative,
 
         sum_i  weight_i (max(s - leaves_i, 0) - max(enters_i - s, 0)),
 
-    is piecewise linear, with bends where the segment's line enters and leaves the slabs. It never
-    falls: its zero lies between the last bend with no more than 0 and the first with no less, and
-    is found there by interpolation. Where it is 0 on a whole interval, the middle is taken.
+    is piecewise linear and never falls, with kinks where the segment's line enters and leaves the
+    slabs. Its zero lies between the last kink with a value <= 0 and the first with a value >= 0,
+    and is found there by interpolation. If it is 0 on a whole interval, the middle is returned.
 
-    Written so, a slab adds exactly 0 at its own bends in float32 too. Computed from coordinates it
-    would add the rounding of a segment that runs across it, beside which the slope of the others,
-    if the segment is nearly along them, is nothing: the zero would be found elsewhere.
+    In this form a slab adds exactly 0 at its own kinks, also in float32. Computed from coordinates
+    it would add a rounding error in proportion to the segment's length across it. That error hides
+    the other terms if the segment is nearly parallel to their slabs, and moves the zero.
     """
 
-    def slope(s: Array | float) -> Array:
+    def half_derivative(s: Array | float) -> Array:
         a, b, c = (
             slab.weight * (jnp.maximum(s - slab.leaves, 0.0) - jnp.maximum(slab.enters - s, 0.0))
             for slab in slabs
         )
         return a + b + c
 
-    low = jnp.where(slope(1.0) <= 0.0, 1.0, 0.0)
-    high = jnp.where(slope(0.0) >= 0.0, 0.0, 1.0)
+    low = jnp.where(half_derivative(1.0) <= 0.0, 1.0, 0.0)
+    high = jnp.where(half_derivative(0.0) >= 0.0, 0.0, 1.0)
     for slab in slabs:
-        for bend in (_unit(slab.enters), _unit(slab.leaves)):
-            value = slope(bend)
-            low = jnp.where(value <= 0.0, jnp.maximum(low, bend), low)
-            high = jnp.where(value >= 0.0, jnp.minimum(high, bend), high)
-    fall, rise = slope(low), slope(high)
+        for kink in (_unit(slab.enters), _unit(slab.leaves)):
+            value = half_derivative(kink)
+            low = jnp.where(value <= 0.0, jnp.maximum(low, kink), low)
+            high = jnp.where(value >= 0.0, jnp.minimum(high, kink), high)
+    fall, rise = half_derivative(low), half_derivative(high)
     rises = rise > fall
     between = jnp.where(rises, low * rise - high * fall, 0.5 * (low + high))
     return between / jnp.where(rises, rise - fall, 1.0)
 
 
-def _nearest_to_line(ends: Array, place: Array) -> Array:
+def _nearest_to_line(ends: Array, place: Array) -> tuple[Array]:
     start, end = _ground(ends)
     step = _minus(end, start)
-    return _unit(_ratio(dot(_minus(tuple(place), start), step), dot(step, step)))
+    return (_unit(_ratio(dot(_minus(tuple(place), start), step), dot(step, step))),)
 
 
-def _gap_to_line(share: Array, ends: Array, place: Array) -> Vector:
-    return _minus(_point(ends, share)[:2], tuple(place))
+def _gap_to_line(shares: tuple[Array], ends: Array, place: Array) -> Vector:
+    return _minus(_point(ends, shares[0])[:2], tuple(place))
 
 
 def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
-    """Shares of both half-edges, from -1 to 1, and whether the line parts from the rectangle.
+    """Return the shares of both half-edges, from -1 to 1, and whether the line is outside.
 
-    They are those of the nearest point of the four edges of the rectangle's projection.
+    They belong to the nearest point on the four edges of the rectangle's projection.
     """
     e, f = _ground(edges)
     to_x, to_y = to = tuple(x - m for x, m in zip(place, middle[:2], strict=True))
@@ -325,7 +294,7 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
             p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # A projection without width has points far off on its line that the areas do not tell apart.
+    # All areas are 0 for points in line with a projection without width, however far off.
     inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 
@@ -340,16 +309,16 @@ def _gap_of_projection(nearest: Any, middle: Array, edges: Array, place: Array) 
 
 
 def _length(vector: Vector) -> Array:
-    """Length () of a vector; 0, with slope 0, of one that is too short to have a direction."""
+    """Return the length () of a vector; 0, with derivative 0, if it is too short."""
     square = dot(vector, vector)
     apart = square > _TINY
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
 
 
 def _ratio(top: Array, square: Array) -> Array:
-    """The quotient of two numbers (), 0 where the second, a square, is 0."""
-    there = square > _TINY
-    return jnp.where(there, top / jnp.where(there, square, 1.0), 0.0)
+    """Return top / square (), or 0 if the square is 0."""
+    is_positive = square > _TINY
+    return jnp.where(is_positive, top / jnp.where(is_positive, square, 1.0), 0.0)
 
 
 def _unit(share: Array) -> Array:
@@ -357,18 +326,18 @@ def _unit(share: Array) -> Array:
 
 
 def _point(ends: Array, share: Array) -> Vector:
-    """The point of a segment (2, 3) at a share () of it."""
+    """Return the point of a segment (2, 3) at a share ()."""
     start, end = _rows(ends)
     return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
 
 
 def _rows(pair: Array) -> tuple[Vector, Vector]:
-    """Two vectors (2, 3), each as its components."""
+    """Split two vectors (2, 3) into their components."""
     return tuple(pair[0]), tuple(pair[1])
 
 
 def _ground(pair: Array) -> tuple[Vector, Vector]:
-    """Two vectors (2, 3) projected onto the ground, each as its components."""
+    """Project two vectors (2, 3) onto the ground and split them into their components."""
     return tuple(pair[0, :2]), tuple(pair[1, :2])
 
 
@@ -377,35 +346,33 @@ def _minus(a: Vector, b: Vector) -> Vector:
 
 
 def dot(a: Vector, b: Vector) -> Array:
-    """The scalar product of two vectors."""
+    """Return the scalar product of two vectors."""
     first, *others = (x * y for x, y in zip(a, b, strict=True))
     return sum(others, first)
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """The cross product of two vectors."""
+    """Return the cross product of two vectors."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _area(a: Vector, b: Vector) -> Array:
-    """Signed area () of the parallelogram of two vectors in the plane."""
+    """Return the signed area () of the parallelogram of two vectors in the plane."""
     return a[0] * b[1] - a[1] * b[0]
 
 
-def _nearest_end(ends: Array) -> Vector:
-    """The lower end of a segment."""
+def _lowest_end(ends: Array) -> Vector:
     start, end = _rows(ends)
     return tuple(jnp.where(start[2] < end[2], a, b) for a, b in zip(start, end, strict=True))
 
 
-def _nearest_corner(middle: Array, edges: Array) -> Vector:
-    """The lowest point of a rectangle."""
+def _lowest_corner(middle: Array, edges: Array) -> Vector:
     p, q = -jnp.sign(edges[0, 2]), -jnp.sign(edges[1, 2])
     return _point_of_rectangle((p, q), middle, edges)
 
 
 def _gap_to_ground(lowest: Vector, *bodies: Array) -> Vector:
-    """Upwards, of any length."""
+    """Return a vector upwards; its length does not matter."""
     return (jnp.zeros_like(lowest[0]), jnp.zeros_like(lowest[0]), jnp.ones_like(lowest[0]))
 
 
@@ -414,25 +381,21 @@ def _point_of_rectangle(nearest: Any, middle: Array, edges: Array, *other: Array
     return tuple(m + p * a + q * b for m, a, b in zip(middle, e, f, strict=True))
 
 
-def _point_of_first(shares: Any, ends: Array, *other: Array) -> Vector:
+def _point_of_segment(shares: Any, ends: Array, *other: Array) -> Vector:
     return _point(ends, shares[0])
-
-
-def _point_of_share(share: Array, ends: Array, *other: Array) -> Vector:
-    return _point(ends, share)
 
 
 def _point_itself(lowest: Vector, *bodies: Array) -> Vector:
     return lowest
 
 
-# Of each distance: what names the nearest points, the gap between them, the first body's point.
-_SIDES: dict[Callable, tuple[Callable, Callable, Callable]] = {
-    segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_first),
-    segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_first),
-    segment_to_box: (_nearest_of_box, _gap_to_box, _point_of_share),
-    segment_to_vertical_line: (_nearest_to_line, _gap_to_line, _point_of_share),
+# Distance -> functions for the nearest points' parameters, the gap, and the first body's point.
+_PARTS: dict[Callable, tuple[Callable, Callable, Callable]] = {
+    segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_segment),
+    segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_segment),
+    segment_to_box: (_nearest_of_box, _gap_to_box, _point_of_segment),
+    segment_to_vertical_line: (_nearest_to_line, _gap_to_line, _point_of_segment),
     rectangle_to_vertical_line: (_nearest_of_projection, _gap_of_projection, _point_of_rectangle),
-    lowest_of_segment: (_nearest_end, _gap_to_ground, _point_itself),
-    lowest_of_rectangle: (_nearest_corner, _gap_to_ground, _point_itself),
+    lowest_of_segment: (_lowest_end, _gap_to_ground, _point_itself),
+    lowest_of_rectangle: (_lowest_corner, _gap_to_ground, _point_itself),
 }

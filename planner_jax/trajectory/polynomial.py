@@ -12,18 +12,18 @@ from jaxtyping import PyTree
 
 @struct.dataclass
 class PiecewisePolynomial:
-    """p(t) = sum_k coeffs[i, k] (t - t_i)^k  on piece i, which starts at t_i."""
+    """The trajectory p(t) = sum_k coeffs[i, k] (t - t_i)^k on piece i, which starts at t_i."""
 
-    coeffs: Array  # (M, D + 1, 3), ascending powers of the time [s] since the piece began
+    coeffs: Array  # (M, D + 1, 3), ascending powers of the time [s] since t_i
     durations: Array  # (M,) [s], > 0
 
 
 @struct.dataclass
 class Motion:
-    """Samples of a trajectory at N times: what the limits look at.
+    """Samples of a trajectory at N times, from which limits are evaluated.
 
-    In a kernel each vector is a tuple of its three components, and of the position there is the
-    height alone: in a compiled program what is not looked at costs nothing.
+    In a kernel each vector is a tuple of its three components, and only the height of the position
+    is present.
     """
 
     height: Array  # (N,) [m]
@@ -31,11 +31,11 @@ class Motion:
     acc: Array  # (N, 3) [m/s^2]
     jerk: Array  # (N, 3) [m/s^3]
     pos: PyTree = None  # (N, 3) [m]
-    snap: PyTree = None  # (N, 3) [m/s^4], where it is asked for
+    snap: PyTree = None  # (N, 3) [m/s^4], if requested
 
 
 def derivative_factors(degree: int, order: int) -> np.ndarray:
-    """Factors k!/(k - order)! of the `order`-th derivative of t^k, shape (degree + 1,)."""
+    """Return the factors (degree + 1,) k!/(k - order)! of the `order`-th derivative of t^k."""
     powers = np.arange(degree + 1)
     factors = np.ones(degree + 1)
     for i in range(order):
@@ -44,12 +44,12 @@ def derivative_factors(degree: int, order: int) -> np.ndarray:
 
 
 def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Array:
-    """Position or a derivative of it at one time.
+    """Evaluate the position or one of its derivatives at one time.
 
     Args:
         trajectory: M pieces.
-        time: () [s] since the start. Before the start and past the end the nearest piece
-            is continued.
+        time: () [s] since the start. The first piece is continued before the start, the last piece
+            past the end.
         order: 0 position, 1 velocity, 2 acceleration, 3 jerk, 4 snap.
 
     Returns:
@@ -69,16 +69,16 @@ def evaluate(trajectory: PiecewisePolynomial, time: Array, order: int = 0) -> Ar
 
 
 def total_duration(trajectory: PiecewisePolynomial) -> Array:
-    """Duration [s] of all pieces together."""
+    """Return the duration [s] of all pieces together."""
     return jnp.sum(trajectory.durations, axis=-1)
 
 
 def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Integral of the squared `order`-th derivative over a unit of time, as a quadratic form.
+    """Return the integral of the squared `order`-th derivative as a quadratic form.
 
     Returns:
-        The form in the coefficients, (degree + 1, degree + 1), and the power of the time that
-        each entry grows with.
+        The form in the coefficients over a unit of time, (degree + 1, degree + 1), and for each
+        entry the power of the duration by which it grows.
     """
     factors, powers = derivative_factors(degree, order), np.arange(degree + 1)
     exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)
@@ -86,7 +86,7 @@ def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
-    """Integral of the squared `order`-th derivative over the whole trajectory, exactly."""
+    """Integrate the squared `order`-th derivative over the whole trajectory, exactly."""
     coeffs, durations = trajectory.coeffs, trajectory.durations
     form, exponents = energy_form(coeffs.shape[1] - 1, order)
     gram = jnp.asarray(form, coeffs.dtype) * durations[:, None, None] ** exponents
@@ -94,7 +94,7 @@ def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
 
 
 def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
-    """Motion at both ends and inside of every piece, `nodes` intervals each, pieces in a row."""
+    """Sample the motion at `nodes` + 1 times of every piece, ends included, piece after piece."""
     coeffs, degree = trajectory.coeffs, trajectory.coeffs.shape[1] - 1
     fractions = jnp.asarray(np.arange(nodes + 1) / nodes, coeffs.dtype)
     times = trajectory.durations[:, None] * fractions
@@ -111,24 +111,24 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
     return Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, snap=snap)
 
 
-def joined(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Two trajectories, or batches of them, one behind the other."""
+def join(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Join two trajectories, or two batches of trajectories, one after the other in time."""
     size = max(first.coeffs.shape[-2], then.coeffs.shape[-2])
 
-    def wide(coeffs: Array) -> Array:
+    def pad(coeffs: Array) -> Array:
         missing = size - coeffs.shape[-2]
         return jnp.pad(coeffs, [(0, 0)] * (coeffs.ndim - 2) + [(0, missing), (0, 0)])
 
-    coeffs = jnp.concatenate([wide(first.coeffs), wide(then.coeffs)], axis=-3)
+    coeffs = jnp.concatenate([pad(first.coeffs), pad(then.coeffs)], axis=-3)
     durations = jnp.concatenate([first.durations, then.durations], axis=-1)
     return PiecewisePolynomial(coeffs=coeffs, durations=durations)
 
 
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
-    """Position to jerk of one trajectory, or of a batch, each at its own time; on the host.
+    """Evaluate position to jerk of one trajectory, or of a batch with a time each, on the host.
 
     Args:
-        trajectory: leaves with a leading axis B, or without.
+        trajectory: one trajectory, or a batch with a leading axis B on every leaf.
         times: (B,) or () [s] since the start.
 
     Returns:
@@ -149,16 +149,16 @@ def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Factors and powers (4, size) of t in position to jerk of a polynomial's coefficients."""
+    """Return factors and powers (4, size) of t by which coefficients enter position to jerk."""
     factors = np.stack([derivative_factors(size - 1, order) for order in range(4)])
     return factors, np.maximum(np.arange(size) - np.arange(4)[:, None], 0)
 
 
 @functools.cache
 def shift_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Factors and powers (size, size) of t in the coefficients of a polynomial that begins t later.
+    """Return factors and powers (size, size) of t that shift a polynomial's origin by t.
 
-    They are the binomials of its Taylor series, C(j, i) t^(j - i) for coefficient i from j.
+    Coefficient j contributes C(j, i) t^(j - i) to the new coefficient i: the Taylor series at t.
     """
     places = np.arange(size)
     factors = np.array([[math.comb(j, i) for j in places] for i in places])

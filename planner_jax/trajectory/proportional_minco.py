@@ -1,27 +1,26 @@
-"""MINCO with durations in fixed proportion: constant matrices in normalised time.
+"""MINCO with piece durations in fixed proportion: constant matrices in normalised time.
 
-MINCO is the piecewise polynomial of least integral |p^(s)|^2 through given waypoints ([Yu2023bat,
+MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints ([Yu2023bat,
 eq. 19]; Wang, Zhou, Xu, Gao, "Geometrically Constrained Trajectory Optimization for
-Multicopters"): 2s - 2 times differentiable, of degree 2s - 1 on every piece.
+Multicopters"). It has degree 2s - 1 on every piece and is 2s - 2 times differentiable.
 
-When the M pieces last r_i h seconds with constant r_i of mean one, so that h = T / M, the map
-from boundary rows and waypoints to coefficients, and to samples of position, velocity,
-acceleration and jerk, is one constant matrix in time over h. Boundary rows are
+Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that
+h = T / M. One constant matrix in time over h then maps the boundary rows and the waypoints to the
+coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
 (p, v h, a h^2, j h^3) at both ends.
 
-The waypoints are expressed as whitened offsets y from the minimum-energy interpolation of
-the boundary, q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T, so y = 0 is
-the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of
-|y|^2.
+The waypoints q are expressed by whitened offsets y from the waypoints that need the least energy
+for the boundary b: q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T. Hence y = 0
+is the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of |y|^2.
 
-The velocities at the waypoints may be variables as well: offsets z, whitened in the same way, from
-those of least energy for boundary and waypoints. z = 0 leaves the trajectory as it is without
-them, and the energy of z is another multiple of |z|^2, the same one. Such a trajectory is
-2s - 3 times differentiable.
+The velocities at the waypoints may be variables as well. They are expressed by offsets z from the
+velocities of least energy for boundary and waypoints, whitened in the same way. With z = 0 the
+trajectory is the same as without these variables. The energy of z is the same multiple of |z|^2.
+A trajectory with z != 0 is 2s - 3 times differentiable.
 
-A `Chain` is N minimum-snap segments of M pieces each. The state at the end of a segment, position
-to jerk, is where the next one starts. Absent segments are computed like the others, so that one
-compiled shape serves any number of them, and count nothing.
+A `Chain` is N minimum-snap segments of M pieces each. Each segment starts with the state, position
+to jerk, at which the segment before it ends. Absent segments are computed like the others and then
+ignored, so that one compiled program serves any number of present segments.
 """
 
 import dataclasses
@@ -53,20 +52,21 @@ class ProportionalMinco:
     order: int
     proportions: np.ndarray  # (M,) durations over h, mean one
     coefficients: np.ndarray  # (M, 2s, C), of powers of time over h, from C = 2s + O columns [b; y]
-    waypoints: np.ndarray  # (O, C), waypoints from [b; y], and behind them velocities times h
-    offsets: np.ndarray  # (O, C), y from [b; waypoints]
-    boundary_energy: np.ndarray  # (2s, 2s), least energy for given boundary rows
-    offset_energy: float  # energy a unit of |y|^2
+    waypoints: np.ndarray  # (O, C), maps [b; y] to the waypoints, then their velocities times h
+    offsets: np.ndarray  # (O, C), maps [b; waypoints] to y
+    boundary_energy: np.ndarray  # (2s, 2s), quadratic form of the least energy for boundary rows
+    offset_energy: float  # energy per unit of |y|^2
 
     @property
     def num_pieces(self) -> int:
-        """M."""
+        """M, the number of pieces."""
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Samples at `nodes` + 1 points a piece, ends shared: (M nodes + 1, C).
+        """Return the matrix that samples a derivative at `nodes` + 1 points of every piece.
 
-        Multiply by [b; y] and divide by h^derivative.
+        Its shape is (M nodes + 1, C): neighbouring pieces share a sample. The samples are the
+        matrix times [b; y] / h^derivative.
         """
         degree = 2 * self.order - 1
         factors = derivative_factors(degree, derivative)
@@ -78,16 +78,11 @@ class ProportionalMinco:
         return np.concatenate([inner, samples[-1:, -1]])
 
 
-def equal_pieces(num_pieces: int) -> tuple[float, ...]:
-    """Proportions of pieces that all last equally long."""
-    return (1.0,) * num_pieces
-
-
 @functools.cache
 def _hermite_map(order: int) -> np.ndarray:
-    """Unit-time coefficients from end derivatives, (2s, 2s) float64.
+    """Return the matrix (2s, 2s) from end derivatives to the coefficients of a unit-time piece.
 
-    Columns: derivatives 0..s-1 at time 0, then the same at time 1.
+    The columns are the derivatives 0 to s - 1 at time 0, then at time 1.
     """
     size = 2 * order
     ends = np.zeros((size, size))
@@ -99,19 +94,19 @@ def _hermite_map(order: int) -> np.ndarray:
 
 @functools.cache
 def _hermite_energy(order: int) -> np.ndarray:
-    """Energy of a unit-time piece as a quadratic form in its end derivatives, (2s, 2s)."""
+    """Return the energy of a unit-time piece as a form (2s, 2s) in its end derivatives."""
     hermite = _hermite_map(order)
     return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Energy of the pieces together as a quadratic form in their columns, (C, C).
+    """Return the energy of all pieces as a quadratic form (C, C) in the columns.
 
-    From the squares of what each piece has of it, because the form in the nodes' derivatives
-    loses the small energies of smooth motion far from the origin to rounding.
+    The form is a sum of squares. The equal form in the nodes' derivatives would lose the small
+    energy of smooth motion far from the origin to rounding.
 
     Args:
-        coefficients: (M, 2s, C) of the powers of each piece's unit time.
+        coefficients: (M, 2s, C), of the powers of each piece's unit time.
         shares: (M,) durations of the pieces.
     """
     s = coefficients.shape[1] // 2
@@ -121,29 +116,29 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """The energy as a form in the first of its unknowns, the others as they are best for these."""
-    kept, free = np.s_[:num], np.s_[num:]
-    best = np.linalg.solve(energy[free, free], energy[free, kept])
-    return energy[kept, kept] - energy[kept, free] @ best
+    """Return the energy as a form in its first `num` unknowns, minimised over the others."""
+    first, free = np.s_[:num], np.s_[num:]
+    best = np.linalg.solve(energy[free, free], energy[free, first])
+    return energy[first, first] - energy[first, free] @ best
 
 
 @functools.cache
 def proportional_minco(
     order: int, proportions: tuple[float, ...], velocities: bool = False
 ) -> ProportionalMinco:
-    """Build the constant maps (cached).
+    """Build the constant maps; the results are cached.
 
     Args:
         order: s, the derivative whose square is integrated: 2, 3 or 4.
         proportions: durations of the M >= 1 pieces relative to each other, all > 0.
-        velocities: whether those at the waypoints are variables too: O = 2 (M - 1) offsets instead
-            of M - 1.
+        velocities: whether the velocities at the waypoints are variables, too. There are then
+            O = 2 (M - 1) offsets instead of M - 1.
     """
     if not proportions or min(proportions) <= 0.0:
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # Derivative d of a node in the unit time of piece i is r_i^d of that in time over h.
+    # A derivative of order d in the unit time of piece i is r_i^d times the one in time over h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
@@ -154,17 +149,18 @@ def proportional_minco(
     head, tail = np.arange(s), np.arange(m * s, (m + 1) * s)
     positions = np.arange(1, m) * s
     kinds = [positions, positions + 1] if velocities else [positions]
-    given = np.concatenate([head, tail, *kinds])
-    free = np.setdiff1d(np.arange((m + 1) * s), given)
-    nodal = np.zeros(((m + 1) * s, given.size))
-    nodal[given] = np.eye(given.size)
-    nodal[free] = -np.linalg.solve(total[np.ix_(free, free)], total[np.ix_(free, given)])
+    known = np.concatenate([head, tail, *kinds])
+    free = np.setdiff1d(np.arange((m + 1) * s), known)
+    nodal = np.zeros(((m + 1) * s, known.size))
+    nodal[known] = np.eye(known.size)
+    nodal[free] = -np.linalg.solve(total[np.ix_(free, free)], total[np.ix_(free, known)])
     energy = nodal.T @ total @ nodal
 
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
-    from_offsets, norm = np.eye(given.size), 1.0
+    from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # From what is best for all before this kind, with what follows as is best for both.
+        # Measure this kind from its best values for the columns before it, while the columns after
+        # it take their best values for both.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         rest = _least_energy(energy, end)
@@ -191,7 +187,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Boundary in time over h, (2s, 3): derivative d times h^d."""
+    """Return the boundary rows (2s, 3), derivative d times h^d, of two states (s, 3)."""
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -199,14 +195,14 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 def sample_motion(
     maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array, orders: int = 4
 ) -> Motion:
-    """Position, velocity, acceleration and jerk at `nodes` intervals a piece.
+    """Sample position, velocity, acceleration and jerk at `nodes` intervals a piece.
 
     Args:
         maps: constant maps of M pieces.
-        nodes: intervals a piece; N = M nodes + 1 samples, ends shared.
+        nodes: intervals a piece. There are N = M nodes + 1 samples: neighbouring pieces share one.
         columns: (C, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
-        orders: 5 for the snap as well.
+        orders: 4, or 5 to sample the snap as well.
     """
     matrices = np.stack([maps.sample_matrix(nodes, d) for d in range(orders)])
     return _motion(jnp.asarray(matrices, columns.dtype), columns, piece_duration)
@@ -219,19 +215,17 @@ def by_pieces(
     columns: Array,
     piece_duration: Array,
 ) -> PyTree:
-    """What a function finds in the motion of each piece, one after another.
-
-    Many samples of all pieces at once would take a lot of memory.
+    """Apply a function to the motion of each piece, one piece after another to save memory.
 
     Args:
-        function: of the motion at `nodes` + 1 samples of a piece, and of its duration [s].
-        maps: as for `sample_motion`, and so are the others.
-        nodes: intervals a piece.
+        function: of the motion at `nodes` + 1 samples of a piece, and of the piece's duration [s].
+        maps: as for `sample_motion`.
+        nodes: intervals of each piece.
         columns: (C, 3).
         piece_duration: () [s].
 
     Returns:
-        What the function gives back, with a leading axis of M.
+        The results of the function, with a leading axis of M.
     """
     each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
     places = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
@@ -246,9 +240,9 @@ def by_pieces(
 
 
 def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
-    """The samples of matrices (orders, N, C)."""
-    # One product for everything: on a CPU each product, division and sum of its own costs more
-    # than its arithmetic. The matrix comes first, so that a batch adds columns.
+    """Return the motion at N samples, by matrices (orders, N, C)."""
+    # One product for all orders: on a CPU the call of an operation costs more than its arithmetic.
+    # The matrix comes first, so that a batch adds columns.
     orders = matrices.shape[0]
     unit = jnp.matmul(
         matrices.reshape(-1, matrices.shape[-1]), columns, precision=lax.Precision.HIGHEST
@@ -262,7 +256,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
-    """Integral of |p^(s)|^2 over the trajectory, ().
+    """Return the integral () of |p^(s)|^2 over the trajectory.
 
     Args:
         maps: constant maps of M pieces.
@@ -275,19 +269,19 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """The part of `trajectory_energy` that the boundary makes, the least there is for it, ()."""
+    """Return the boundary part () of `trajectory_energy`: its least value for the boundary."""
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """The part of `trajectory_energy` that the offsets make, ()."""
+    """Return the part () of `trajectory_energy` that the offsets add."""
     rate = reciprocal(piece_duration)
     return maps.offset_energy * jnp.sum(offsets**2) * rate ** (2 * maps.order - 1)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Energy of boundary rows (2s, 3) in time over h, ()."""
+    """Return the least energy () for boundary rows (2s, 3), in time over h."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -295,13 +289,16 @@ def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
 def _boundary_form_jvp(
     maps: ProportionalMinco, primals: tuple[Array], tangents: tuple[Array]
 ) -> tuple[Array, Array]:
-    # The matrix is symmetric: one product serves value and slope.
+    # The matrix is symmetric, so that value and derivative share one product.
     product = _by_rows(maps, primals[0])
     return jnp.sum(primals[0] * product), 2.0 * jnp.sum(product * tangents[0])
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """The energy's matrix times the rows; sums, because a small product costs more to call."""
+    """Multiply the matrix of the energy by the rows.
+
+    A sum is used, because the call of a small matrix product costs more than its arithmetic.
+    """
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     return jnp.sum(gram[..., None] * rows, axis=1)
 
@@ -309,7 +306,7 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
 def proportional_trajectory(
     maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
 ) -> PiecewisePolynomial:
-    """The trajectory in real time; arguments as in `trajectory_energy`."""
+    """Return the trajectory in real time; arguments as in `trajectory_energy`."""
     unit = jnp.einsum(
         "mkc,ci->mki",
         jnp.asarray(maps.coefficients, rows.dtype),
@@ -333,7 +330,7 @@ class Chain:
 
     @property
     def columns(self) -> Float[Array, "N columns 3"]:
-        """Rows and offsets together."""
+        """The boundary rows and the offsets, concatenated."""
         return jnp.concatenate([self.rows, self.offsets], axis=1)
 
 
@@ -345,30 +342,18 @@ def chain_rows(
     """Return the boundary rows of every segment.
 
     Args:
-        head_state: of the whole trajectory.
-        tail_states: at the end of each segment.
-        piece_durations: [s], mean of the pieces of a segment.
+        head_state: state at the start of the whole trajectory.
+        tail_states: state at the end of each segment.
+        piece_durations: [s], mean duration of the pieces of each segment.
     """
     heads = jnp.concatenate([head_state[None], tail_states[:-1]])
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 
 
-def chain_motion(maps: ProportionalMinco, nodes: int, chain: Chain, orders: int = 4) -> Motion:
-    """Return samples of every segment, with the snap at 5 orders; leaves with a leading axis N."""
-    sample = functools.partial(sample_motion, maps, nodes, orders=orders)
-    return jax.vmap(sample)(chain.columns, chain.piece_durations)
-
-
-def chain_energy(maps: ProportionalMinco, chain: Chain) -> Float[Array, " N"]:
-    """Return the integral of |snap|^2 over every segment."""
-    energy = functools.partial(trajectory_energy, maps)
-    return jax.vmap(energy)(chain.rows, chain.offsets, chain.piece_durations)
-
-
 def chain_trajectory(
     maps: ProportionalMinco, chain: Chain, active: Bool[Array, " N"]
 ) -> PiecewisePolynomial:
-    """Return the trajectory of N * M pieces; pieces of absent segments stand still for no time."""
+    """Return the trajectory of N * M pieces; pieces of absent segments rest and last 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
     ends = chain.rows[:, maps.order, :]  # positions at the ends of the segments

@@ -30,12 +30,11 @@ from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
     Chain,
     ProportionalMinco,
-    chain_energy,
-    chain_motion,
     chain_rows,
     chain_trajectory,
-    equal_pieces,
     proportional_minco,
+    sample_motion,
+    trajectory_energy,
 )
 
 _ORDER = 4  # minimum snap
@@ -137,7 +136,7 @@ class PaperCatch(OptimisedPlanner):
     @property
     def maps(self) -> ProportionalMinco:
         """Constant maps from boundary and offsets to one segment."""
-        return proportional_minco(_ORDER, equal_pieces(self.num_pieces))
+        return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
@@ -221,7 +220,9 @@ class PaperCatch(OptimisedPlanner):
         """The cost of energy, catches and time, ()."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
-        energy = chain_energy(self.maps, chain)
+        energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
+            chain.rows, chain.offsets, chain.piece_durations
+        )
         rest = jnp.sum(jnp.where(context.active, at_catch + energy, 0.0))
         return rest + self.time_weight * catch.times[-1]
 
@@ -253,7 +254,9 @@ class PaperCatch(OptimisedPlanner):
         """The plan at a point, its violation that of the protocol's samples."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
-        motion = chain_motion(self.maps, self.nodes, chain)
+        motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(
+            chain.columns, chain.piece_durations
+        )
         along = jnp.stack(limits_excess(motion, (gravity, limits)))  # (4, N, K)
         least, most = limits.thrust_bounds
         half = 0.5 * (most - least)

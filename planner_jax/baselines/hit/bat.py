@@ -27,7 +27,6 @@ from planner_jax.trajectory.polynomial import Motion, evaluate
 from planner_jax.trajectory.proportional_minco import (
     ProportionalMinco,
     boundary_rows,
-    equal_pieces,
     proportional_minco,
     proportional_trajectory,
     sample_motion,
@@ -174,7 +173,7 @@ class BatHit(OptimisedPlanner):
     @property
     def maps(self) -> ProportionalMinco:
         """Constant maps from boundary and offsets to the trajectory."""
-        return proportional_minco(_ORDER, equal_pieces(self.num_pieces))
+        return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
