@@ -273,7 +273,7 @@ XML = (DATA / "quadrotor.xml").read_text()
         (
             'name="1" site="front_right" gear="0 0 2 0 0 -0.04"',
             'name="1" site="front_right" gear="0 0 2 0 0 0.04"',
-            "gear of neighbouring rotors must turn one against the other, got 0.02 -0.02 0.02 0.02",
+            "gear of neighbouring rotors must turn in opposite directions, got 0.02 -0.02 0.02",
         ),
         (
             'name="2" site="back_left" gear="0 0 2',

@@ -1,7 +1,7 @@
 """A six-axis arm with a square shield at its flange: kinematics, limits, and plans of the joints.
 
-Base frame of the robot, z up, SI units, angles of the joints (6,) [rad]. The frame of a link lies
-at its joint and turns with it, as in MuJoCo's model files (`planner_jax.robot.arm_mjcf` reads one).
+Positions are in the robot's base frame, z up, SI units; joint angles are (6,) [rad]. The frame of a
+link lies at its joint and turns with it, as in MuJoCo's model files (see `robot.arm_mjcf`).
 """
 
 import dataclasses
@@ -19,30 +19,29 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class Arm:
-    """Everything of an arm that planners need: joints and links 1 to 6, capsules, the shield."""
+    """An arm's joints and links 1 to 6, the capsules around its links, its base and its shield."""
 
-    origin: Array  # (6, 3) [m], of each joint in the frame of the link before it
-    turn: Array  # (6, 4) unit quaternion w, x, y, z, of that joint's frame at angle 0
+    origin: Array  # (6, 3) [m], position of each joint in the frame of the previous link
+    turn: Array  # (6, 4) unit quaternion w, x, y, z: rotation of the joint's frame at angle 0
     axis: Array  # (6, 3) unit, in the joint's frame
     lower: Array  # (6,) [rad], position limits
     upper: Array  # (6,) [rad]
-    home: Array  # (6,) [rad], where the arm waits
+    home: Array  # (6,) [rad], angles at which the arm waits
     mass: Array  # (6,) [kg]
-    centre: Array  # (6, 3) [m], of mass, in the link's frame
+    centre: Array  # (6, 3) [m], centre of mass in the link's frame
     inertia: Array  # (6, 3, 3) [kg m^2], about the centre of mass, along the link's axes
-    capsule_ends: Array  # (C, 2, 3) [m], in the frame of its link
+    capsule_ends: Array  # (C, 2, 3) [m], ends of each capsule's axis in the frame of its link
     capsule_radius: Array  # (C,) [m]
-    base_box: Array  # (2, 3) [m], lowest and highest corner of the base
+    base_box: Array  # (2, 3) [m], lowest and highest corner of the box around the base
     shield_centre: Array  # (3,) [m], middle of the shield's front face, in the frame of link 6
     shield_half: Array  # () [m], half of an edge; outward normal +x of link 6, edges y and z
-    capsule_link: tuple[int, ...] = struct.field(
-        pytree_node=False
-    )  # (C,) 0 to 5: links 1 to 6, -1: base
+    # (C,) link of each capsule: 0 to 5 are links 1 to 6, -1 is the base.
+    capsule_link: tuple[int, ...] = struct.field(pytree_node=False)
 
 
 @struct.dataclass
 class ArmLimits:
-    """What the joints may not exceed, either way; an arm has its position limits itself."""
+    """Limits on the magnitudes of joint rates; `Arm` holds the position limits."""
 
     velocity: Array  # (6,) [rad/s]
     acceleration: Array  # (6,) [rad/s^2]
@@ -50,22 +49,28 @@ class ArmLimits:
 
 @struct.dataclass
 class Regime:
-    """How an arm is driven: its limits, and whether a motion has to end at rest."""
+    """Limits of an arm, and whether its motions have to end at rest."""
 
     limits: ArmLimits
     ends_at_rest: bool = struct.field(pytree_node=False)
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return a regime of the IRB 1600-6/1.2 at `factor` times the speeds of its datasheet."""
+    """Return a regime of the IRB 1600-6/1.2.
+
+    Args:
+        factor: joint speeds over those in the data sheet.
+        acceleration: [rad/s^2], limit of every joint.
+        ends_at_rest: whether a motion has to end at rest.
+    """
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     accelerations = np.full(6, acceleration, np.float32)
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
-# Of the IRB 1600-6/1.2: what the code of [Natarajan2024] allows, the datasheet's speeds with an
-# acceleration as it is usual (the sheet has none), and the former with an end at rest.
+# Regimes of the IRB 1600-6/1.2. R1: limits in the code of [Natarajan2024]. R2: speeds of the data
+# sheet; it gives no acceleration, so a usual one is assumed. R3: limits of R1, ending at rest.
 REGIMES = {
     "R1": _regime(2.0, 60.0, ends_at_rest=False),
     "R2": _regime(1.0, 30.0, ends_at_rest=True),
@@ -74,12 +79,12 @@ REGIMES = {
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return matrix product in the full precision of its arguments."""
+    """Return the matrix product in the full precision of its arguments."""
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
 def quaternion_rotation(quaternion: Array) -> Array:
-    """Return rotations (..., 3, 3) of unit quaternions (..., 4), w x y z."""
+    """Return the rotation matrices (..., 3, 3) of unit quaternions (..., 4), w x y z."""
     w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
     rows = (
         (1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
@@ -90,13 +95,16 @@ def quaternion_rotation(quaternion: Array) -> Array:
 
 
 def _joint_rotations(arm: Arm, angles: Array) -> Array:
-    """Return rotations (6, 3, 3) of links to those before: Rodrigues' formula on each axis."""
+    """Return rotations (6, 3, 3) of the links, each relative to the previous link.
+
+    Each joint turns about its axis by Rodrigues' formula.
+    """
     turn = quaternion_rotation(jnp.asarray(arm.turn))
     axis = jnp.asarray(arm.axis)
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
     cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
-    # These products are of the arm alone: once for all lanes of a batch of angles.
+    # These products do not depend on the angles: `vmap` over angles computes them once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
     cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
@@ -104,11 +112,11 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
 
 
 def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return where the links are at angles (6,) [rad].
+    """Return the poses of the links at angles (6,) [rad].
 
     Returns:
         rotations: (6, 3, 3), link to base.
-        positions: (6, 3) [m], of the joints in the base frame.
+        positions: (6, 3) [m], joints in the base frame.
     """
     turned = _joint_rotations(arm, angles)
     origin = jnp.asarray(arm.origin)
@@ -120,24 +128,24 @@ def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
 
 
 def joint_axes(arm: Arm, rotations: Array) -> Array:
-    """Return directions (6, 3) of the joints in the base frame by links' rotations (6, 3, 3)."""
+    """Return the joint axes (6, 3) in the base frame, given the links' rotations (6, 3, 3)."""
     return product(rotations, jnp.asarray(arm.axis)[:, :, None])[:, :, 0]
 
 
 def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return the shield's rotation (3, 3) at angles (6,) and the middle (3,) [m] of its face.
+    """Return the shield's rotation (3, 3) and the middle (3,) [m] of its face, at angles (6,).
 
-    The columns of the rotation are the outward normal and the directions of the edges.
+    The columns of the rotation are the outward normal and the directions of the two edges.
     """
     rotations, positions = link_frames(arm, angles)
     return rotations[5], positions[5] + product(rotations[5], jnp.asarray(arm.shield_centre))
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:
-    """Return how the shield moves with each joint at angles (6,): the geometric Jacobian (6, 6).
+    """Return the geometric Jacobian (6, 6) of the shield at angles (6,), in the base frame.
 
-    Its first three rows are the velocity of the middle of the front face [m/rad], the last three
-    the angular velocity [rad/rad], both in the base frame; a column a joint.
+    Rows 0 to 2: velocity [m/rad] of the middle of the front face. Rows 3 to 5: angular velocity
+    [rad/rad]. Each column belongs to a joint.
     """
     rotations, positions = link_frames(arm, angles)
     axes = joint_axes(arm, rotations)
@@ -146,9 +154,9 @@ def shield_jacobian(arm: Arm, angles: Array) -> Array:
 
 
 def capsules(arm: Arm, angles: Array) -> Array:
-    """Return ends (C, 2, 3) [m] of the capsules' segments in the base frame, at angles (6,)."""
+    """Return ends (C, 2, 3) [m] of the capsules' axes in the base frame, at angles (6,)."""
     rotations, positions = link_frames(arm, angles)
-    # The base is the last one, where -1 finds it.
+    # The base is the last link, where index -1 finds it.
     rotations = jnp.concatenate([rotations, jnp.eye(3, dtype=rotations.dtype)[None]])
     positions = jnp.concatenate([positions, jnp.zeros((1, 3), positions.dtype)])
     link = np.asarray(arm.capsule_link, np.int32)
@@ -158,25 +166,25 @@ def capsules(arm: Arm, angles: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class ArmSetpoints:
-    """A plan at K equally spaced times; of a batch every array but `time` has a leading axis B.
+    """Samples of a plan at K equally spaced times.
 
-    Entries past the end of a plan are NaN.
+    In a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
     """
 
-    time: np.ndarray  # (K,) [s] since the plan began
-    angles: np.ndarray  # (K, 6) [rad], of the joints
+    time: np.ndarray  # (K,) [s] since the start of the plan
+    angles: np.ndarray  # (K, 6) [rad], joint angles
     rates: np.ndarray  # (K, 6) [rad/s]
     accelerations: np.ndarray  # (K, 6) [rad/s^2]
 
 
 @struct.dataclass
 class ArmPlan(Plan):
-    """A plan with the motion of an arm's joints, coefficients (M, D + 1, 6) in [rad]."""
+    """A plan for the joints of an arm; the motion has coefficients (M, D + 1, 6) in [rad]."""
 
     motion: PiecewisePolynomial
 
     def sample(self, rate: float) -> ArmSetpoints:
-        """Sample the plan, or the batch, at a rate [Hz], from its beginning up to its end.
+        """Sample the plan, or the batch, at a rate [Hz] from start to end.
 
         Raises:
             ValueError: the rate is not positive.
@@ -186,6 +194,6 @@ class ArmPlan(Plan):
 
 
 def _setpoint_at(motion: PiecewisePolynomial, time: Array) -> dict[str, Array]:
-    """Return one setpoint of one motion at a time () [s]."""
+    """Return the setpoint of one motion at a time () [s]."""
     names = ("angles", "rates", "accelerations")
     return {name: evaluate(motion, time, order) for order, name in enumerate(names)}

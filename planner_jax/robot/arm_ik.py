@@ -1,10 +1,10 @@
-"""Inverse kinematics in closed form, of arms that are ortho-parallel with a spherical wrist.
+"""Inverse kinematics in closed form, for arms that are ortho-parallel with a spherical wrist.
 
 Brandstoetter, Angerer and Hofbaur, "An analytical solution of the inverse kinematics problem of
 industrial serial manipulators with an ortho-parallel basis and a spherical wrist" (2014): axis 2
-is across axis 1, axis 3 along axis 2, and axes 4, 5 and 6 meet in one point, the centre of the
-wrist, each across the next. Their seven lengths a1, a2, b, c1, c2, c3, c4 are taken from the
-frames of an `Arm`, wherever these frames lie and whichever way the joints turn.
+is perpendicular to axis 1, axis 3 parallel to axis 2. Axes 4, 5 and 6 meet in one point, the wrist
+centre, each perpendicular to the next. The paper's seven lengths a1, a2, b, c1, c2, c3, c4 are
+computed from the frames of an `Arm`, whose origins and senses of rotation are arbitrary.
 """
 
 import jax
@@ -16,32 +16,31 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.robot.arm import Arm, joint_axes, link_frames, product
 
-# Whether the arm faces the wrist's centre (1) or reaches it over its shoulder (-1), and on which
-# side of the line between the two the elbow is.
+# Rows: whether the arm faces the wrist centre (1) or reaches it over its shoulder (-1), and on
+# which side of the line from the shoulder to the wrist centre the elbow is.
 _ARM_BRANCHES = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)]).T
-# Largest deviation [m or rad] from the geometry that the closed form is for.
-_MISFIT = 1e-5
+_MISFIT = 1e-5  # [m or rad], largest deviation from the geometry that the closed form assumes
 
 
 @struct.dataclass
 class _Geometry:
-    """What the closed form needs of an arm at angle 0, in the axes x, y, z of its basis.
+    """Geometry of an arm at angles 0, in the axes x, y, z of its basis.
 
-    z is axis 1, y axis 2, and the origin is on axis 1, where joint 1 is.
+    z is axis 1, y is axis 2, and the origin is joint 1.
     """
 
     basis: Array  # (3, 3), columns x, y, z in the base frame
     origin: Array  # (3,) [m], in the base frame
-    shoulder: Array  # (2,) [m] x and z of axis 2: a1 and c1
-    lateral: Array  # () [m] y of the wrist's centre: b
-    upper_arm: Array  # () [m], axis 2 to axis 3: c2
-    forearm: Array  # () [m], axis 3 to the wrist's centre: sqrt(a2^2 + c3^2)
+    shoulder: Array  # (2,) [m], x and z of axis 2: a1 and c1
+    lateral: Array  # () [m], y of the wrist centre: b
+    upper_arm: Array  # () [m], length from axis 2 to axis 3: c2
+    forearm: Array  # () [m], length from axis 3 to the wrist centre: sqrt(a2^2 + c3^2)
     upper_arm_angle: Array  # () [rad] about y, from z to the upper arm
     forearm_angle: Array  # () [rad] about y, from z to the forearm
-    elbow_sign: Array  # (), 1 where axis 3 points along axis 2, -1 where against it
-    wrist: Array  # (3,) [m], centre of the wrist in the frame of link 6: c4 off the flange
-    before: Array  # (3, 3), columns axis 4, axis 5 and across them, in the basis
-    after: Array  # (3, 3), columns axis 6, axis 5 and across them, in the frame of link 6
+    elbow_sign: Array  # (), 1 if axis 3 has the direction of axis 2, -1 if the opposite one
+    wrist: Array  # (3,) [m], wrist centre in the frame of link 6: c4 off the flange
+    before: Array  # (3, 3), columns axis 4, axis 5 and their cross product, in the basis
+    after: Array  # (3, 3), columns axis 6, axis 5 and their cross product, in link 6's frame
     bend: Array  # () [rad], angle about axis 5 from axis 4 to axis 6
 
 
@@ -75,22 +74,21 @@ def _geometry(arm: Arm) -> _Geometry:
 
 
 def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array, Array]:
-    """Return all angles at which the shield is where it is wanted: the eight branches.
+    """Return the joint angles of all eight branches that bring the shield to a pose.
 
-    Branch 4 i + 2 j + k has the wrist in front of the shoulder (i = 0) or reached over it (1),
-    the elbow on one side or the other (j), the wrist bent one way or the other (k). Where joint
-    axes fall together, 4 and 6 at a straight wrist or 1 with the wrist on it, the first of these
-    joints is put at its zero.
+    Branch 4 i + 2 j + k: i tells whether the wrist is in front of the shoulder (0) or reached over
+    it (1), j on which side the elbow is, k the sign of the wrist's bend. At a singularity, such as
+    a straight wrist, where axes 4 and 6 coincide, the joint with the lower number is set to zero.
 
     Args:
-        arm: one arm; the geometry is not checked here, `read_arm` does.
-        rotation: (3, 3), of the shield in the base frame: outward normal and edges its columns.
-        middle: (3,) [m], of its front face, in the base frame.
+        arm: one arm; `read_arm` checks its geometry, this function does not.
+        rotation: (3, 3), shield to base; its columns are the outward normal and the edges.
+        middle: (3,) [m], middle of the front face in the base frame.
 
     Returns:
-        angles: (8, 6) [rad]; of equal angles the nearest to the middle of the joint's range, which
-            for joints 4 and 6 of most arms means within +-pi. Out of reach they are those of an arm
-            stretched towards the pose, or folded: finite, with finite gradients.
+        angles: (8, 6) [rad]. Of angles that differ by 2 pi, the one nearest to the middle of the
+            joint's range. For a pose out of reach: angles of an arm that is stretched towards the
+            pose, or folded; finite, with finite gradients.
         found: (8,) bool, whether the pose is reached within the position limits.
     """
     geometry = _geometry(arm)
@@ -102,9 +100,9 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
     def branches(front: Array, elbow: Array) -> tuple[Array, Array]:
         first, reached = _arm_angles(geometry, wrist, front, elbow)
         pitch = first[1] + geometry.elbow_sign * first[2]
-        turned = product(_about_z(first[0]), product(_about_y(pitch), geometry.before))
-        wanted = product(turned.T, tip)
-        both = [jnp.append(first, _wrist_angles(wanted, flip, geometry.bend)) for flip in (1, -1)]
+        turned = product(_turn_about(2, first[0]), product(_turn_about(1, pitch), geometry.before))
+        turn = product(turned.T, tip)
+        both = [jnp.append(first, _wrist_angles(turn, flip, geometry.bend)) for flip in (1, -1)]
         return jnp.stack(both), jnp.stack([reached, reached])
 
     angles, reached = jax.vmap(branches)(*jnp.asarray(_ARM_BRANCHES, wrist.dtype))
@@ -118,10 +116,13 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
 def _arm_angles(
     geometry: _Geometry, wrist: Array, front: Array, elbow: Array
 ) -> tuple[Array, Array]:
-    """Return joints 1 to 3 (3,) [rad] that put the wrist's centre at (3,) [m]; whether they can."""
+    """Return angles (3,) [rad] of joints 1 to 3 that bring the wrist centre to a point (3,) [m].
+
+    Also return whether the arm reaches the point, () bool.
+    """
     x, y, z = wrist
     lateral, upper_arm, forearm = geometry.lateral, geometry.upper_arm, geometry.forearm
-    # Rounding must not take a pose at the very end of the reach out of it.
+    # The slack counts points at the very end of the reach as reached in spite of rounding.
     slack = 16.0 * jnp.finfo(wrist.dtype).eps
     radius_squared = x * x + y * y
     ahead = front * _root(radius_squared - lateral**2)
@@ -137,42 +138,42 @@ def _arm_angles(
     return jnp.stack([first, second, geometry.elbow_sign * third]), reached
 
 
-def _wrist_angles(wanted: Array, flip: int, bend: Array) -> Array:
-    """Return joints 4 to 6 (3,) [rad] of X(j4) Y(j5 + bend) X(j6) = rotation (3, 3), one branch."""
-    fourth = _angle(flip * wanted[1, 0], -flip * wanted[2, 0])
+def _wrist_angles(turn: Array, flip: int, bend: Array) -> Array:
+    """Return joints 4 to 6 (3,) [rad] of X(j4) Y(j5 + bend) X(j6) = turn (3, 3).
+
+    The two solutions belong to `flip` = 1 and -1.
+    """
+    fourth = _angle(flip * turn[1, 0], -flip * turn[2, 0])
     sine, cosine = jnp.sin(fourth), jnp.cos(fourth)
-    # What joint 4 leaves is well determined at a straight wrist too, where joint 4 is not.
-    fifth = _angle(sine * wanted[1, 0] - cosine * wanted[2, 0], wanted[0, 0])
-    left = cosine * wanted[1] + sine * wanted[2]
+    # Joint 4 is undetermined at a straight wrist; joints 5 and 6, given joint 4, never are.
+    fifth = _angle(sine * turn[1, 0] - cosine * turn[2, 0], turn[0, 0])
+    left = cosine * turn[1] + sine * turn[2]
     return jnp.stack([fourth, fifth - bend, _angle(-left[2], left[1])])
 
 
 def _angle(y: Array, x: Array) -> Array:
-    """Return the angle atan2(y, x); 0 with no slope where it is not defined."""
+    """Return atan2(y, x); at x = y = 0 the value and its gradient are zero."""
     none = x * x + y * y <= jnp.finfo(x.dtype).eps ** 2
     return jnp.arctan2(jnp.where(none, 0.0, y), jnp.where(none, 1.0, x))
 
 
 def _root(x: Array) -> Array:
-    """Return square root of x (...), 0 with no slope where x is not positive."""
+    """Return the square root of x (...); for x <= 0 the value and its gradient are zero."""
     positive = x > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, x, 1.0)), 0.0)
 
 
-def _about_z(angle: Array) -> Array:
+def _turn_about(axis: int, angle: Array) -> Array:
+    """Return the rotation (3, 3) about y (axis 1) or z (axis 2) by an angle () [rad]."""
     sin, cos = jnp.sin(angle), jnp.cos(angle)
     none, one = jnp.zeros_like(angle), jnp.ones_like(angle)
-    return jnp.stack([cos, -sin, none, sin, cos, none, none, none, one]).reshape(3, 3)
-
-
-def _about_y(angle: Array) -> Array:
-    sin, cos = jnp.sin(angle), jnp.cos(angle)
-    none, one = jnp.zeros_like(angle), jnp.ones_like(angle)
-    return jnp.stack([cos, none, sin, none, one, none, -sin, none, cos]).reshape(3, 3)
+    about_y = [cos, none, sin, none, one, none, -sin, none, cos]
+    about_z = [cos, -sin, none, sin, cos, none, none, none, one]
+    return jnp.stack(about_y if axis == 1 else about_z).reshape(3, 3)
 
 
 def misfit(arm: Arm) -> str | None:
-    """Return why the closed form does not fit an arm with NumPy leaves; None if it fits."""
+    """Return why the closed form does not apply to an arm with NumPy leaves; None if it does."""
     rotation, position = Rotation.identity(), np.zeros(3)
     axes, positions = np.zeros((6, 3)), np.zeros((6, 3))
     for k in range(6):
@@ -188,10 +189,11 @@ def misfit(arm: Arm) -> str | None:
     for k in (4, 5):
         if np.linalg.norm(np.cross(axes[k], centre - positions[k])) > _MISFIT:
             return "axes 4, 5 and 6 must meet in one point"
-    for name, way in (
-        ("2 and 3", positions[2] - positions[1]),
-        ("3 and the wrist's centre", centre - positions[2]),
-    ):
-        if np.linalg.norm(np.cross(axes[1], way)) <= _MISFIT:
+    links = {
+        "2 and 3": positions[2] - positions[1],
+        "3 and the wrist centre": centre - positions[2],
+    }
+    for name, link in links.items():
+        if np.linalg.norm(np.cross(axes[1], link)) <= _MISFIT:
             return f"there must be a distance between axis {name}"
     return None

@@ -1,4 +1,4 @@
-"""Body and rotors of a quadrotor from MuJoCo's model format, MJCF, as MuJoCo compiles it."""
+"""Reader of a quadrotor's body and rotors from MuJoCo's model format, MJCF, compiled by MuJoCo."""
 
 from pathlib import Path
 from types import ModuleType
@@ -10,18 +10,19 @@ from planner_jax.core.errors import MissingExtra
 from planner_jax.robot.quadrotor_file import RobotError, Value
 
 _Mj = Any  # a structure of MuJoCo, whose package has no types
-_SKEW = 0.02  # of the greatest moment of inertia, what may lie off the body's axes
+_SKEW = 0.02  # greatest product of inertia over the greatest moment of inertia
 
 
-def described_by(path: Path) -> dict[str, Value]:
+def describe_mjcf(path: Path) -> dict[str, Value]:
     """Return the quadrotor of an MJCF file, in the fields of a YAML file, in SI units.
 
-    Mass and inertia are those of all that hangs on the one free joint, about its centre of mass. A
-    rotor is an actuator on a site whose `gear` pushes along z and turns about it; its thrusts are
-    `ctrlrange` times gain and `gear`, its lag is that of its filter.
+    Mass and inertia are the sums of all bodies below the only free joint, about their centre of
+    mass. A rotor is an actuator on a site whose `gear` has a force along z and a torque about z.
+    Its bounds of thrust are `ctrlrange` times gain and `gear`; its lag is its filter's time
+    constant.
 
     Raises:
-        RobotError: it is no such model; one line.
+        RobotError: the model is not of this kind; one line.
         MissingExtra: MuJoCo is not installed.
     """
     try:
@@ -62,7 +63,10 @@ def described_by(path: Path) -> dict[str, Value]:
 def _body(
     model: _Mj, data: _Mj, root: int, turn: np.ndarray
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """Return mass [kg], its centre (3,) [m] and inertia (3, 3) [kg m^2] of a tree of bodies."""
+    """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m^2] of a tree of bodies.
+
+    The inertia is about the centre of mass, in the frame `turn` (3, 3) of the root body.
+    """
     mass, centre = float(model.body_subtreemass[root]), data.subtree_com[root]
     total = np.zeros((3, 3))
     for body in range(root, model.nbody):
@@ -83,7 +87,10 @@ def _rotor(
     centre: np.ndarray,
     turn: np.ndarray,
 ) -> dict[str, Value]:
-    """Return position (2,) [m], thrusts (2,) [N], torque ratio [m] and lag [s] of an actuator."""
+    """Return position (2,) [m], bounds of thrust (2,) [N], torque ratio [m] and lag [s] of a rotor.
+
+    `k` is its actuator; `centre` (3,) [m] and `turn` (3, 3) are the frame of the body in the world.
+    """
     name = model.actuator(k).name or k
     site = int(model.actuator_trnid[k, 0])
     frame = turn.T @ data.site_xmat[site].reshape(3, 3)
@@ -102,25 +109,25 @@ def _rotor(
     return {"place": place, "force": force, "ratio": spin[2] / push[2], "lag": lag}
 
 
-def _rotors(path: Path, found: list[dict[str, Value]]) -> dict[str, Value]:
-    """Return the rotors counter-clockwise, the first of those that turn the body to the left."""
-    found = sorted(found, key=lambda rotor: np.arctan2(rotor["place"][1], rotor["place"][0]) % 6.28)
-    if found[0]["ratio"] < 0.0:
-        found = [*found[1:], found[0]]
-    ratios = np.array([rotor["ratio"] for rotor in found]) * [1.0, -1.0, 1.0, -1.0]
+def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
+    """Return the field `rotors`: counter-clockwise, the first with a positive drag torque."""
+    rotors = sorted(rotors, key=lambda rotor: np.arctan2(*rotor["place"][::-1]) % 6.28)
+    if rotors[0]["ratio"] < 0.0:
+        rotors = [*rotors[1:], rotors[0]]
+    ratios = np.array([rotor["ratio"] for rotor in rotors]) * [1.0, -1.0, 1.0, -1.0]
     if not np.all(ratios > 0.0) or np.ptp(ratios) > 1e-6 * ratios.max():
-        shown = " ".join(f"{rotor['ratio']:g}" for rotor in found)
+        shown = " ".join(f"{rotor['ratio']:g}" for rotor in rotors)
         raise RobotError(
-            f"{path}: gear of neighbouring rotors must turn one against the other, got {shown}"
+            f"{path}: gear of neighbouring rotors must turn in opposite directions, got {shown}"
         )
-    first = found[0]
-    for name, word in (("force", "ctrlrange"), ("lag", "dynprm")):
-        if any(not np.array_equal(rotor[name], first[name]) for rotor in found):
-            raise RobotError(f"{path}: {word} must be the same for all rotors")
+    first = rotors[0]
+    for name, attribute in (("force", "ctrlrange"), ("lag", "dynprm")):
+        if any(not np.array_equal(rotor[name], first[name]) for rotor in rotors):
+            raise RobotError(f"{path}: {attribute} must be the same for all rotors")
     return {
-        "places": [rotor["place"].tolist() for rotor in found],
+        "places": [rotor["place"].tolist() for rotor in rotors],
         "min_thrust": float(first["force"][0]),
         "max_thrust": float(first["force"][1]),
         "torque_ratio": float(ratios[0]),
-        "lag": first["lag"],  # None without a filter: then somebody else has to say it
+        "lag": first["lag"],  # None without a filter: the YAML file or a keyword must have it
     }

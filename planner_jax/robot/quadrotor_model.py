@@ -1,9 +1,9 @@
-"""A quadrotor in one object: body, rotors, tool and limits, for planner, referee and simulation.
+"""Model of a quadrotor: body, rotors, tool and limits, for planner, referee and simulation.
 
-The robots of the papers are here, all others in `quadrotor_models`.
+The robots of the papers are defined here, all others in `quadrotor_models`.
 
-Body frame: x forward, y left, z along the thrust; the origin is the centre of mass, in the plane of
-the propellers. SI units. Nothing here imports JAX.
+Body frame: x forward, y left, z along the thrust. The origin is the centre of mass, which lies in
+the plane of the propellers. SI units. Nothing here imports JAX.
 """
 
 import dataclasses
@@ -14,110 +14,116 @@ import numpy as np
 
 from planner_jax.core.errors import ArgumentError
 
-GRAVITY = 9.81  # [m/s^2], by which a model is asked whether it can hover
+GRAVITY = 9.81  # [m/s^2], for the check that a model can hover
 
 NET, RACKET = "net", "racket"
+
+# Rules of numbers, each with its text.
+_FINITE = ("finite", lambda x: True)
+_POSITIVE = ("> 0", lambda x: x > 0.0)
+_NOT_NEGATIVE = (">= 0", lambda x: x >= 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Tool:
-    """What meets the ball: a disc across the thrust, the hoop of a net or a racket."""
+    """The disc that meets the ball, perpendicular to the thrust: hoop of a net, or a racket."""
 
     kind: str  # "net" or "racket"
-    height: float  # [m], of the disc's centre above the propeller plane
+    height: float  # [m], height of the disc's centre above the propeller plane
     radius: float  # [m]
     restitution: float = 0.7  # beta of a racket
-    max_angle: float = math.pi / 6.0  # theta_safe [rad], between a net's axis and the ball's way
+    # theta_safe [rad], greatest angle between a net's axis and the ball's path
+    max_angle: float = math.pi / 6.0
 
     def __post_init__(self) -> None:
         if self.kind not in (NET, RACKET):
             raise ArgumentError("tool.kind", f"{NET} or {RACKET}", self.kind)
-        _require_positive("tool.radius", self.radius)
-        _require("tool.height", self.height, "finite", lambda x: True)
+        _require("tool.radius", self.radius, *_POSITIVE)
+        _require("tool.height", self.height, *_FINITE)
         _require("tool.restitution", self.restitution, "in [0, 1]", lambda x: 0.0 <= x <= 1.0)
         _require("tool.max_angle", self.max_angle, "in [0, 3.14159]", lambda x: 0.0 <= x <= math.pi)
 
 
 @dataclasses.dataclass(frozen=True)
 class Rotors:
-    """Four rotors, each of which turns against its neighbours."""
+    """Four rotors; neighbouring rotors turn in opposite directions."""
 
     places: tuple[tuple[float, float], ...]  # (4, 2) [m], x and y, counter-clockwise
-    max_thrust: float  # [N], of one
-    min_thrust: float = 0.0  # [N], of one
+    max_thrust: float  # [N], of one rotor
+    min_thrust: float = 0.0  # [N], of one rotor
     torque_ratio: float = 0.016  # [m], drag torque of a rotor over its thrust
     lag: float = 0.02  # [s], time constant of its thrust
-    radius: float = 0.06  # [m], of a propeller, to be looked at
+    radius: float = 0.06  # [m], of a propeller; only for pictures
 
     def __post_init__(self) -> None:
         if np.shape(self.places) != (4, 2):
             raise ArgumentError("rotors.places", "4 of 2 numbers", self.places)
         if not np.isfinite(self.places).all():
             raise ArgumentError("rotors.places", "finite", self.places)
-        _require_not_negative("rotors.min_thrust", self.min_thrust)
         least = self.min_thrust
+        _require("rotors.min_thrust", least, *_NOT_NEGATIVE)
         _require("rotors.max_thrust", self.max_thrust, f"> {least:g}", lambda x: x > least)
-        _require_positive("rotors.torque_ratio", self.torque_ratio)
-        _require_positive("rotors.lag", self.lag)
-        _require_positive("rotors.radius", self.radius)
+        _require("rotors.torque_ratio", self.torque_ratio, *_POSITIVE)
+        _require("rotors.lag", self.lag, *_POSITIVE)
+        _require("rotors.radius", self.radius, *_POSITIVE)
         if abs(np.linalg.det(self.allocation)) < 1e-12:
             raise ArgumentError("rotors.places", "them turn the body", self.places, verb="let")
 
     @property
     def positions(self) -> np.ndarray:
-        """Centres (4, 3) [m], body frame."""
+        """Centres of the rotors (4, 3) [m], body frame."""
         return np.pad(np.asarray(self.places, float), ((0, 0), (0, 1)))
 
     @property
     def torque_arms(self) -> np.ndarray:
-        """Torque about body z that each rotor's drag makes of its thrust (4,) [m]."""
+        """Drag torque of each rotor about body z over its thrust (4,) [m]."""
         return self.torque_ratio * np.array([1.0, -1.0, 1.0, -1.0])
 
     @property
     def allocation(self) -> np.ndarray:
-        """The matrix (4, 4) from rotor thrusts [N] to total thrust [N] and torque [N m]."""
+        """Matrix (4, 4) from rotor thrusts [N] to total thrust [N] and torque [N m]."""
         x, y = np.asarray(self.places, float).T
         return np.stack([np.ones(4), y, -x, self.torque_arms])
 
     @property
     def mixer(self) -> np.ndarray:
-        """The matrix (4, 4) from total thrust [N] and torque [N m] to rotor thrusts [N]."""
+        """Matrix (4, 4) from total thrust [N] and torque [N m] to rotor thrusts [N]."""
         return np.linalg.inv(self.allocation)
 
     @property
     def shares(self) -> np.ndarray:
-        """The part (4,) of a total thrust that each rotor has where they do not turn the body."""
+        """Shares (4,) of the rotors in a total thrust without torque."""
         return self.mixer[:, 0]
 
 
 def cross(diagonal: float) -> tuple[tuple[float, float], ...]:
-    """Return positions of four rotors at 45, 135, 225 and 315 degrees on a circle's diagonal."""
+    """Return positions of four rotors at 45, 135, 225 and 315 degrees, `diagonal` [m] apart."""
     half = 0.5 * diagonal * math.sqrt(0.5)
     return ((half, half), (-half, half), (-half, -half), (half, -half))
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightLimits:
-    """What plans may not exceed; None where there is no such limit."""
+    """Limits of plans; None means that there is no such limit."""
 
     speed: float  # [m/s]
     body_rate: float  # [rad/s], with the yaw part of the Hopf fibration
     min_height: float = 0.25  # [m], of the propeller plane
     acceleration: float | None = None  # [m/s^2]
     thrust: tuple[float, float] | None = None  # [m/s^2], least and greatest, per unit mass
-    # Share of a rotor's range of thrusts that plans use, the rest is left for control; None: plans
-    # are not asked what the rotors do.
+    # Share of a rotor's range of thrusts that plans may use; the remainder is left for control.
+    # None: plans do not limit the rotors' thrusts.
     rotor_share: float | None = 0.9
 
     def __post_init__(self) -> None:
-        _require_positive("limits.speed", self.speed)
-        _require_positive("limits.body_rate", self.body_rate)
-        _require_not_negative("limits.min_height", self.min_height)
+        _require("limits.speed", self.speed, *_POSITIVE)
+        _require("limits.body_rate", self.body_rate, *_POSITIVE)
+        _require("limits.min_height", self.min_height, *_NOT_NEGATIVE)
         if self.acceleration is not None:
-            _require_positive("limits.acceleration", self.acceleration)
+            _require("limits.acceleration", self.acceleration, *_POSITIVE)
         if self.thrust is not None:
             least, most = self.thrust
-            _require_not_negative("limits.thrust, the least,", least)
+            _require("limits.thrust, the least,", least, *_NOT_NEGATIVE)
             _require("limits.thrust, the greatest,", most, f"> {least:g}", lambda x: x > least)
         if self.rotor_share is not None:
             _require("limits.rotor_share", self.rotor_share, "in (0, 1]", lambda x: 0.0 < x <= 1.0)
@@ -125,7 +131,7 @@ class FlightLimits:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorModel:
-    """A quadrotor; hashable, static under jit.
+    """A quadrotor; hashable, static under `jit`.
 
     Raises:
         ValueError: a number breaks its rule, or the rotors cannot hold the body in hover; one line.
@@ -137,18 +143,17 @@ class QuadrotorModel:
     rotors: Rotors
     tool: Tool
     limits: FlightLimits
-    source: str = ""  # of the figures
+    source: str = ""  # where the numbers are from
 
     def __post_init__(self) -> None:
-        _require_positive("mass", self.mass)
+        _require("mass", self.mass, *_POSITIVE)
         if np.shape(self.inertia) != (3,):
             raise ArgumentError("inertia", "3 numbers", self.inertia)
         for axis in self.inertia:
-            _require_positive("inertia", axis)
+            _require("inertia", axis, *_POSITIVE)
         if not 2.0 * max(self.inertia) <= sum(self.inertia) * (1.0 + 1e-9):
-            raise ArgumentError(
-                "inertia", "of a body, none above the other two together", self.inertia
-            )
+            rule = "of a body, none above the other two together"
+            raise ArgumentError("inertia", rule, self.inertia)
         weight, most = self.mass * GRAVITY, 4.0 * self.rotors.max_thrust
         if not most > weight:
             rule = f"> the weight of {weight:.3g} N"
@@ -168,7 +173,7 @@ class QuadrotorModel:
 
     @property
     def thrust_bounds(self) -> tuple[float, float]:
-        """Least and greatest thrust per unit mass [m/s^2], those of its rotors if none are said."""
+        """Least and greatest thrust per unit mass [m/s^2]; by default given by the rotors."""
         if self.limits.thrust is not None:
             return self.limits.thrust
         low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)
@@ -176,7 +181,7 @@ class QuadrotorModel:
 
     @property
     def rotor_range(self) -> tuple[float, float] | None:
-        """Least and greatest thrust of a rotor [N] that plans may ask for; None: any."""
+        """Least and greatest thrust of a rotor [N] in plans; None means that all are allowed."""
         share = self.limits.rotor_share
         if share is None:
             return None
@@ -186,28 +191,18 @@ class QuadrotorModel:
 
 
 def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]) -> None:
-    """Raise `ValueError` unless a value is a finite number that keeps a rule."""
+    """Raise `ArgumentError` unless a value is a finite number that keeps a rule."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise ArgumentError(name, "a number", value)
     if not (math.isfinite(value) and holds(float(value))):
         raise ArgumentError(name, rule, value)
 
 
-def _require_positive(name: str, value: object) -> None:
-    """Raise `ValueError` unless a value is a number > 0."""
-    _require(name, value, "> 0", lambda x: x > 0.0)
-
-
-def _require_not_negative(name: str, value: object) -> None:
-    """Raise `ValueError` unless a value is a number >= 0."""
-    _require(name, value, ">= 0", lambda x: x >= 0.0)
-
-
-# [Yu2023catch]: l and radius of the net (Fig. 6). It gives no limits; these are the shared
-# protocol's. The papers give neither mass, inertia nor rotors. Those here are assumptions: 0.9 kg
-# of computer, battery and frame within 5 cm of the centre and 75 g of motor and propeller at the
-# end of each arm, whose diagonal is the papers'. The greatest thrust is 4 g, so that a plan of 2.5
-# g leaves room for control. As in the papers, plans are not asked what the rotors do.
+# [Yu2023catch, Fig. 6]: height l and radius of the net. The paper has no limits; these limits are
+# the protocol of this library. The papers have neither mass, inertia nor rotors. Assumptions:
+# 0.9 kg of computer, battery and frame within 5 cm of the centre, and 75 g of motor and propeller
+# at the end of each arm; the diagonal is from the papers. The greatest thrust is 4 g, which leaves
+# a margin for control above plans of 2.5 g. As in the papers, plans do not limit single rotors.
 PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
     mass=1.2,
@@ -219,7 +214,7 @@ PAPER_CATCHER = QuadrotorModel(
     ),
     source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# [Yu2023bat]: Fig. 2 and Section VI-A.
+# [Yu2023bat, Fig. 2 and Section VI-A].
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",

@@ -1,11 +1,12 @@
-"""Quadrotors by name: those of the papers, and three that are published with their figures.
+"""Quadrotors by name: the robots of the papers, and three with published numbers.
 
-What no source says is an assumption, and `source` says so. All tools are assumed to weigh nothing,
-and all but the papers' are. Limits of speed, body rate and height are assumptions, chosen within
-what the rotors can do; so are the shares of the rotors' thrusts that plans use.
+Numbers without a source are assumptions, which `source` names. All tools are assumed to be
+massless; the tools of the published robots are assumptions. So are limits of speed, body rate and
+height, chosen within the abilities of the rotors, and the shares of the rotors' thrusts in plans.
 """
 
 import dataclasses
+import math
 
 from planner_jax.core.errors import UnknownName
 from planner_jax.robot.quadrotor_model import (
@@ -23,7 +24,8 @@ from planner_jax.robot.quadrotor_model import (
 
 # Mass and diagonal: the manufacturer's data sheet (27 g; 92 mm from motor to motor). Inertia, drag
 # torque and greatest thrust: J. Foerster, "System Identification of the Crazyflie 2.0 Nano
-# Quadrocopter", ETH Zurich 2015. Lag and tool are assumptions. A racket would be as heavy as it is.
+# Quadrocopter", ETH Zurich 2015. Lag and tool are assumptions. The tool is a net, since a racket
+# would weigh about as much as the robot.
 CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
@@ -36,9 +38,9 @@ CRAZYFLIE = QuadrotorModel(
 )
 
 # Mass and static thrust (870 g, 35 N): E. Kaufmann et al., "Champion-level drone racing using deep
-# reinforcement learning", Nature 620, 2023, whose frame takes propellers of 6 inches. The diagonal
-# is that of the 330 mm class. Inertia is an assumption: 60 g of motor and propeller at the end of
-# each arm, the rest within 4 cm of the centre. So are drag torque, lag and tools.
+# reinforcement learning", Nature 620, 2023, whose frame has propellers of 6 inches. The diagonal is
+# usual for such frames: 330 mm. Inertia is an assumption: 60 g of motor and propeller at the end
+# of each arm, the remainder within 4 cm of the centre. So are drag torque, lag and tools.
 RACER = QuadrotorModel(
     name="racer",
     mass=0.87,
@@ -50,9 +52,9 @@ RACER = QuadrotorModel(
     "tool and limits assumed",
 )
 
-# Everything but tool and limits: models x500_base and x500 of PX4's Gazebo models, base and four
-# propellers together; greatest thrust 8.54858e-6 N s^2 x (1000 rad/s)^2, the slower of two lags.
-# Propellers of 13 inches, as the model shows them.
+# Everything but tool and limits: models x500_base and x500 of PX4's Gazebo models. Mass and inertia
+# are the sums of base and propellers; greatest thrust 8.54858e-6 N s^2 x (1000 rad/s)^2; the slower
+# of the model's two lags; propellers of 13 inches, as in its mesh.
 X500 = QuadrotorModel(
     name="x500",
     mass=2.064,
@@ -91,13 +93,13 @@ MODELS = {
 
 
 def ready_robot(name: str) -> QuadrotorModel:
-    """Return the ready quadrotor of a name.
+    """Return a quadrotor of this module by its name.
 
-    There are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
-    `x500-net`; `planner-jax robots` shows their figures.
+    The names are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
+    `x500-net`; `planner-jax robots` prints their main numbers.
 
     Raises:
-        UnknownName: there is none; one line that lists those there are.
+        UnknownName: no quadrotor has this name; one line that lists the names.
     """
     if name in MODELS:
         return MODELS[name]
@@ -108,10 +110,10 @@ def ready_robot(name: str) -> QuadrotorModel:
 
 
 def robot_named(word: str) -> QuadrotorModel:
-    """Return the ready quadrotor of a name, or that of a file.
+    """Return a quadrotor by its name, or read it from a file.
 
     Raises:
-        UnknownName: there is neither a ready one nor such a file; one line.
+        UnknownName: there is neither such a name nor such a file; one line.
         RobotError: the file breaks a rule; one line.
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
@@ -127,21 +129,17 @@ def robot_named(word: str) -> QuadrotorModel:
 
 
 def listing() -> str:
-    """Return the ready quadrotors with their main figures, a line each under a heading."""
-    rows = [_figures(model) for model in MODELS.values()]
-    table = [list(rows[0]), *(list(row.values()) for row in rows)]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    lines = (
-        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()
-        for row in table
-    )
-    return "\n".join(lines) + "\n"
+    """Return a table of the quadrotors by name: a heading, and a line for each."""
+    rows = [_summarise(model) for model in MODELS.values()]
+    columns = [[heading, *(row[heading] for row in rows)] for heading in rows[0]]
+    padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
+    return "".join("  ".join(line).rstrip() + "\n" for line in zip(*padded, strict=True))
 
 
-def _figures(model: QuadrotorModel) -> dict[str, str]:
+def _summarise(model: QuadrotorModel) -> dict[str, str]:
+    """Return the main numbers of a quadrotor as text, by their headings."""
     rotors, limits = model.rotors, model.limits
-    places = rotors.positions[:, :2]
-    across = max(float(((a - b) ** 2).sum()) for a in places for b in places) ** 0.5
+    across = max(math.dist(a, b) for a in rotors.places for b in rotors.places)
     return {
         "robot": model.name,
         "mass [kg]": f"{model.mass:g}",

@@ -16,7 +16,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
-from planner_jax.task.block.motion import append_braking, cut
+from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
@@ -99,7 +99,22 @@ def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
 
     low, high = lax.fori_loop(0, _HALVINGS, halve, (times[nearest], times[nearest + 1]))
     time = jnp.where(jnp.any(crosses), 0.5 * (low + high), plan.contact_time)
-    return dataclasses.replace(plan, motion=cut(motion, time - case.delay), contact_time=time)
+    return dataclasses.replace(plan, motion=_cut(motion, time - case.delay), contact_time=time)
 
 
 _end_each_at_contact = jax.jit(jax.vmap(_find_contact))
+
+
+def _cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
+    """Cut a motion at a time () [s] since its start; a motion that ends before stays whole.
+
+    Pieces that begin later last 0 s, and start from where the motion is cut.
+    """
+    starts = jnp.cumsum(motion.durations) - motion.durations
+    last = jnp.minimum(time, jnp.sum(motion.durations))
+    end = jnp.stack([evaluate(motion, last), evaluate(motion, last, 1)])
+    rest = jnp.zeros_like(motion.coeffs[0]).at[:2].set(end)
+    return PiecewisePolynomial(
+        coeffs=jnp.where((starts >= time)[:, None, None], rest, motion.coeffs),
+        durations=jnp.clip(time - starts, 0.0, motion.durations),
+    )

@@ -159,21 +159,6 @@ def speed_up(
     ), pace
 
 
-def cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Cut a motion at a time () [s] since its start; a motion that ends before stays whole.
-
-    Pieces that begin later last 0 s, and start from where the motion is cut.
-    """
-    starts = jnp.cumsum(motion.durations) - motion.durations
-    last = jnp.minimum(time, jnp.sum(motion.durations))
-    end = jnp.stack([evaluate(motion, last), evaluate(motion, last, 1)])
-    rest = jnp.zeros_like(motion.coeffs[0]).at[:2].set(end)
-    return PiecewisePolynomial(
-        coeffs=jnp.where((starts >= time)[:, None, None], rest, motion.coeffs),
-        durations=jnp.clip(time - starts, 0.0, motion.durations),
-    )
-
-
 def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
     """Return a motion, and after it all joints slowing down evenly to a stop at the same time.
 
