@@ -12,7 +12,7 @@ from planner_jax.baselines.catch.mpp import MppCatch, falling_time
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
-from planner_jax.task.catch.context import ordered_context, targets_at
+from planner_jax.task.catch.context import order_targets, targets_at
 from planner_jax.task.catch.suites import draw
 
 NUM = 16
@@ -52,7 +52,7 @@ def lane_of(tree, lane):
 
 def heights(cases, plans):
     """Heights [m] of the targets at the catches, in their order."""
-    ordered = jax.vmap(ordered_context)(cases).targets
+    ordered = jax.vmap(order_targets)(cases).targets
     return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
 
 
@@ -79,7 +79,7 @@ def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws, thro
 def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
     @jax.jit
     def tried(case):
-        context = ordered_context(case)
+        context = order_targets(case)
         times, _ = MPP.times(context)
         ball = jax.tree.map(lambda leaf: leaf[0], targets_at(context.targets, times))
         return MPP.candidates(case.head_state, ball, times[0], case)

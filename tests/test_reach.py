@@ -12,7 +12,7 @@ from planner_jax.ball.target import BallPath
 from planner_jax.core.protocol import Status, is_unsolved
 from planner_jax.robot.quadrotor import ALLOWED, QuadrotorLimits, beyond_reach
 from planner_jax.task.catch.context import is_too_far as is_catch_too_far
-from planner_jax.task.catch.context import ordered_context
+from planner_jax.task.catch.context import order_targets
 from planner_jax.task.hit.context import is_too_far as is_hit_too_far
 from planner_jax.task.hit.context import prepare_hit
 
@@ -20,7 +20,7 @@ HIT, CATCH = pj.hit.planner("exact"), pj.catch.planner("exact", decide="greedy")
 TARGET = (4.0, 0.0, 0.0)
 
 hits_too_far = jax.jit(jax.vmap(lambda case: is_hit_too_far(prepare_hit(case, 36))))
-catches_too_far = jax.jit(jax.vmap(lambda case: is_catch_too_far(ordered_context(case))))
+catches_too_far = jax.jit(jax.vmap(lambda case: is_catch_too_far(order_targets(case))))
 
 
 def limits(**given):

@@ -12,44 +12,52 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike, DTypeLike
 
-from planner_jax.core.checks import numbers_of, numeric, require_number, require_switch, shape_of
+from planner_jax.core.checks import (
+    numbers_of,
+    numeric,
+    require_kind,
+    require_number,
+    require_switch,
+    shape_of,
+)
 from planner_jax.core.choices import require_memory, require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Decision, Plan, take
 from planner_jax.core.registry import split_name
 from planner_jax.core.rules import NOT_NEGATIVE, Case
 
-_DRAWN_BYTES = 1_000  # of a case, as estimated
+_DRAWN_BYTES = 1_000  # estimated memory of a drawn case
 
 
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return `numbers_of` as a JAX array of a type."""
-    with np.errstate(over="ignore"):  # what is too large is infinite, and refused as that
+    """Return an argument as a JAX array of shape batch + shape; errors as of `numbers_of`."""
+    with np.errstate(over="ignore"):  # numbers too large for the type become infinite
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
-    """The batch's axes of an argument (..., *shape), which the others follow.
+    """Return the leading axes of an argument of shape (..., *shape).
 
     Raises:
-        TypeError: no numbers.
-        ValueError: the argument does not end with this shape.
+        TypeError: the argument does not hold numbers.
+        ValueError: the shape of the argument does not end with `shape`.
     """
-    given = shape_of(name, vectors)
-    if given[len(given) - len(shape) :] != shape or len(given) < len(shape):
+    found = shape_of(name, vectors)
+    split = len(found) - len(shape)
+    if split < 0 or found[split:] != shape:
         ends = ", ".join(map(str, shape))
-        raise ArgumentError(name, f"a shape that ends with ({ends},)", given, verb="have")
-    return given[: len(given) - len(shape)]
+        raise ArgumentError(name, f"a shape that ends with ({ends},)", found, verb="have")
+    return found[:split]
 
 
 def require_draw(num: int, seed: int, first: int) -> None:
-    """Raise unless so many cases of a suite can be drawn from a seed, from a place on.
+    """Raise unless `num` cases of a suite can be drawn from a seed, the first at index `first`.
 
     Raises:
-        TypeError: one of them is no whole number.
-        ValueError: one of them is too small, or `num` is more than memory holds.
+        TypeError: an argument is not a whole number.
+        ValueError: an argument is too small, or memory cannot hold `num` cases.
     """
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
@@ -57,11 +65,7 @@ def require_draw(num: int, seed: int, first: int) -> None:
 
 
 def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
-    """Make a generator for every case of a suite, so that no case depends on the others.
-
-    Raises:
-        TypeError, ValueError: as of `require_draw`.
-    """
+    """Make one random generator a case, so that no case depends on others; see `require_draw`."""
     require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
@@ -70,13 +74,16 @@ def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.rand
 def find_decision(
     names: Mapping[str, str], decide: str | Decision, from_file: Collection[str] = ()
 ) -> Decision:
-    """Return the decision of a name out of "name -> module:class", or the decision itself.
+    """Return a decision by its name, or the decision itself.
 
-    The names in `from_file` may have ":" and a file behind them.
+    Args:
+        names: "module:class" of each decision, by name.
+        decide: a name or a decision. ":" and a file may follow a name in `from_file`.
+        from_file: names of decisions that are read from a file.
 
     Raises:
-        ValueError: there is no decision of that name, or it takes no file.
-        TypeError: it is neither a name nor a decision.
+        ValueError: there is no decision of that name, or the decision takes no file.
+        TypeError: the argument is neither a name nor a decision.
     """
     if not isinstance(decide, str):
         if isinstance(decide, type) or not isinstance(decide, Decision):
@@ -87,7 +94,7 @@ def find_decision(
 
 
 def require_orders(orders: ArrayLike) -> None:
-    """Raise `ValueError` unless every order (..., N) of a batch is a permutation."""
+    """Raise `ValueError` unless every order (..., N) is a permutation."""
     flat = np.asarray(orders).reshape(-1, np.shape(orders)[-1])
     wrong = np.flatnonzero((np.sort(flat, axis=1) != np.arange(flat.shape[1])).any(axis=1))
     if wrong.size:
@@ -105,16 +112,14 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Return the verdict of a referee of batches on one plan, or on a batch.
+    """Return the verdict on one plan, or on a batch, by a referee that judges batches.
 
     Raises:
-        TypeError: cases or plans are not of the two `kinds`, or a setting is none of the referee's
-            keyword arguments or of another kind.
-        ValueError: shapes that do not fit, or an error of the referee.
+        TypeError: cases or plans are not instances of `kinds`, or `require_settings` raises.
+        ValueError: cases and plans differ in batch shape, or the referee raises.
     """
-    for name, tree, kind in zip(("cases", "plans"), (cases, plans), kinds, strict=True):
-        if not isinstance(tree, kind):
-            raise ArgumentTypeError(name, f"a {kind.__name__}", shown=f"a {type(tree).__name__}")
+    require_kind("cases", cases, kinds[0])
+    require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)
     for leaf in jax.tree.leaves((cases, plans)):
         if numeric(leaf) is None:
@@ -132,21 +137,21 @@ def judge_by(
 
 
 def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:
-    """Raise unless settings are a referee's, each of the kind that its default is.
+    """Raise unless settings are keyword arguments of a referee, each of its default's type.
 
-    Those that a referee hands on to another are looked at for that one.
+    Where a referee accepts any keyword argument, only the named ones are checked.
     """
     known = inspect.signature(referee).parameters
-    hands_on = any(each.kind is each.VAR_KEYWORD for each in known.values())
+    accepts_any = any(each.kind is each.VAR_KEYWORD for each in known.values())
     for name, value in settings.items():
-        if name not in known and hands_on:
-            continue
         if name not in known:
-            raise ArgumentTypeError(name, "a setting of the referee's", value)
-        usual = known[name].default
-        if isinstance(usual, bool):
-            require_switch(name, value)
-        elif isinstance(usual, int):
-            require_size(name, value)
-        elif isinstance(usual, float):
-            require_number(name, value, NOT_NEGATIVE)
+            if accepts_any:
+                continue
+            raise ArgumentTypeError(name, "a setting of the referee", value)
+        match known[name].default:
+            case bool():
+                require_switch(name, value)
+            case int():
+                require_size(name, value)
+            case float():
+                require_number(name, value, NOT_NEGATIVE)

@@ -1,4 +1,4 @@
-"""The quadrotor in a case: rules of its limits, and what a case takes from the robot."""
+"""The quadrotor in cases: rules of its limits, and quantities that cases take from the robot."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ from planner_jax.core.rules import (
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
 
-# Rules of the limits, in the cases of all quadrotor tasks.
+# Rules of the limits in cases of all quadrotor tasks.
 FLIGHT_RULES: Table = (
     Field("limits.speed", (), POSITIVE),
     Field("limits.body_rate", (), POSITIVE),
@@ -39,7 +39,7 @@ FLIGHT_RULES: Table = (
     Field("limits.rotors.max_thrust", ()),
 )
 
-# Fields of a case, by which its rules know them, that are arguments of what makes it.
+# Fields of a case -> arguments of the function that makes the case, for error messages.
 ARGUMENTS = {
     "head_state": "start",
     **{
@@ -53,8 +53,8 @@ def require_tool(robot: object, kind: str) -> Tool:
     """Return the tool of a robot.
 
     Raises:
-        TypeError: the robot is no `QuadrotorModel`.
-        ValueError: it carries another tool than one of this kind.
+        TypeError: the robot is not a `QuadrotorModel`.
+        ValueError: the robot carries a tool of another kind.
     """
     if not isinstance(robot, QuadrotorModel):
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
@@ -67,26 +67,26 @@ def require_tool(robot: object, kind: str) -> Tool:
 
 
 def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return the states (..., 4, 3) of quadrotors in hover at positions (3,) or (..., 3) [m]."""
+    """Return states (..., 4, 3), position to jerk, of hover at positions (3,) or (..., 3) [m]."""
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
     return jnp.asarray(head, dtype)
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` if a quadrotor begins below its least height, which no plan may do.
+    """Raise `CaseError` if a quadrotor starts below its least height.
 
-    Of traced arrays, which have no values yet, nothing is asked.
+    Traced arrays have no values yet and are not checked.
     """
-    given = cases.head_state[..., 0, 2], cases.limits.min_height
-    if any(isinstance(each, Tracer) for each in given):
+    heights = cases.head_state[..., 0, 2], cases.limits.min_height
+    if any(isinstance(each, Tracer) for each in heights):
         return
-    height, least = map(np.asarray, given)
+    height, least = map(np.asarray, heights)
     require_rule("start", height, height >= least, "at a height >= min_height", cases.batch_shape)
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise `ValueError` if a robot is named for a suite of another package, which has its own."""
+    """Raise `ValueError` unless the robot is the default one, for suites with their own robot."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
@@ -94,9 +94,12 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
 def limits_of(
     robot: QuadrotorModel, leaf: Callable[..., Array], **given: object
 ) -> QuadrotorLimits:
-    """Return the limits of a case, by default the robot's; `leaf(name, value)` makes an array.
+    """Return the limits of a case: the given ones that are not None, else the robot's.
 
-    A robot with a net has a least and a greatest thrust, by default of its rotors.
+    Args:
+        robot: quadrotor with its tool. With a net its thrust is bounded, by default by its rotors.
+        leaf: `leaf(name, value, *shape)` makes an array of the batch.
+        **given: limits by name.
     """
     own = robot.limits
     least, most = own.thrust or (None, None)
@@ -111,7 +114,7 @@ def limits_of(
         "max_thrust": most,
     }
     values = {**known, **{name: value for name, value in given.items() if value is not None}}
-    # One bound alone leaves the other side open.
+    # A single thrust bound needs its counterpart: 0 below, infinity above.
     if values["max_thrust"] is None and values["min_thrust"] is not None:
         values["max_thrust"] = np.inf
     if values["min_thrust"] is None and values["max_thrust"] is not None:

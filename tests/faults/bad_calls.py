@@ -119,7 +119,7 @@ pj.gradient(exact, hits, of='cost', by='limits.nothing') | by must
 pj.optimal_plan(exact, hits) | case must be one case, got batch shape (2,)
 pj.hit.judge(hits, catch_plans) | plans must be a HitPlan, got a CatchPlan
 pj.catch.judge(catches, catch_plans, net_test='box') | net_test must
-pj.hit.judge(hits, hit_plans, tolerence=0.1) | tolerence must be a setting of the referee's
+pj.hit.judge(hits, hit_plans, tolerence=0.1) | tolerence must be a setting of the referee
 pj.intercept.judge(drives, drive_plans, truth=5) | truth must
 pj.block.judge(blocks, first(3, block_plans)) | plans must have the batch shape of the cases
 hit_plans.sample(0) | rate must be

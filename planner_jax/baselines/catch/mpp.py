@@ -24,7 +24,7 @@ from planner_jax.cost.quadrotor import (
     thrust_excess,
 )
 from planner_jax.task.catch.case import CatchCase
-from planner_jax.task.catch.context import CatchContext, ordered_context, targets_at
+from planner_jax.task.catch.context import CatchContext, order_targets, targets_at
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import (
     PiecewisePolynomial,
@@ -132,7 +132,7 @@ class MppCatch(Planner):
 
         Their cost is the mean squared jerk of the whole way.
         """
-        context = ordered_context(case)
+        context = order_targets(case)
         times, missed = self.times(context)
         balls = targets_at(context.targets, times)
         durations = jnp.maximum(jnp.diff(times, prepend=jnp.zeros_like(times[:1])), _SHORTEST)

@@ -22,7 +22,7 @@ from planner_jax.task.catch.context import (
     CatchContext,
     facing_cosine,
     is_too_far,
-    ordered_context,
+    order_targets,
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
@@ -145,7 +145,7 @@ class PaperCatch(OptimisedPlanner):
 
     def prepare(self, case: CatchCase) -> CatchContext:
         """The targets in the order of catching."""
-        return ordered_context(case)
+        return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
         """From rest to rest below every ball, on minimum-jerk primitives, (1, n)."""

@@ -1,4 +1,4 @@
-"""One catching task: up to N targets, the quadrotor, its net and its limits."""
+"""One catch to plan: up to N targets, the quadrotor, its net and its limits."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -38,14 +38,14 @@ from planner_jax.task.quadrotor import (
 )
 
 
-def _lies_ahead(horizon: Numbers, case: PyTree) -> Numbers:
+def _is_ahead(horizon: Numbers, case: PyTree) -> Numbers:
     return (horizon > 0.0) | ~case.present
 
 
-# What the numbers of a case must be.
+# Shapes and rules of the numbers of a case.
 RULES: Table = (
     Field("present", ("N",), kind=np.bool_),
-    Field("horizon", ("N",), Rule("> 0 of a target that is present", _lies_ahead)),
+    Field("horizon", ("N",), Rule("> 0 of a target that is present", _is_ahead)),
     Field("order", ("N",), PERMUTATION, kind=np.integer),
     Field("times", ("N",)),
     Field("head_state", (4, 3)),
@@ -56,10 +56,8 @@ RULES: Table = (
     *FLIGHT_RULES,
     Field("limits.min_height", ()),
 )
-
-
 GRAVITY = 9.81  # [m/s^2]
-START = (0.0, 0.0, 1.0)  # [m], where the quadrotor hovers
+START = (0.0, 0.0, 1.0)  # [m], hover position of the quadrotor
 _ARGUMENTS = {
     **ARGUMENTS,
     **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
@@ -69,43 +67,43 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class Net:
-    """A hoop above the propellers, across the thrust direction [Yu2023catch, eqs 22 and 25]."""
+    """A hoop above the propellers, normal to the thrust [Yu2023catch, eqs 22 and 25]."""
 
     height: Array  # () l [m], of the hoop's centre above the propeller plane
     radius: Array  # () [m]
-    max_angle: Array  # () theta_safe [rad], between the net's axis and the ball's way back
+    max_angle: Array  # () theta_safe [rad], between the net's axis and minus the ball's velocity
 
 
 @struct.dataclass
 class CatchChoice:
-    """What a decision settles of a catch."""
+    """A decision's choice for one case, or for a batch."""
 
-    order: Array  # (N,) int32, a permutation, the targets that are taken first
-    times: Array  # (N,) [s], rising, when to catch in that order, before any optimisation
-    taken: Array  # (N,) bool, of the targets as the case has them; the others are left
+    order: Array  # (N,) int32, permutation: the caught targets in their order, then the others
+    times: Array  # (N,) [s], rising, of catches in that order, before the optimisation
+    taken: Array  # (N,) bool, whether to catch each target, in the order of the case
 
 
 @struct.dataclass
 class CatchCase:
-    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+    """One catch to plan, or a batch of catches. Every number is a leaf of the pytree.
 
-    Times count from the moment at which planning begins. The N targets are caught in the
-    order `order`, which a decision fills in together with `times`.
+    Time 0 is when planning starts. A decision sets `order` and `times`.
     """
 
     rules: ClassVar[Table] = RULES
 
     targets: TargetPath  # leaves with a leading axis N
-    present: Array  # (N,) bool, in the same order as `targets`; which of the N there are
-    horizon: Array  # (N,) [s], until when each target may be caught
-    order: Array  # (N,) int32, a permutation: which target is caught first, second, ...
-    times: Array  # (N,) [s], when, as a first guess; in the order of catching, rising
+    present: Array  # (N,) bool, whether each target exists; absent targets fill up the shape
+    horizon: Array  # (N,) [s], latest time at which each target may be caught
+    order: Array  # (N,) int32, permutation: indices of the targets in the order of catching
+    times: Array  # (N,) [s], first guess of the times of catches in that order, rising
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
     gravity: Array  # () [m/s^2], magnitude
     net: Net
     limits: QuadrotorLimits  # with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e]
-    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
-    optional: bool = struct.field(pytree_node=False, default=False)  # targets may be left
+    extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
+    # Whether targets may be left, to catch the greatest possible number.
+    optional: bool = struct.field(pytree_node=False, default=False)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -114,11 +112,11 @@ class CatchCase:
 
     @property
     def num_targets(self) -> int:
-        """N, the number of targets that the shape holds."""
+        """N, the number of targets, present or absent."""
         return np.shape(self.present)[-1]
 
     def decided(self, choice: CatchChoice) -> "CatchCase":
-        """The case, or the batch, with an order and times, without the targets that are left."""
+        """Return the case, or the batch, with the order, times and targets of a choice."""
         present = self.present & choice.taken
         return dataclasses.replace(self, order=choice.order, times=choice.times, present=present)
 
@@ -143,27 +141,26 @@ def case(
     optional: bool = False,
     dtype=jnp.float32,
 ) -> CatchCase:
-    """Return a catch, or a batch of catches, with the setting of [Yu2023catch].
+    """Make a catch, or a batch of catches, by default for the robot of [Yu2023catch].
 
-    The paper gives no limits. The limits here are those of the shared protocol: |v| <= 5 m/s,
-    |omega| <= 5 rad/s, thrust 0.3 g to 2.5 g, height >= 0.25 m, theta_safe = 30 degrees. Order and
-    times are placeholders until `decide` sets them: the targets as they come, at equal shares of
-    the first horizon.
+    The paper gives no limits. The defaults are |v| <= 5 m/s, |omega| <= 5 rad/s, thrust from 0.3 g
+    to 2.5 g, height >= 0.25 m and theta_safe = 30 degrees. Until a decision sets them, `order` is
+    0, 1, ..., N - 1 and the times are equally spaced up to the first horizon.
 
-    The arguments that are not in this list, and the errors, are those of `pj.hit.case`.
+    Further arguments and the errors are as in `pj.hit.case`.
 
-    * `targets`: a path pytree whose leaves have leading axes (..., N).
-    * `horizon`: (..., N) [s], until when each target may be caught.
-    * `present`: (..., N) bool.
-    * `robot`: with a net. The net's and the quadrotor's numbers are the robot's by default.
-    * `net_height`, `net_radius`: l and radius of the net [m].
+    * `targets`: path pytree whose leaves have leading axes (..., N).
+    * `horizon`: (..., N) [s], latest time at which each target may be caught.
+    * `present`: (..., N) bool, whether each target exists.
+    * `robot`: quadrotor with a net. Arguments that are None take the robot's numbers.
+    * `net_height`, `net_radius`: height l above the propeller plane and radius of the net [m].
     * `max_angle`: theta_safe [rad].
-    * `optional`: whether targets may be left: as many as possible are to be caught, not all.
+    * `optional`: whether targets may be left, to catch the greatest possible number.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:
-        found = "none" if shape else "one number"
-        raise ArgumentError("horizon", "an entry for each target", verb="have", shown=found)
+        shown = "none" if shape else "one number"
+        raise ArgumentError("horizon", "an entry for each target", verb="have", shown=shown)
     require_switch("optional", optional)
     batch, num = shape[:-1], shape[-1]
 
@@ -175,7 +172,7 @@ def case(
     shares = np.arange(1, num + 1) / (num + 1.0)
     made = CatchCase(
         targets=targets,
-        present=_present(present, shape),
+        present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
         order=jnp.asarray(np.broadcast_to(np.arange(num), shape), jnp.int32),
         times=leaf("horizon", shares * np.asarray(horizon)[..., :1], num),
@@ -203,11 +200,11 @@ def case(
     return made
 
 
-def _present(given: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Which targets there are, of the shape (..., N) of the horizon."""
-    found = np.asarray(given)
-    if found.dtype != np.bool_:
-        raise ArgumentTypeError("present", "True or False of each target", given)
-    if found.shape not in ((), shape[-1:], shape):
-        raise ArgumentError("present", f"the shape {shape}", found.shape, verb="have")
-    return jnp.asarray(np.broadcast_to(found, shape), bool)
+def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """Return the argument `present` in the shape (..., N) of the horizon."""
+    array = np.asarray(present)
+    if array.dtype != np.bool_:
+        raise ArgumentTypeError("present", "True or False of each target", present)
+    if array.shape not in ((), shape[-1:], shape):
+        raise ArgumentError("present", f"the shape {shape}", array.shape, verb="have")
+    return jnp.asarray(np.broadcast_to(array, shape), bool)

@@ -1,4 +1,4 @@
-"""One catch as every planner of the task sees it: targets in their order, and a bound on them."""
+"""Functions that all catch planners share: ordered targets, the net's axis, a bound on reach."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,9 @@ from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath, state_at
 from planner_jax.robot.quadrotor import beyond_reach, greatest_speed
 from planner_jax.task.catch.case import CatchCase
 
-_RESTING = 1e-3  # [m/s]: a target that is much slower has no direction to come from
-_TIMES = 32  # up to the horizon, at which every target is looked at
-_SLACK = 0.02  # [m], far more than a plan that the referee accepts may be off its target
+_RESTING = 1e-3  # [m/s], added upwards: much slower targets have no direction
+_TIMES = 32  # times up to the horizon at which the bound on the reach is evaluated
+_SLACK = 0.02  # [m], far more than the contact error that the referee accepts
 
 
 @struct.dataclass
@@ -22,13 +22,13 @@ class CatchContext:
 
     case: CatchCase
     targets: TargetPath  # the path pytree, leaves (N, ...)
-    active: Array  # (N,) bool, False for the places of absent targets
+    active: Array  # (N,) bool, False for absent targets
     horizon: Array  # (N,) [s]
     times: Array  # (N,) [s], first guess
 
 
-def ordered_context(case: CatchCase) -> CatchContext:
-    """Return a case with its targets, presence and horizons in the order of catching."""
+def order_targets(case: CatchCase) -> CatchContext:
+    """Return a case with its targets in the order of catching."""
     return CatchContext(
         case=case,
         targets=jax.tree.map(lambda leaf: leaf[case.order], case.targets),
@@ -44,10 +44,7 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) between unit net axes and the ways back of targets of velocities (N, 3).
-
-    Also return which targets have one.
-    """
+    """Return cosines (N,) between unit axes of the net and -vel (N, 3), and which targets move."""
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
@@ -55,16 +52,16 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 
 
 def nearest_upright(vel: Array, lean: Array) -> Array:
-    """Return the net's axes (N, 3) nearest to upright that lean so far from the targets' way back.
+    """Return the axes (N, 3) nearest to upright at an angle of at most `lean` from -vel (N, 3).
 
-    Targets that rise are taken to fly level, and of those at rest the axis is upright. The lean
-    () [rad] is from 0 to a quarter turn.
+    Targets that rise are taken to fly level. For targets at rest the axis is upright. The lean
+    () [rad] is from 0 to pi / 2.
     """
     back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0) + _RESTING], axis=1)
     back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))
     level = jnp.sqrt(jnp.maximum(jnp.sum(back[:, :2] ** 2, axis=1, keepdims=True), 1e-6))
     cosine, sine, rise = jnp.cos(lean), jnp.sin(lean), back[:, 2:]
-    # The way back, turned by the lean towards upright.
+    # The direction back along the target's path, turned by the lean towards upright.
     turned = jnp.concatenate(
         [(cosine - sine * rise / level) * back[:, :2], cosine * rise + sine * level], axis=1
     )
@@ -72,14 +69,14 @@ def nearest_upright(vel: Array, lean: Array) -> Array:
 
 
 def is_too_far(context: CatchContext) -> Array:
-    """Return whether the quadrotor can be near some target at no time up to its horizon, () bool.
+    """Return whether a bound proves that the quadrotor cannot reach some target, () bool.
 
-    At a catch it is no farther from the target than height and radius of its net, and above its
-    least height. A catch is within half a step of one of the times that are looked at, in which
-    target and quadrotor move by what is added to the distance.
+    At a catch the quadrotor is within height plus radius of the net from the target, and above its
+    least height. The bound is evaluated at `_TIMES` times. A catch is within half a step of one of
+    them, so the bound adds the distances that target and quadrotor move in half a step.
 
-    False does not say that there is a plan. It is false for targets that may be left, for those of
-    a class that does not say how it accelerates, and where a number is not finite.
+    False proves nothing. The result is false for optional targets, for targets that are neither
+    `BallPath` nor `HarmonicPath`, and where a number is not finite.
     """
     case, targets = context.case, context.targets
     if case.optional or not isinstance(targets, BallPath | HarmonicPath):
@@ -102,7 +99,7 @@ def is_too_far(context: CatchContext) -> Array:
 
 
 def _greatest_acceleration(target: BallPath | HarmonicPath, horizon: Array) -> Array:
-    """Of a target up to a time () [s], a bound, () [m/s^2]."""
+    """Return a bound () [m/s^2] on a target's acceleration up to its horizon () [s]."""
     if isinstance(target, HarmonicPath):
         return jnp.sqrt(jnp.sum(target.amplitude**2)) * target.rate**2
     fastest = jnp.sqrt(jnp.sum(target.ball.vel**2)) + target.gravity * horizon

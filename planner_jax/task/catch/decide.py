@@ -1,7 +1,7 @@
-"""When and in what order to catch: by estimated arrival, or the best of all orders.
+"""Decisions on the order and the times of catches, by the estimate of `estimate`.
 
-Where targets are optional a decision also settles which are left, and every order is proposed
-in several lengths: the planner keeps the plan that catches most.
+If targets are optional, a decision also chooses which to catch. Every order is then proposed in
+several lengths, and the plan that catches most targets is selected.
 """
 
 import dataclasses
@@ -17,45 +17,34 @@ from jax import Array, lax
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Status, is_unsolved, require_settings
 from planner_jax.task.arguments import require_orders
+from planner_jax.task.catch import estimate
 from planner_jax.task.catch.case import CatchCase, CatchChoice
-from planner_jax.task.catch.estimate import (
-    GRID,
-    INSTANT,
-    Timetable,
-    arrivals,
-    earliest_next,
-    follow,
-    later_by_shortfall,
-    length,
-    sampled,
-    takeable,
-    timetable,
-    top_speed,
-)
+from planner_jax.task.catch.estimate import Timetable, timetable
 from planner_jax.task.catch.plan import CatchPlan
 
-LENGTHS = 3  # in which an order of optional targets is proposed
-MOST_PERMUTED = 6  # targets, of which all orders are estimated
-MOST_SEARCHED = 100  # targets, of which a beam search finds orders
-_WORD = 24  # bits of a number that says which targets are taken
+LENGTHS = 3  # proposals for each order of optional targets
+MOST_PERMUTED = 6  # greatest number of targets for which all orders are estimated
+MOST_SEARCHED = 100  # greatest number of targets for the beam search
+_WORD = 24  # bits in each integer of the set of taken targets
 
 
 def closest_approach(cases: CatchCase) -> Array:
-    """Return the distance (N,) or (B, N) [m] of targets from the net's reach; zero is within reach.
+    """Return the least distance (N,) or (B, N) [m] between each target and the net's reach.
 
-    A bound that no plan can beat, at 64 times up to the horizon: the quadrotor leaves with its
-    velocity and flies at its greatest speed in any direction, above the least height.
+    It is a lower bound, and zero where a target may be within reach. The quadrotor is taken to fly
+    at its greatest speed in any direction, above its least height. The bound is evaluated at 64
+    times up to the horizon.
     """
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
 
 def _closest_approach(case: CatchCase) -> Array:
-    """`closest_approach` of one case."""
     net, limits = case.net, case.limits
-    times, states, speed = sampled(case)
-    distance = length(states.pos - case.head_state[0][:, None])
-    # The target moves on between two of the times.
-    slack = net.height + net.radius + (speed + limits.speed) * case.horizon[:, None] / GRID
+    times, states, speed = estimate.sample_targets(case)
+    distance = estimate.length(states.pos - case.head_state[0][:, None])
+    # Target and quadrotor move between two of the times.
+    step = case.horizon[:, None] / estimate.GRID
+    slack = net.height + net.radius + (speed + limits.speed) * step
     far = distance - limits.speed * times - slack
     low = limits.min_height - states.pos[:, 2] - slack
     gap = jnp.min(jnp.maximum(jnp.maximum(far, low), 0.0), axis=1)
@@ -66,10 +55,10 @@ _closest_approaches = jax.jit(jax.vmap(_closest_approach))
 
 
 def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
-    """Choices (K, N) as they are, or (K * LENGTHS, N) where targets are optional.
+    """Return choices (K, N) unchanged, or (K * LENGTHS, N) for optional targets.
 
-    Each is then also proposed without its last catch, its last two, ...: whether the last ones
-    can be reached is more than an estimate knows.
+    Each choice is then also proposed without its last catch, without its last two and so on,
+    because the estimate is least certain for the last catches.
     """
     if not case.optional:
         return choices
@@ -87,31 +76,32 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 @struct.dataclass
 class _Partial:
-    """W beginnings of orders in a beam search."""
+    """W partial orders in a beam search."""
 
-    rank: Array  # (W,) [s], infinite where there is none
-    short: Array  # (W,) [m], out of the estimate's reach so far
+    rank: Array  # (W,) [s], infinite in empty rows
+    short: Array  # (W,) [m], sum of the shortfalls
     time: Array  # (W,) [s], of the last catch
-    place: Array  # (W, 3) [m], of the last catch
-    position: Array  # (W, N) of each target in the order; N where it is left so far
+    place: Array  # (W, 3) [m], of the quadrotor at the last catch
+    position: Array  # (W, N), of each target in the order; N for targets that are not in it
     times: Array  # (W, N) [s], of each target
 
 
 def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
-    """Return orders of one case that take most targets, the earliest of them, leaves (W, N).
+    """Return the best orders of one case: with the most targets, then the earliest; leaves (W, N).
 
-    After each catch the W best beginnings go on, at most one for the same targets with the same
-    last one: a bounded search, which may miss the best order. Where fewer than W are found, the
-    first one is repeated.
+    After each catch the W best partial orders continue, of those with the same set of targets and
+    the same last target only the best. The search may miss the best order. Where fewer than W
+    orders are found, the first one is repeated.
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
     """
-    num, speed = case.num_targets, top_speed(case)
+    num, speed = case.num_targets, estimate.top_speed(case)
     if num > MOST_SEARCHED:
         raise ArgumentError("targets", f"at most {MOST_SEARCHED} of a case", num)
-    from_all = jax.vmap(arrivals, (None, 0, 0, None))
-    # Which targets are taken, in words of so many bits that 32 hold one and the last target, too.
+    from_all = jax.vmap(estimate.arrivals, (None, 0, 0, None))
+    # The set of taken targets as bits of a few integers. Each of 32 bits also has room for the
+    # index of the last target.
     words = np.arange(0, num, _WORD)
     place = np.arange(num) - words[:, None]
     inside = (place >= 0) & (place < _WORD)
@@ -119,16 +109,16 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
     def advance(now: _Partial, step: Array) -> tuple[_Partial, _Partial]:
         times, places, shortfalls = from_all(table, now.time, now.place, speed)
-        times = jnp.maximum(times, now.time[:, None] + INSTANT)
+        times = jnp.maximum(times, now.time[:, None] + estimate.INSTANT)
         left = now.position == num
-        possible = left & jax.vmap(takeable, (None, 0))(case, shortfalls)
+        possible = left & jax.vmap(estimate.can_be_next, (None, 0))(case, shortfalls)
         short = now.short[:, None] + shortfalls
-        rank = later_by_shortfall(times, short)
+        rank = estimate.later_by_shortfall(times, short)
         rank = jnp.where(possible & jnp.isfinite(now.rank)[:, None], rank, jnp.inf).ravel()
         taken = jnp.sum(jnp.where(left, 0, bits[:, None]), axis=2, keepdims=True)
         *others, last = (taken | bits[:, None]).reshape(len(words), -1)
         state = (*others, last * num + jnp.tile(np.arange(num), width))
-        # Of equal states only the first one, in order of their ranks, goes on.
+        # Of equal states only the one with the least rank continues.
         sorted_ = jnp.lexsort((rank, *state))
         alike = [jnp.diff(word[sorted_], prepend=-1) == 0 for word in state]
         again = functools.reduce(jnp.logical_and, alike)
@@ -163,20 +153,20 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the choice of one order, from the position and the time of each target (N,)."""
+    """Return the choice for positions in the order and times of the targets (N,)."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
     rising = jnp.where(taken, times, 0.0)[order]
     behind = jnp.maximum(jnp.arange(num) - jnp.sum(taken) + 1, 0)
-    rising = lax.cummax(rising) + INSTANT * behind
+    rising = lax.cummax(rising) + estimate.INSTANT * behind
     return CatchChoice(order=order.astype(jnp.int32), times=rising, taken=taken)
 
 
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
     """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
 
-    The times T_p were decided, and the times T_o are optimised.
+    T_p are the decided times of the catches, T_o the optimised ones.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)
@@ -187,17 +177,20 @@ def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
 
 
 class CatchDecision:
-    """What the decisions about catches have in common."""
+    """Base class of decisions about catches."""
 
     def check(self, cases: CatchCase) -> None:
-        """Any batch will do."""
+        """Accept any batch."""
 
     def rank(self, plans: CatchPlan) -> Array:
-        """The time of the last catch [s], one a plan; far later for any target that is left."""
+        """Return the time of the last catch of each plan [s], plus 100 s for each target left."""
         return plans.times[..., -1] + 100.0 * (plans.times.shape[-1] - plans.num_taken)
 
     def explain(self, case: CatchCase, status: Array) -> Array:
-        """OUT_OF_REACH for an unsolved case with a target that `closest_approach` rules out."""
+        """Return OUT_OF_REACH for unsolved cases with a target that `closest_approach` rules out.
+
+        Other statuses are returned unchanged.
+        """
         away = jnp.max(_closest_approach(case)) > 0.0
         unsolved = is_unsolved(status) | (status == Status.OUT_OF_TIME)
         return jnp.where(unsolved & away, jnp.int32(Status.OUT_OF_REACH), status)
@@ -206,15 +199,15 @@ class CatchDecision:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(CatchDecision):
-    """The most promising of all orders are planned, and the earliest last catch is kept.
+    """Plans the orders with the best estimates; the plan with the earliest last catch is selected.
 
-    All N! orders are estimated. Those with the least shortfall, then the earliest last catch,
-    are the finalists. Beyond six targets, and where they are optional, the orders are those that
-    a beam search of bounded width finds, which may miss the best one, of at most 100 targets.
+    The finalists are the orders of least time of the last catch plus 10 s for each metre of
+    shortfall. All N! orders of up to six targets are estimated. For more targets (at most 100), and
+    for optional ones, a beam search finds the orders, which may miss the best one.
     """
 
     finalists: int = 6  # orders that are planned
-    width: int = 64  # of the beam
+    width: int = 64  # of the beam search
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -222,13 +215,13 @@ class Best(CatchDecision):
             raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The finalists of one case, leaves (F, N)."""
+        """Return the finalists of one case, leaves (F, N)."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)
             return in_several_lengths(case, jax.tree.map(lambda x: x[: self.finalists], found))
         orders = jnp.asarray(list(itertools.permutations(range(case.num_targets))), jnp.int32)
-        choices, shortfall = jax.vmap(functools.partial(follow, case, table))(orders)
+        choices, shortfall = jax.vmap(functools.partial(estimate.follow, case, table))(orders)
         rank = choices.times[:, -1] + 10.0 * shortfall
         chosen = jnp.argsort(rank)[: min(self.finalists, len(orders))]
         return jax.tree.map(lambda leaf: leaf[chosen], choices)
@@ -237,40 +230,41 @@ class Best(CatchDecision):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Greedy(CatchDecision):
-    """Next is caught whatever can be caught earliest."""
+    """Catches next the target that can be caught earliest."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The one choice for one case, leaves (1, N), or (LENGTHS, N) if targets are optional."""
-        choice = earliest_next(case, timetable(case), jnp.zeros_like(case.horizon))
+        """Return the only choice for one case, leaves (1, N), or (LENGTHS, N) if optional."""
+        table = timetable(case)
+        choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
+
+    def _handicap(self, case: CatchCase, table: Timetable) -> Array:
+        """Return times (N,) [s] that are added to the targets' times in comparisons."""
+        return jnp.zeros_like(case.horizon)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Random(CatchDecision):
-    """Next is any target that can be caught, as early as it can be; the same for equal cases."""
+class Random(Greedy):
+    """Catches next a random target; equal cases have equal choices."""
 
     seed: int = 0
 
-    def propose(self, case: CatchCase) -> CatchChoice:
-        """The one choice for one case, leaves (1, N), or (LENGTHS, N) if targets are optional."""
-        table = timetable(case)
+    def _handicap(self, case: CatchCase, table: Timetable) -> Array:
         own = lax.bitcast_convert_type(jnp.sum(table.places).astype(jnp.float32), jnp.uint32)
         key = jax.random.fold_in(jax.random.key(self.seed), own)
-        handicap = 1e3 * jax.random.uniform(key, case.horizon.shape, case.horizon.dtype)
-        choice = earliest_next(case, table, handicap)
-        return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
+        return 1e3 * jax.random.uniform(key, case.horizon.shape, case.horizon.dtype)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Given(CatchDecision):
-    """Order and times are those that the cases hold."""
+    """Takes order and times from the cases."""
 
     def check(self, cases: CatchCase) -> None:
         """Raise `ValueError` unless every order is a permutation."""
         require_orders(cases.order)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The one choice of one case, leaves (1, N)."""
+        """Return the only choice of one case, leaves (1, N)."""
         return CatchChoice(order=case.order[None], times=case.times[None], taken=case.present[None])

@@ -1,8 +1,8 @@
-"""The `exact` catch planner: every catch is built into the decision variables.
+"""The `exact` catch planner, whose decision variables satisfy every catch.
 
-[Yu2023catch] brings the net to the ball by a penalty (eqs 22-24), and its plans miss by what the
-penalty accepts. Here the net's centre is the ball's position less an offset inside the
-hoop, so that no plan misses; attitude and limits stay inequalities.
+[Yu2023catch, eqs 22-24] moves the net to the ball by a penalty and accepts a small error. Here the
+net's centre is the ball's position less an offset inside the hoop, so that every plan catches the
+ball. Attitude and limits remain inequalities.
 """
 
 import dataclasses
@@ -25,7 +25,7 @@ from planner_jax.task.catch.context import (
     facing_cosine,
     is_too_far,
     nearest_upright,
-    ordered_context,
+    order_targets,
     targets_at,
 )
 from planner_jax.task.catch.plan import CatchPlan
@@ -35,16 +35,14 @@ if TYPE_CHECKING:
     from planner_jax.task.catch.replan import ReplanCatch
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_SEEN = (-0.1, 0.1)  # [s] from the decided time, at which the network's features take the ball
-_RIM = 0.9  # share of the net's radius that a planned catch may use
-_LEARNED_PLACE = 2.0  # greatest size of a place that is learnt: 0.89 of that share
-_ENCODED_RIM = 0.99  # share of that which a point made by `encode` may use
-
-
-# Starting points, best first: factor on the guessed times, then twice two numbers, for a catch on
-# the way and for the last one: the share of the mean velocity of the way there that is kept, and
-# the thrust, from -1 for the least that is allowed over 0 for the weight to 1 for the greatest.
-# Optimal plans sink through their catches and brake at the last one.
+_FEATURE_TIMES = (-0.1, 0.1)  # [s], relative to the decided time, of the ball in the features
+_RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
+_LEARNED_SIZE = 2.0  # greatest length of the variables of a learned catch point: 0.89 of `_RIM`
+_ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
+# Starting points, best first: factor on the decided times; for the catches before the last, the
+# velocity relative to the mean velocity of the segment, and the thrust, where -1 is the least, 0
+# hover and 1 the greatest; both numbers for the last catch. Optimal plans sink through their
+# catches and brake at the last one.
 _GUESSES = np.array(
     [
         (1.0, 0.5, 0.8, -5.0 / 7.0, 0.1),
@@ -62,57 +60,30 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # in its place, of one target
-# In its place, of several targets, where Newton's method goes on: it would begin too far away.
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # replaces it after a network
+# Before Newton's method with several targets, in place of `_FIRST`, which ends too far away.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
-# In the place of the first two of `_ROUNDS`, where more than `_FEW` targets are in line, each of
-# which must be caught: few iterations lead nowhere there.
+# For more than `_FEW` targets, each of which must be caught, the first two rounds are longer.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))
-_LEAN = 0.95  # of the angle that the net may have to the ball's way, what a guess makes use of
-
-
-def start_features(context: CatchContext) -> Array:
-    """Return the inputs of the network of a single catch, (F,): ball, quadrotor and limits."""
-    case, net = context.case, context.case.net
-    head, limits, time = case.head_state, case.limits, context.times[0]
-    seen = [targets_at(context.targets, context.times[:1] + late) for late in _SEEN]
-    least, most = limits.thrust_bounds
-    numbers = (
-        *(part for ball in seen for part in (ball.pos[0] - head[0], ball.vel[0])),
-        head[1],
-        0.2 * head[2],
-        0.02 * head[3],
-        jnp.stack(
-            [
-                time,
-                context.horizon[0] - time,
-                head[0, 2] - limits.min_height,
-                *map(jnp.log, (limits.speed, most, least, limits.body_rate, case.gravity)),
-                net.height,
-                net.radius,
-                net.max_angle,
-            ]
-        ),
-    )
-    return jnp.concatenate(numbers)
+_LEAN = 0.95  # angle between net and ball in a guess, relative to the greatest allowed angle
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
-    """Minimum-snap catches with the ball in the net by construction.
+    """Plans minimum-snap catches; the decision variables put the ball into the net.
 
-    Decision variables, N segments with 3 (M - 1) + 12 each, in units of `scale`: whitened
-    waypoint offsets, log duration of the segment, place in the net, velocity, acceleration and
-    jerk at the catch. The acceleration gives the net's axis z_d; the ball's position at the
-    catch less the net's height along z_d and a place inside the hoop is the quadrotor's.
+    Each of N segments has 3 (M - 1) + 12 variables in units of `scale`: whitened waypoint offsets,
+    log duration, catch point in the net, and velocity, acceleration and jerk at the catch. The
+    acceleration determines the net's axis z_d. The quadrotor's position at the catch is the ball's
+    position minus the net's height along z_d and minus the catch point's offset inside the hoop.
 
-    Cost: time_weight * total time + energy_weight * integral |snap|^2 + integral of the
-    smoothed hinges of the limits [Yu2023catch, eqs 26-28], and of the case's extras + hinges of the
-    angle (eq. 25) and of the horizon.
+    The cost is time_weight * total time + energy_weight * integral |snap|^2, plus the integral of
+    the smoothed hinges of the limits [Yu2023catch, eqs 26-28] and extras, plus catch_weight * the
+    hinges of the angle [Yu2023catch, eq. 25] and of the horizon.
     """
 
     case_type = CatchCase
@@ -120,12 +91,12 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     num_end_variables = 12
     guess_table = _GUESSES
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
-    catch_weight: float = 0.3  # [s], of the hinges at a catch beside the integrals
+    catch_weight: float = 0.3  # [s], of the hinges at a catch
     rounds: tuple[Round, ...] = _ROUNDS
-    # Of the first guess, the thrust at catches on the way, as in `_GUESSES`. Near the least that is
-    # allowed catches are soonest; more leaves control a margin in flight.
+    # Thrust at catches before the last one in the first guess, as in `_GUESSES`. Near -1 catches
+    # are earliest; larger values leave a margin for feedback control in flight.
     lift: float = _GUESSES[0, 3].item()
-    learned: bool = True  # whether a network makes the first guess of a single catch
+    learned: bool = True  # whether a network improves the first guess of a single catch
 
     @property
     def end_weight(self) -> float:
@@ -133,14 +104,14 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.catch_weight
 
     def active(self, context: CatchContext) -> Array:
-        """Return which catches, in their order, are of targets that are there, (N,) bool."""
+        """Return which catches, in their order, are of present targets, (N,) bool."""
         return context.active
 
     def start_network(self, case: CatchCase) -> StartNetwork | None:
-        """Return the network for the first guess of a single catch of usual sizes and lift.
+        """Return the network for the first guess of a single catch, or None.
 
-        Around obstacles there is none, because the side on which a search starts decides where it
-        can end.
+        There is none for several targets, unusual sizes or `lift`, and around obstacles, because
+        the side on which a search starts decides where it can end.
         """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
         is_usual &= case.num_targets == 1 and not case.extras
@@ -149,15 +120,36 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return shipped_network(self.package, "exact-6")
 
     def start_features(self, context: CatchContext) -> Array:
-        """Return the inputs of the network, (F,)."""
-        return start_features(context)
+        """Return the inputs of the network, (F,): ball, quadrotor and limits."""
+        case, net = context.case, context.case.net
+        head, limits, time = case.head_state, case.limits, context.times[0]
+        balls = [targets_at(context.targets, context.times[:1] + late) for late in _FEATURE_TIMES]
+        least, most = limits.thrust_bounds
+        numbers = (
+            *(part for ball in balls for part in (ball.pos[0] - head[0], ball.vel[0])),
+            head[1],
+            0.2 * head[2],
+            0.02 * head[3],
+            jnp.stack(
+                [
+                    time,
+                    context.horizon[0] - time,
+                    head[0, 2] - limits.min_height,
+                    *map(jnp.log, (limits.speed, most, least, limits.body_rate, case.gravity)),
+                    net.height,
+                    net.radius,
+                    net.max_angle,
+                ]
+            ),
+        )
+        return jnp.concatenate(numbers)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """Return the targets in the order of catching."""
-        return ordered_context(case)
+        """Return the case with its targets in the order of catching."""
+        return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
-        """Return catches that face the balls, at and after the guessed times, (num, N, 12)."""
+        """Return the end variables of the first rows of `guess_table`, (num, N, 12)."""
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
@@ -172,17 +164,17 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
     def starts_long(self, cases: CatchCase) -> bool:
-        """Return whether the first search is a long one: many targets that must all be caught."""
+        """Return whether the first round is long: for many targets that must all be caught."""
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """Return a shorter first round where it starts near its end, longer searches elsewhere."""
+        """Return a round adapted to the distance of its starting point from the optimum."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
-            # Far from the end what an iteration gains says little of what all of them do.
+            # Far from the optimum the gain of one iteration is no measure of convergence.
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
             solver = dataclasses.replace(attempt.solver, tolerance=slow)
             return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
@@ -190,19 +182,19 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return _FROM_LEARNED if is_near else attempt
 
     def limit_learned(self, point: Array) -> Array:
-        """Return a point (n,) whose places in the net still move with their variables.
+        """Return a point (n,) with bounded variables of the catch points.
 
-        The least time puts the ball on the rim, at places without bound, from which no later search
-        comes back when the ball turns out to be elsewhere.
+        Least time moves a catch point to the rim, where its variables grow without bound and the
+        catch point hardly moves with them. A later re-plan could not leave such a point.
         """
         offsets, natural = self.split(point)
         place = natural[:, 1:3]
         size = jnp.sqrt(jnp.maximum(jnp.sum(place**2, axis=1, keepdims=True), 1e-12))
-        natural = natural.at[:, 1:3].set(place * jnp.minimum(1.0, _LEARNED_PLACE / size))
+        natural = natural.at[:, 1:3].set(place * jnp.minimum(1.0, _LEARNED_SIZE / size))
         return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """Return the end variables (N, 12) for a row of the table of starting points."""
+        """Return the end variables (N, 12) of a row of `guess_table`."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
@@ -211,14 +203,14 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         ball = targets_at(context.targets, times)
         before = jnp.concatenate([case.head_state[None, 0], ball.pos[:-1]])
         is_last = jnp.arange(times.size) == jnp.sum(context.active) - 1
-        kept, lift = (
-            jnp.where(is_last, last, on_the_way)[:, None]
-            for on_the_way, last in (of_catches[:2], of_catches[2:])
+        share, lift = (
+            jnp.where(is_last, of_last, of_others)[:, None]
+            for of_others, of_last in (of_catches[:2], of_catches[2:])
         )
         least, most = case.limits.thrust_bounds
         less, more = case.gravity - least, most - case.gravity
         thrust = case.gravity + lift * jnp.where(lift < 0.0, less, more)
-        vel = kept * (ball.pos - before) / durations[:, None]
+        vel = share * (ball.pos - before) / durations[:, None]
         up = jnp.array([0.0, 0.0, 1.0], times.dtype)
         lean = _LEAN * case.net.max_angle
         acc = thrust * nearest_upright(ball.vel, lean) - case.gravity * up
@@ -228,9 +220,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         )
 
     def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
-        """Return the catches that the variables (N, 12) describe, as the ends of the segments.
+        """Return the catches that the end variables (N, 12) describe, as ends of the segments.
 
-        Their excess (2, N) is that of the net's angle, and the time after the horizon.
+        The excess (2, N) consists of the net's angle and the time after the horizon.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
@@ -244,12 +236,12 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         place = place * inside
         pos = ball.pos - net.height * axis - place[:, :1] * across_x - place[:, 1:] * across_y
         facing, moving = facing_cosine(axis, ball.vel)
-        # To first order the relative excess of the angle, without an arc cosine.
+        # Relative excess of the angle to first order, which needs no arc cosine.
         angle = jnp.maximum(net.max_angle, 1e-3)
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
-        # The horizon is a hard end: the tolerance of a feasible plan is taken off.
+        # A feasible plan may not use its tolerance to catch after the horizon.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return ChainEnds(
             durations=durations,
@@ -264,9 +256,13 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     ) -> Array:
         """Return the point (n,) that describes given catches: the inverse of `decode`.
 
-        A place in the net cannot hold what is outside of the hoop or off its plane; the catch
-        is then the nearest across the net's axis. Segments have durations (N,) [s], states of the
-        quadrotor at the catches (N, 4, 3), and whitened waypoint offsets (N, M - 1, 3).
+        Balls off the net's plane are projected onto it, and balls outside of the hoop onto its rim.
+
+        Args:
+            context: case with its targets in the order of catching.
+            durations: (N,) [s], of the segments.
+            tail_states: (N, 4, 3) position to jerk of the quadrotor at the catches.
+            offsets: (N, M - 1, 3) whitened waypoint offsets.
         """
         case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -276,7 +272,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
         squared = jnp.sum(share**2, axis=1, keepdims=True)
-        # Nearer to the rim than this the place hardly moves with its variables.
+        # Nearer to the rim the catch point hardly moves with its variables.
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(
@@ -285,7 +281,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Return whether a target is never within reach."""
+        """Return whether `is_too_far` proves that no plan exists."""
         return is_too_far(context)
 
     def make_plan(
@@ -295,7 +291,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         violation: Array,
         context: CatchContext,
     ) -> CatchPlan:
-        """Return the plan of a trajectory and the times of its catches."""
+        """Return the plan of a trajectory with catches at the times `ends.contact`."""
         return CatchPlan(
             trajectory=trajectory,
             gravity=context.case.gravity,
@@ -306,7 +302,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         )
 
     def replanner(self) -> "ReplanCatch":
-        """Return the `ReplanCatch` that continues from this planner's plans; see `pj.replan`."""
+        """Return the planner that `pj.replan` uses."""
         from planner_jax.task.catch.replan import ReplanCatch
 
         return ReplanCatch(self)

@@ -1,4 +1,4 @@
-"""What a catch planner returns."""
+"""Plans of catches."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -10,30 +10,30 @@ from planner_jax.task.catch.case import CatchChoice
 
 @struct.dataclass
 class CatchPlan(QuadrotorPlan):
-    """One plan, or a batch of them with a leading axis on every leaf.
+    """One plan, or a batch with a leading axis on every leaf.
 
-    The trajectory has N * M pieces, M up to each catch. Where fewer than N targets are
-    present, the last pieces have no duration and stay where the last catch was made.
+    The trajectory has M pieces to each of N catches. If fewer than N targets are caught, the last
+    pieces have no duration and stay at the position of the last catch.
     """
 
-    order: Array  # (N,) int32, which target is caught first, second, ...
-    decided_times: Array  # (N,) [s], of the catches in that order, as the decision had them
-    times: Array  # (N,) [s], of the catches in that order; other targets repeat the last
+    order: Array  # (N,) int32, indices of the targets in the order of catching
+    decided_times: Array  # (N,) [s], of the catches in that order, before the optimisation
+    times: Array  # (N,) [s], of the catches in that order; repeated where there is no catch
 
     @property
     def num_taken(self) -> Array:
-        """How many targets the plan catches, (...)."""
-        return jnp.sum(self._rises, axis=-1)
+        """Number of targets that the plan catches, (...)."""
+        return jnp.sum(self._is_catch, axis=-1)
 
     @property
-    def _rises(self) -> Array:
-        """Which of the catches, in their order, are planned, (..., N) bool."""
+    def _is_catch(self) -> Array:
+        """Which entries of `order` are caught, (..., N) bool."""
         times = jnp.asarray(self.times)
         return jnp.diff(times, prepend=jnp.zeros_like(times[..., :1]), axis=-1) > 0.0
 
     @property
     def choice(self) -> CatchChoice:
-        """What was decided."""
+        """Order, decided times, and which targets are caught."""
         order = jnp.asarray(self.order)
-        taken = jnp.take_along_axis(self._rises, jnp.argsort(order, axis=-1), axis=-1)
+        taken = jnp.take_along_axis(self._is_catch, jnp.argsort(order, axis=-1), axis=-1)
         return CatchChoice(order=self.order, times=self.decided_times, taken=taken)

@@ -1,4 +1,4 @@
-"""What the registry knows of catches; imports no JAX."""
+"""Specification of the task of catches for the registry; imports no JAX."""
 
 import dataclasses
 
@@ -7,28 +7,26 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """One kind of catching task."""
+    """Properties of one suite."""
 
     num_targets: int
-    horizon: float  # [s], until when a target may be caught at the latest
+    horizon: float  # [s], latest time at which a target of the suite may be caught
     description: str
-    # Planning success [%], optimal time ratio, and success of its MPP [%] in [Yu2023catch], Tables
-    # I and III. Those of `throws` are of 50 real throws, planned; the others of 1,000 simulated
-    # ones each. The paper gives no ranges: a suite of the same name is of the same kind, no more.
-    success: float | None = None
-    time_ratio: float | None = None
-    mpp_success: float | None = None
-    optional: bool = False  # whether targets may be left: there are more than can be caught
+    # Results of [Yu2023catch, Tables I and III]: for `throws` of 50 real throws, for other suites of
+    # 1,000 simulated cases. The paper gives no ranges, so its cases are similar, not the same.
+    success: float | None = None  # [%], of the planner
+    time_ratio: float | None = None  # optimal time ratio
+    mpp_success: float | None = None  # [%], of the motion primitives of the paper
+    optional: bool = False  # whether targets may be left, because some cannot be caught
 
 
-# The ranges are those of `planner_jax.task.catch.suites`.
 SUITES = {
     "throws": Suite(
         1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m.", 96.0, 0.092, 14.0
     ),
-    "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m that are seen 0.2 s later."),
+    "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m, planned for 0.2 s later."),
     "parabola1": Suite(
-        1, 1.66, "A throw without drag, as high as its flight time asks.", 99.3, 0.052
+        1, 1.66, "A throw without drag, to a height that follows from its flight time.", 99.3, 0.052
     ),
     "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together.", 98.2, 0.119),
     "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across.", 84.7, 0.234),
@@ -39,10 +37,8 @@ SUITES = {
     "heptagon7": Suite(7, 10.0, "Seven targets in parallel, on a heptagon."),
     "rush3": Suite(3, 4.4, "Three targets of `triangle3`, each with a deadline of its own."),
     "rush6": Suite(6, 8.6, "Six targets of `hexagon6`, each with a deadline of its own."),
-    "swarm8": Suite(8, 13.9, "Eight balls that sink all around: as many as can be.", optional=True),
-    "swarm12": Suite(
-        12, 13.9, "Twelve balls that sink all around: as many as can be.", optional=True
-    ),
+    "swarm8": Suite(8, 13.9, "Eight sinking balls, more than can be caught.", optional=True),
+    "swarm12": Suite(12, 13.9, "Twelve sinking balls, more than can be caught.", optional=True),
 }
 
 DECISIONS = {
@@ -52,7 +48,7 @@ DECISIONS = {
     "given": "planner_jax.task.catch.decide:Given",
     "policy": "planner_jax.policies.policy:policy",
 }
-TRAINED = ("policy",)  # of these, those that may be read from a file, as "policy:FILE"
+TRAINED = ("policy",)  # decisions that can be read from a file, as in "policy:FILE"
 
 TASK = Task(
     name="catch",

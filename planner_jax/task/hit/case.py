@@ -1,4 +1,4 @@
-"""One volley to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
+"""One hit to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -34,7 +34,7 @@ from planner_jax.task.quadrotor import (
     require_tool,
 )
 
-# What the numbers of a case must be.
+# Shapes and rules of the numbers of a case.
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
@@ -52,8 +52,6 @@ RULES: Table = (
     Field("hit_limits.min_apex", (), below("hit_limits.max_apex")),
     Field("hit_limits.max_apex", ()),
 )
-
-
 GRAVITY = 9.8  # [m/s^2]
 _ARGUMENTS = {
     **ARGUMENTS,
@@ -64,33 +62,33 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class HitLimits:
-    """What the stroke itself may not exceed [Yu2023bat, eqs 18f and 18g]."""
+    """Limits of the stroke [Yu2023bat, eqs 18f and 18g]."""
 
-    hitting_speed: Array  # (3,) [m/s], per world axis, of the quadrotor at impact
+    hitting_speed: Array  # (3,) [m/s], of the quadrotor at the impact, for each world axis
     min_apex: Array  # () [m], of the ball after the impact
     max_apex: Array  # () [m]
 
 
 @struct.dataclass
 class HitCase:
-    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+    """One hit to plan, or a batch of hits. Every number is a leaf of the pytree.
 
-    Times count from the moment at which planning begins.
+    Time 0 is when planning starts.
     """
 
     rules: ClassVar[Table] = RULES
 
     ball: BallState  # at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    target: Array  # (3,) [m], where the returned ball must land
+    target: Array  # (3,) [m], required landing point of the returned ball
     drag: Array  # () K_D [1/m]
     gravity: Array  # () [m/s^2], magnitude
-    restitution: Array  # () beta of the racket
-    racket_height: Array  # () [m], racket centre above the propeller plane
+    restitution: Array  # () coefficient beta of the racket
+    racket_height: Array  # () [m], of the racket's centre above the propeller plane
     limits: QuadrotorLimits
     hit_limits: HitLimits
-    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
-    racket_radius: Array | None = None  # () [m]; None: not looked at
+    extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
+    racket_radius: Array | None = None  # () [m]; None: not checked
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -122,39 +120,39 @@ def case(
     extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> HitCase:
-    """Return a hit, or a batch of hits, with the setting of [Yu2023bat, Section VI-A].
+    """Make a hit, or a batch of hits, by default with the numbers of [Yu2023bat, Section VI-A].
 
     Args:
-        serve_pos: (..., 3) [m], ball when planning begins, above the ground at z = 0.
-        serve_vel: (..., 3) [m/s].
-        target: (..., 3) [m].
-        robot: with a racket. The racket's and the quadrotor's numbers are the robot's by default.
+        serve_pos: (..., 3) [m], of the ball at time 0, above the ground at z = 0.
+        serve_vel: (..., 3) [m/s], of the ball at time 0.
+        target: (..., 3) [m], required landing point of the returned ball.
+        robot: quadrotor with a racket. Arguments that are None take the robot's numbers.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
         drag: K_D [1/m]. The drag and all later numbers are one value, or one value a case.
         gravity: [m/s^2].
-        restitution: beta of the racket.
-        racket_height: [m].
-        racket_radius: [m]; the ball has to meet the racket within 0.9 of it around its centre.
+        restitution: coefficient beta of the racket.
+        racket_height: [m], of the racket's centre above the propeller plane.
+        racket_radius: [m]. A valid contact is within 0.9 of it around the racket's centre.
         speed: [m/s].
         acceleration: [m/s^2].
         min_thrust: [m/s^2], per unit mass.
         max_thrust: [m/s^2], per unit mass.
         body_rate: [rad/s].
         min_height: [m].
-        hitting_speed: (3,) [m/s], per axis.
-        min_apex: [m].
-        max_apex: [m].
-        extras: such as `pj.KeepOut`, each for one case and shared by all cases, or with the
-            batch's axes on every leaf.
+        hitting_speed: (3,) [m/s], limit of the quadrotor's speed at the impact, for each axis.
+        min_apex: [m], least apex of the returned ball.
+        max_apex: [m], greatest apex of the returned ball.
+        extras: constraints and costs such as `pj.KeepOut`, without batch axes to share them, or
+            with the batch's axes on every leaf.
         dtype: of every floating leaf.
 
     Returns:
-        A `HitCase` whose leaves carry the batch shape of `serve_pos`.
+        Case whose leaves have the batch shape of `serve_pos`.
 
     Raises:
-        CaseError: a number breaks a rule, such as a limit that is not positive; one line.
-        ValueError: an argument has another shape.
-        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+        CaseError: a number breaks a rule, such as a limit that is not positive.
+        ValueError: an argument has a wrong shape.
+        TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
     dtype, batch = floating(dtype), batch_of("serve_pos", serve_pos, 3)
     tool = require_tool(robot, RACKET)

@@ -1,14 +1,14 @@
 """The court of [Yu2023bat, Section VI-B]: regions, targets, 36 scenarios, and flights of serves.
 
-World frame, z up, x towards the opponent, net at x = 0, y to the left. The opponent's half
-has x > 0, the hitting half x < 0; the same lines, mirrored in x, divide both.
+World frame: z up, x towards the opponent, y to the left, net at x = 0. The opponent's half has
+x > 0 and the hitting half x < 0. Both halves are divided into the same regions, mirrored in x.
 
-The paper gives the size of the court; the lines inside it are measured from the published
-serves, landing points and targets. The lane line shows itself at 0.84 m: points of the middle
-lanes reach 0.8395 m, points of the side lanes begin at 0.8418 m.
+The paper gives the size of the court. The lines between regions are measured from the published
+serves, landing points and targets: in y, the middle lane extends to 0.8395 m at least and the side
+lanes start at 0.8418 m at most.
 
-Flights are computed in float64 NumPy over whole batches, so that a bad serve is found and named
-before a program is compiled for it.
+Flights are computed by NumPy in float64, so that a bad serve is reported before anything is
+compiled.
 """
 
 import numpy as np
@@ -20,25 +20,23 @@ from planner_jax.task.hit.case import HitCase
 HALF_LENGTH = 5.0  # [m], net to back line
 HALF_WIDTH = 2.5  # [m], middle line to side line
 DEAD_ZONE = 0.5  # [m], from the net
-NEAR_LINE = 3.0  # [m], from the net; near ends and far begins, in the middle lane
-LANE_LINE = 0.84  # [m], from the middle line; middle lane ends and side lane begins
+NEAR_LINE = 3.0  # [m], from the net; between the near and the far region, in the middle lane
+LANE_LINE = 0.84  # [m], from the middle line; between the middle lane and a side lane
 
-_FLIGHT_STEPS = 16  # puts the landing point of a serve within 0.1 mm
+_FLIGHT_STEPS = 16  # landing points of serves are then exact to 0.1 mm
 _NEWTON_STEPS = 5
 
-# Near, Far, Left, Right; the published files count them from 1.
-REGIONS = "NFLR"
-
-# Left is y > 0 in both halves.
+REGIONS = "NFLR"  # near, far, left, right; the published files number them from 1
+# Targets of the regions in the opponent's half. Left is y > 0 in both halves.
 TARGETS = ((1.75, 0.0, 0.0), (4.0, 0.0, 0.0), (3.0, 1.67, 0.0), (3.0, -1.67, 0.0))  # [m]
 
 PLANNERS = ("juggle", "bat-lite", "bat")
 
 
 def _scenario_names() -> tuple[str, ...]:
-    """Serve, landing and target region of the 36 scenarios.
+    """Return serve, landing and target region of the 36 scenarios, as in "NFL".
 
-    A case and its mirror image in the middle line count as one, so R stands only behind an L.
+    Of two scenarios that mirror each other in y only one is listed: R follows only after an L.
     """
     return tuple(
         serve + landing + target
@@ -52,7 +50,10 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return edges (4, 2, 2) [m] of regions: region; |x| up to a depth, or y; lower or upper."""
+    """Return bounds (4, 2, 2) [m] of the regions, by region, axis (|x|, y), and lower or upper.
+
+    The far and side regions end at |x| = depth.
+    """
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)
@@ -60,21 +61,24 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Return region codes (..., 3), 1 to 4, of serve, landing and target of scenarios (...) int."""
+    """Return codes (..., 3), 1 to 4, of the serve, landing and target region.
+
+    Scenarios (...) are indices into SCENARIOS.
+    """
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 
 
 def target_of(scenario) -> np.ndarray:
-    """Target points (..., 3) [m] of scenarios given by their place in SCENARIOS."""
+    """Return targets (..., 3) [m] of scenarios (...), which are indices into SCENARIOS."""
     return np.array(TARGETS)[scenario_regions(scenario)[..., 2] - 1]
 
 
-# Inside, the axis of the components comes first: NumPy is quick along the last one.
+# The following vectors are (3, ...), because NumPy is fastest along the last axis.
 
 
 def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Acceleration  g - K_D |v| v  (3, ...) [Yu2023bat, eq. 2]."""
+    """Return g - K_D |v| v, (3, ...) [Yu2023bat, eq. 2]."""
     x, y, z = velocity
     acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
     acceleration[2] -= gravity
@@ -82,7 +86,7 @@ def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -
 
 
 def _rk4_step(position, velocity, step, drag, gravity):
-    """Position and velocity (3, ...) after one Runge-Kutta step (...) [s] of order 4."""
+    """Return position and velocity (3, ...) after one Runge-Kutta step (...) [s] of order 4."""
     half = 0.5 * step
     a1 = _acceleration(velocity, drag, gravity)
     a2 = _acceleration(velocity + half * a1, drag, gravity)
@@ -101,8 +105,8 @@ def _components_first(vectors: ArrayLike) -> np.ndarray:
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
     """Return position and velocity (..., 3) of balls after a flight with quadratic drag.
 
-    Position (..., 3) [m], velocity (..., 3) [m/s], duration [s], drag K_D [1/m] and gravity
-    [m/s^2] (...) broadcast; the flight takes a number of equal Runge-Kutta steps.
+    Position (..., 3) [m], velocity (..., 3) [m/s], duration (...) [s], drag K_D (...) [1/m] and
+    gravity (...) [m/s^2] broadcast. The flight is integrated in equal Runge-Kutta steps.
     """
     step = np.asarray(duration, float) / num_steps
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
@@ -117,10 +121,10 @@ def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT
 
 
 def landing(position, velocity, drag, gravity):
-    """Return when and where balls come down to the floor z = 0 if nobody hits them.
+    """Return times and points of landing on the floor z = 0.
 
-    Flies in equal steps until the ball is below the floor, then back to it by Newton's method on
-    the height, each of its steps a Runge-Kutta step.
+    The flight is integrated in equal Runge-Kutta steps until the ball is below the floor. Newton's
+    method on the height, whose steps are Runge-Kutta steps too, then finds the landing point.
 
     Args:
         position: (..., 3) [m], with z > 0.
@@ -129,9 +133,8 @@ def landing(position, velocity, drag, gravity):
         gravity: (...) [m/s^2], magnitude, > 0.
 
     Returns:
-        time: (...) [s] from now.
-        point: (..., 3) [m]. Both are NaN for balls that are never down: too fast to compute with,
-            or held up by a drag out of all proportion.
+        time: (...) [s], NaN if no landing is found, as for extreme speeds or drags.
+        point: (..., 3) [m], NaN if no landing is found.
     """
     vectors = np.broadcast_arrays(np.asarray(position, float), velocity)
     point, velocity = (_components_first(vector) for vector in vectors)
@@ -139,7 +142,7 @@ def landing(position, velocity, drag, gravity):
     rise = velocity[2]
     with np.errstate(all="ignore"):
         drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * gravity * point[2])) / gravity
-        # Drag slows a ball down within 1 / (drag speed); a step must be a fraction of that.
+        # Drag slows a ball down within 1 / (drag * speed), so a step must be shorter.
         stiffness = drag * np.linalg.norm(velocity, axis=0) * drag_free_time
         num_steps = int(np.clip(8.0 * np.nanmax(stiffness, initial=0.0), _FLIGHT_STEPS, 1024))
         step = drag_free_time / num_steps
@@ -160,10 +163,10 @@ def landing(position, velocity, drag, gravity):
 
 
 def check_cases(cases: HitCase) -> None:
-    """Raise `CaseError` for the first rule that some lane of a batch breaks.
+    """Raise `CaseError` for the first rule that a case of a batch breaks.
 
-    Every number keeps the rules of `HitCase`; the ball is above the floor, and comes down in the
-    hitting half, x < 0. The leaves must be concrete.
+    Numbers must keep the rules of `HitCase`. The ball must be above the floor and land in the
+    hitting half, x < 0. The leaves must not be traced.
     """
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball

@@ -1,8 +1,8 @@
-"""The `exact` hit planner: contact, impact and landing are built into the decision variables.
+"""The `exact` hit planner, whose decision variables satisfy contact, impact and landing.
 
-No plan it returns can miss; only inequalities are left to penalties. The idea of solving the
-impact for the racket's normal and normal speed is [Yu2023bat]'s (eqs 11-12); what is new is the
-choice of variables, which needs none of the singular divisions of its eqs 13-14.
+Every plan meets the ball and returns it to the target; penalties treat the inequalities alone. As
+in [Yu2023bat, eqs 11-12] the impact determines normal and normal speed of the racket. The choice of
+variables avoids the singular divisions of [Yu2023bat, eqs 13-14].
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import OptimisedPlanner, pending
-from planner_jax.optimise.settings import LbfgsConfig, Round, Settings, Stage
+from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
 from planner_jax.optimise.shipped import StartNetwork, shipped_network
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase
@@ -40,11 +40,10 @@ if TYPE_CHECKING:
     from planner_jax.task.hit.replan import ReplanHit
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
-_SEEN = (0.5, 0.75, 0.95)  # of the landing time, at which the network's features take the ball
-# Stages of rounds that look for any feasible plan. The velocities at the waypoints are for what a
-# network or a search without them has brought near; alone they lead astray. At last, limits that
-# bind all along the way have to leave no margin more than what peaks between nodes take.
-_HARD = LbfgsConfig(memory=12, tolerance=1e-6, patience=5)
+_FEATURE_TIMES = (0.5, 0.75, 0.95)  # relative to the landing time, of the ball in the features
+# Settings of searches for any feasible plan. A search with the waypoints' velocities as variables
+# needs a starting point near a feasible one. Where limits bind along the whole trajectory, the
+# margin is reduced to what peaks between the nodes need.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 _SMOOTH = (*_ANY_FEASIBLE, ("learned", False))
 SUPPLE = (*_ANY_FEASIBLE, ("velocities", True))
@@ -55,18 +54,10 @@ _TO_THE_LIMIT = (
     ("nodes", 12),
     ("velocities", True),
 )
-
-
-def _hard_stage(steps: int, settings: Settings, keep: int) -> Stage:
-    return Stage(dataclasses.replace(_HARD, max_steps=steps), settings, keep)
-
-
-_VELOCITY_SCALE = 2.0  # of the offsets of velocities; measured ones lie between 0.6 and 7
-_PASSING = 0.9  # of the speed limit, at most, is how fast a guess passes the ball
-
-
-# Starting points, best first: impact time over landing time, flight time afterwards [s],
-# thrust over g. The first serves every easy case; the others hit earlier, flatter or harder.
+_VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units are from 0.6 to 7
+_PASSING = 0.9  # greatest speed of a guess at the ball, relative to the speed limit
+# Starting points, best first: impact time over landing time, flight time after the impact [s],
+# thrust over g. The first one suits easy cases; the others hit earlier, flatter or harder.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -85,53 +76,27 @@ _GUESSES = np.array(
 )
 
 
-def start_features(context: HitContext) -> Array:
-    """Return the inputs of the network, (F,): ball, target, quadrotor and limits."""
-    case, lands = context.case, context.landing_time
-    head, limits, stroke = case.head_state, case.limits, case.hit_limits
-    seen = [target_at(context.path, share * lands) for share in _SEEN]
-    acceleration = limits.acceleration
-    if acceleration is None:  # about what the thrust leaves beside the weight
-        thrust = 2.5 * case.gravity if limits.max_thrust is None else limits.max_thrust
-        acceleration = jnp.maximum(thrust - case.gravity, 0.1 * case.gravity)
-    numbers = (
-        *(part for ball in seen for part in (ball.pos - head[0], ball.vel)),
-        case.target - head[0],
-        head[1],
-        0.2 * head[2],
-        0.02 * head[3],
-        jnp.log(stroke.hitting_speed),
-        jnp.stack(
-            [
-                lands,
-                head[0, 2] - limits.min_height,
-                *map(jnp.log, (limits.speed, acceleration, limits.body_rate, case.gravity)),
-                case.restitution,
-                case.racket_height,
-                case.drag,
-                stroke.min_apex,
-                stroke.max_apex,
-            ]
-        ),
-    )
-    return jnp.concatenate(numbers)
+def _hard(steps: int) -> LbfgsConfig:
+    return LbfgsConfig(max_steps=steps, memory=12, tolerance=1e-6, patience=5)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactHit(ChainPlanner[HitCase, HitPlan]):
-    """Minimum-snap hits with the impact eliminated exactly.
+    """Plans minimum-snap hits; the decision variables satisfy the equations of the impact.
 
-    Decision variables, n = 3 (M - 1) + 8, each in units of `scale`: whitened waypoint offsets
-    y, log impact time, log flight time after it, log thrust, two racket velocities across the
-    normal, jerk at the impact. From the two times follow the ball's velocities before and
-    after (target reached exactly), from these normal and normal speed of the racket
-    [Yu2023bat, eqs 11-12], and so position, velocity and acceleration at the impact. With
-    `velocities` the velocities at the waypoints are 3 (M - 1) variables more, behind the offsets.
+    The n = 3 (M - 1) + 8 variables are the whitened waypoint offsets, the logarithms of the impact
+    time, of the ball's flight time after the impact and of the thrust at the impact, two velocities
+    of the racket across its normal, and the jerk at the impact, each in units of `scale`. With
+    `velocities` the velocities at the waypoints are 3 (M - 1) further variables behind the offsets.
 
-    Cost: energy_weight * integral |snap|^2 + integral of the smoothed hinges of the limits
-    [Yu2023bat, eq. 18a], and of the case's extras + hinges of apex (eq. 21) and hitting speed
-    (eq. 24).
+    The two times determine the ball's velocities before and after the impact, such that the ball
+    reaches the target. These determine the racket's normal and normal speed [Yu2023bat, eqs 11-12],
+    and with the other variables the position, velocity and acceleration at the impact.
+
+    The cost is energy_weight * integral |snap|^2, plus the integral of the smoothed hinges of the
+    limits [Yu2023bat, eq. 18a] and extras, plus impact_weight * the hinges of apex and hitting
+    speed [Yu2023bat, eqs 21 and 24].
     """
 
     case_type = HitCase
@@ -139,52 +104,39 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     num_end_variables = 8
     guess_table = _GUESSES
     decode_nodes = (16, 16)
-    # Relative durations of the pieces. The first are short, because a hovering quadrotor has
-    # to begin to turn at once and its jerk is continuous.
+    # Relative durations of the pieces. The first are short, because a hovering quadrotor must start
+    # to turn at once, and its jerk is continuous.
     proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 4  # penalty intervals a piece
     time_weight: float = 0.0
     energy_weight: float = 1e-8
     num_table_nodes: int = 36
     drag_after_impact: bool = False
-    impact_weight: float = 0.3  # [s], of apex and hitting-speed hinges beside the integrals
-    # The first two solve what is easy. Where limits bind all along the way, energy is worth
-    # nothing any more and the margin has to give: the others look for any feasible plan. The third
-    # and the fourth begin where a network has learnt that limits can hold, the fourth, which is
-    # longer, if little is missing. The last two begin at fixed guesses, for cases and sizes that no
-    # network knows: long from those from where a short search says that it is worth it, and at
-    # last, at twice the price a case, if little is missing.
+    impact_weight: float = 0.3  # [s], of the hinges of apex and hitting speed
+    # The first two rounds solve easy cases. The others search for any feasible plan, almost without
+    # the energy. Rounds three and four start at a network's point; round four is longer and only
+    # for violations below 0.1. The last two start at all fixed guesses and continue the best of
+    # them; the last one is for violations below 0.04.
     rounds: tuple[Round, ...] = (
-        Round(starts=1, solver=LbfgsConfig(max_steps=3)),
-        Round(starts=1, solver=LbfgsConfig(max_steps=60)),
-        Round(starts=1, solver=dataclasses.replace(_HARD, max_steps=150), settings=SUPPLE),
-        Round(
-            starts=1,
-            within=0.1,
-            solver=dataclasses.replace(_HARD, max_steps=500),
-            settings=_TO_THE_LIMIT,
-            stages=(_hard_stage(800, SUPPLE, keep=1),),
-        ),
+        Round(1, LbfgsConfig(max_steps=3)),
+        Round(1, LbfgsConfig(max_steps=60)),
+        Round(1, _hard(150), SUPPLE),
+        Round(1, _hard(500), _TO_THE_LIMIT, (Stage(_hard(800), SUPPLE, keep=1),), within=0.1),
+        Round(12, _hard(240), SUPPLE, (Stage(_hard(50), _SMOOTH, keep=2),)),
         Round(
             starts=12,
-            solver=dataclasses.replace(_HARD, max_steps=240),
-            settings=SUPPLE,
-            stages=(_hard_stage(50, _SMOOTH, keep=2),),
-        ),
-        Round(
-            starts=12,
-            within=0.04,
-            solver=dataclasses.replace(_HARD, max_steps=300),
+            solver=_hard(300),
             settings=_TO_THE_LIMIT,
             stages=(
-                _hard_stage(60, _SMOOTH, keep=6),
-                _hard_stage(150, _SMOOTH, keep=2),
-                _hard_stage(400, SUPPLE, keep=1),
+                Stage(_hard(60), _SMOOTH, keep=6),
+                Stage(_hard(150), _SMOOTH, keep=2),
+                Stage(_hard(400), SUPPLE, keep=1),
             ),
+            within=0.04,
         ),
     )
-    velocities: bool = False  # whether the velocities at the waypoints are variables, too
-    learned: bool = True  # whether a network makes the first guess, where there is one
+    velocities: bool = False  # whether the velocities at the waypoints are variables
+    learned: bool = True  # whether a network improves the first guess of usual cases
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -202,27 +154,27 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def num_offsets(self) -> int:
-        """Number of variables of the waypoints."""
+        """Number of waypoint variables."""
         return self._num_places * (2 if self.velocities else 1)
 
     @property
     def _num_places(self) -> int:
-        """Number of variables of the waypoints' positions."""
+        """Number of variables for the waypoints' positions."""
         return 3 * (self.num_pieces - 1)
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return a scale with units for the velocities at the waypoints, if these are variables."""
+        """Return a scale, with units for the waypoints' velocities inserted if they are missing."""
         places = self._num_places
         if not self.velocities or len(scale) != places + self.num_end_variables:
             return scale
         return scale[:places] + (_VELOCITY_SCALE,) * places + scale[places:]
 
     def start_network(self, case: HitCase) -> StartNetwork | None:
-        """Return the network for the first guess; there are two for the shipped sizes.
+        """Return the network for the first guess, or None for unusual sizes or cases with extras.
 
-        The network of points without velocities has learnt where every limit holds at little
-        energy, the other one where limits bind along the whole trajectory. Around obstacles there
-        is none, because the side on which a search starts decides where it can end.
+        The network without velocities was trained for feasible points of little energy, the network
+        with velocities for limits that bind along the whole trajectory. There is none around
+        obstacles, because the side on which a search starts decides where it can end.
         """
         is_usual = self.proportions == _PROPORTIONS and not case.extras
         if not self.learned or not is_usual:
@@ -232,15 +184,42 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return shipped_network(self.package, "exact-12" + "-supple" * self.velocities)
 
     def start_features(self, context: HitContext) -> Array:
-        """Return the inputs of the network, (F,)."""
-        return start_features(context)
+        """Return the inputs of the network, (F,): ball, target, quadrotor and limits."""
+        case, landing = context.case, context.landing_time
+        head, limits, stroke = case.head_state, case.limits, case.hit_limits
+        balls = [target_at(context.path, share * landing) for share in _FEATURE_TIMES]
+        acceleration = limits.acceleration
+        if acceleration is None:  # roughly the thrust less the weight
+            thrust = 2.5 * case.gravity if limits.max_thrust is None else limits.max_thrust
+            acceleration = jnp.maximum(thrust - case.gravity, 0.1 * case.gravity)
+        numbers = (
+            *(part for ball in balls for part in (ball.pos - head[0], ball.vel)),
+            case.target - head[0],
+            head[1],
+            0.2 * head[2],
+            0.02 * head[3],
+            jnp.log(stroke.hitting_speed),
+            jnp.stack(
+                [
+                    landing,
+                    head[0, 2] - limits.min_height,
+                    *map(jnp.log, (limits.speed, acceleration, limits.body_rate, case.gravity)),
+                    case.restitution,
+                    case.racket_height,
+                    case.drag,
+                    stroke.min_apex,
+                    stroke.max_apex,
+                ]
+            ),
+        )
+        return jnp.concatenate(numbers)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """Return the incoming ball's table; see `prepare_hit`."""
+        """Return the case with the table of its incoming ball."""
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
-        """Return impacts at a few impact times, flight times and thrusts, (num, 1, 8)."""
+        """Return the end variables of the first rows of `guess_table`, (num, 1, 8)."""
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         times = jnp.stack(
             [
@@ -251,15 +230,16 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             axis=1,
         )
         natural = jnp.pad(times, ((0, 0), (0, 5)))
-        if num > 1:  # what is hard is hit in passing
-            passing = jax.vmap(lambda own: self._in_passing(own, context))(natural[1:])
-            natural = jnp.concatenate([natural[:1], passing])
+        if num > 1:  # hard cases need speed across the racket's normal
+            moving = jax.vmap(lambda each: self._set_passing_speed(each, context))(natural[1:])
+            natural = jnp.concatenate([natural[:1], moving])
         return natural[:, None]
 
-    def _in_passing(self, natural: Array, context: HitContext) -> Array:
-        """Return a guess (8,) whose racket is as fast across the normal as an even acceleration.
+    def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
+        """Return a guess (8,) with the racket's velocity across its normal set.
 
-        The acceleration leads from the start to the impact, no faster than allowed.
+        It is the velocity at the impact of a constant acceleration from the start to the impact, at
+        most `_PASSING` times the speed limit.
         """
         impact, case = self.impact(natural, context), context.case
         start, time = case.head_state, impact.stroke.time
@@ -270,16 +250,16 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def carried(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Return a point (n,) without velocities as one with the smoothest velocities."""
+        """Return a point (n,) of a planner without velocities, with zero offsets of velocities."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
         return jnp.concatenate([places, jnp.zeros_like(places), own])
 
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
-        """Return the impact that the variables (1, 8) describe, as the end of the segment.
+        """Return the impact that the end variables (1, 8) describe, as the end of the segment.
 
-        Its excess (5,) is that of the apex, and of the squares of the hitting speed.
+        The excess (5,) consists of `apex_excess` and `hitting_speed_excess`.
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
@@ -293,13 +273,13 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the excess (5,) at the impact, the squares of the speeds as ratios."""
+        """Return the excess (5,) with ratios of speeds in place of ratios of their squares."""
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
         """Return the impact that the end variables (8,) describe.
 
-        These are log T, log t_post, log thrust, two tangential speeds [m/s] and jerk [m/s^3].
+        The variables are log T, log t_post, log thrust, two tangential speeds and the jerk.
         """
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])
@@ -331,7 +311,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return Impact(stroke=stroke, tail_state=tail_state, apex=apex)
 
     def rules_out(self, context: HitContext) -> Array:
-        """Return whether the ball is never within reach."""
+        """Return whether `is_too_far` proves that no plan exists."""
         return is_too_far(context)
 
     def make_plan(
@@ -341,7 +321,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         violation: Array,
         context: HitContext,
     ) -> HitPlan:
-        """Return the plan of a trajectory and its stroke."""
+        """Return the plan of a trajectory that ends with the stroke `ends.contact`."""
         return HitPlan(
             trajectory=trajectory,
             gravity=context.case.gravity,
@@ -350,7 +330,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def replanner(self) -> "ReplanHit":
-        """Return the `ReplanHit` that continues from this planner's plans; see `pj.replan`."""
+        """Return the planner that `pj.replan` uses."""
         from planner_jax.task.hit.replan import ReplanHit
 
         return ReplanHit(self)

@@ -1,9 +1,9 @@
-"""Re-planning of a hit: from the plan that is being flown, for what the ball now seems to do.
+"""Re-planning of hits: from the plan that is being flown, for a new estimate of the ball.
 
-The stroke of the previous plan (when, how hard and how high) is where the search begins, on the
-smoothest way to it from where the quadrotor will be; a few iterations mend the rest. The paper
-plans once, because "even minor updates in the terminal state could lead to drastic deformations"
-(002, Section VI-C): here the stroke moves as little as the ball's estimate does.
+The search starts at the stroke of the previous plan and the smoothest trajectory to it from the
+quadrotor's state. A few iterations suffice. [Yu2023bat, Section VI-C] plans once, because "even
+minor updates in the terminal state could lead to drastic deformations"; here the stroke changes as
+little as the estimate of the ball does.
 """
 
 import dataclasses
@@ -26,25 +26,22 @@ from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
-_SHORTEST = 0.01  # [s], least time to the impact that is guessed
-_TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction, without curvature, is too long
+_SHORTEST = 0.01  # [s], least time to the impact in a starting point
+_TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction ignores curvature and is too long
 
 
 @struct.dataclass
 class ReplanHitContext:
-    """What every evaluation needs, and where the search begins."""
+    """The context of the remaining hit, and the starting point."""
 
     hit: HitContext
-    start: Array  # (n,)
+    start: Array  # (n,), the previous stroke
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanHit(OptimisedPlanner):
-    """Hits re-planned from the previous plan, as `pj.replan` asks for them.
-
-    The previous plan may be any planner's; what comes back is `planner`'s.
-    """
+    """Re-plans hits from plans of any hit planner, for `pj.replan`. New plans are by `planner`."""
 
     case_type = Replanning
     plan_type = HitPlan
@@ -56,7 +53,7 @@ class ReplanHit(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactHit:
-        """The planner of the cases that are planned again."""
+        """The planner of the remaining cases."""
         return self.planner
 
     def begin(
@@ -69,11 +66,17 @@ class ReplanHit(OptimisedPlanner):
         drag: ArrayLike | None = None,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remainder of a case, or of a batch, some time into its plan.
+        """Return the remaining case, or batch, some time into its plan.
 
-        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. The
-        estimated `ball` has leaves (3,) or (B, 3), and its `drag` is () or (B,) K_D [1/m], by
-        default the drag of the cases. `head_state` is (4, 3) or (B, 4, 3), by default the plan's.
+        `pj.replan` describes the first three arguments and the errors.
+
+        Args:
+            cases: planned cases.
+            previous: plans of the cases.
+            elapsed: () or (B,) [s].
+            ball: estimated ball, leaves (3,) or (B, 3).
+            drag: () or (B,) K_D [1/m]; by default the drag of the cases.
+            head_state: (4, 3) or (B, 4, 3) state of the quadrotor; by default the plan's.
         """
         elapsed = moment_of(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
@@ -85,11 +88,11 @@ class ReplanHit(OptimisedPlanner):
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanHitContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The incoming ball's table, and the previous stroke as a point."""
+        """Return the context of the remaining hit, and the previous stroke as a point."""
         return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
 
     def _start(self, task: Replanning) -> Array:
-        """The previous stroke, and no offset from the smoothest way to it, (n,)."""
+        """Return the previous stroke with zero waypoint offsets, (n,)."""
         planner, stroke = self.planner, task.previous.stroke
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
@@ -107,14 +110,14 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """The previous stroke, and then those from scratch, (num, n)."""
+        """Return the previous stroke, followed by guesses of the planner, (num, n)."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Return the value of the planner's objective."""
+        """Return the planner's objective at a point."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:

@@ -1,15 +1,15 @@
-"""What the registry knows of hits; imports no JAX."""
+"""Specification of the task of hits for the registry; imports no JAX."""
 
 from planner_jax.core.registry import Task
 
 # Drag of the ball, a fit to the published landing points; the residual is 1 cm.
 DRAG = 0.0616  # K_D [1/m]
-# Where the quadrotor hovers: an assumption, the paper draws it at the near/far boundary of the
-# hitting half.
+# Hover position of the quadrotor. An assumption: the paper draws it at the line between the near
+# and the far region.
 START = (-3.0, 0.0, 1.5)  # [m]
 
-# Serve, landing and target region of the simulated court (`court.SCENARIOS`) for the six real
-# scenarios of [Yu2023bat, Section VI-C], which it names in words alone: an assumption.
+# Names in `court.SCENARIOS` for the six real scenarios of [Yu2023bat, Section VI-C]. An
+# assumption: the paper describes these scenarios in words alone.
 REAL_SCENARIOS = {
     "S.1": ("FNN", "FFN"),  # from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions
@@ -30,7 +30,7 @@ TASK = Task(
         "juggle": "planner_jax.baselines.hit.juggle:JuggleHit",
     },
     suites={
-        "court": "Serves by the law of the published ones, all 36 scenarios of the court.",
+        "court": "Serves distributed as the published ones, all 36 scenarios of the court.",
         "S.1": "Serves from different distances.",
         "S.2": "Serves from different directions.",
         "S.3": "Balls that are hit from different directions.",

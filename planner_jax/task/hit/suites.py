@@ -1,4 +1,4 @@
-"""Serves to plan for: read from published trial files, or drawn from the law they follow."""
+"""Serves: read from the published trial files, or drawn from the distribution fitted to them."""
 
 import dataclasses
 import functools
@@ -22,34 +22,32 @@ from planner_jax.task.hit.case import GRAVITY, HitCase, case
 from planner_jax.task.hit.court import fly, landing
 from planner_jax.task.hit.spec import DRAG, START
 
-# The law of the published serves, fitted to them. Position and velocity are uniform, and those
-# serves are kept that meet the following and land in the region asked for.
+# The distribution fitted to the published serves: position and velocity are uniform under the
+# following conditions and the condition that the ball lands in the region of the scenario.
 SERVE_HEIGHT = 2.0  # [m]
-DEPTH = 4.5  # [m] from the net, where the far and side regions end for serves and landings
-RISE_SPEED = (6.5, 8.73)  # [m/s], vertical speed at the serve
-MIN_APPROACH_SPEED = 2.0  # [m/s], towards the net at the serve
+DEPTH = 4.5  # [m] from the net, end of the far and side regions for serves and landing points
+RISE_SPEED = (6.5, 8.73)  # [m/s], vertical speed of the serve
+MIN_APPROACH_SPEED = 2.0  # [m/s], speed of the serve towards the net
 MAX_FLIGHT_TIME = 1.8214  # [s], from the serve to the floor
-# From F into the middle lane the serves never go to the right (their mirror images are left
-# out); from N they go both ways.
-ONE_SIDED = ("FN", "FF")
+ONE_SIDED = ("FN", "FF")  # serve and landing regions of serves that never fly to the right
 
-_ROUNDS = 128  # how often a block of generated serves goes through its scenarios
-_STARTS = 1024  # how many uniform starts come from one random stream
-_AIM_STEPS = 4
 START_HEIGHT = 1.5  # [m], of uniform starts
+_ROUNDS = 128  # repetitions of the list of scenarios in a block of serves
+_STARTS = 1024  # uniform starts of one random stream
+_AIM_STEPS = 4
 _SERVE_STREAM, _START_STREAM = 0, 1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Serves:
-    """Balls served to the hitting half, world frame. `serves[rows]` picks rows as NumPy does."""
+    """Balls served to the hitting half, world frame. `serves[rows]` selects rows as in NumPy."""
 
     position: np.ndarray  # (N, 3) [m]
     velocity: np.ndarray  # (N, 3) [m/s]
-    target: np.ndarray  # (N, 3) [m], where the returned ball must land
-    scenario: np.ndarray  # (N,) int, place in court.SCENARIOS
-    index: np.ndarray  # (N,) int, place in the whole that these rows are part of
-    # (N, 3) published outcome per court.PLANNERS: 1 planned, 0 failed, NaN not published.
+    target: np.ndarray  # (N, 3) [m], required landing point of the returned ball
+    scenario: np.ndarray  # (N,) int, index into court.SCENARIOS
+    index: np.ndarray  # (N,) int, of the serve in the suite or the trial files
+    # (N, 3) published result of each of court.PLANNERS: 1 solved, 0 failed, NaN not published.
     published: np.ndarray | None = None
     file: np.ndarray | None = None  # (N,) str, the first file that holds the serve
     line: np.ndarray | None = None  # (N,) int, line in that file, from 1
@@ -58,25 +56,25 @@ class Serves:
         return len(self.scenario)
 
     def __getitem__(self, rows) -> "Serves":
-        picked = {name: column[rows] for name, column in vars(self).items() if column is not None}
-        return dataclasses.replace(self, **picked)
+        columns = {name: column[rows] for name, column in vars(self).items() if column is not None}
+        return dataclasses.replace(self, **columns)
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """Read the serves of published trial files  S_L_T_M.csv.
+    """Read the serves of published trial files "S_L_T_M.csv".
 
-    S, L, T are serve, landing and target region (1 N, 2 F, 3 L, 4 R), M the planner (p Bat,
-    l Bat-Lite, b Juggle). The files of one S_L_T hold the same serves in the same order; any of
-    them may be missing. Other files of the folder are passed over.
+    S, L and T are serve, landing and target region (1 N, 2 F, 3 L, 4 R), and M is the planner
+    (p Bat, l Bat-Lite, b Juggle). Files of the same S_L_T contain the same serves in the same
+    order. Some of them may be missing. Other files of the folder are ignored.
 
     Returns:
-        Row 1 of every scenario, then row 2 and so on, so that the first rows of the whole are a
-        fair sample of the court. `published` has NaN for the files that are missing.
+        Row 1 of every scenario, then row 2 of every scenario and so on, so that the first rows
+        cover all scenarios evenly. `published` is NaN where a file is missing.
 
     Raises:
-        ArgumentError: the folder is missing or holds no such file; or any row does not parse, is
-            not finite, does not land in the hitting half, or differs between the files of a
-            scenario; `value` has all of these rows.
+        ArgumentError: the folder does not exist or contains no such file, or a row does not parse,
+            is not finite, does not land in the hitting half, or differs between the files of a
+            scenario. `value` lists all such rows.
     """
     trials = pkgutil.resolve_name("planner_jax.baselines.hit.published:read_trials")(folder)
     numbers = np.array([trial.numbers for trial in trials])
@@ -95,18 +93,21 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 def generate_serves(
     num: int, seed: int, scenarios: Sequence[str] | None = None, *, first: int = 0
 ) -> Serves:
-    """Draw serves from the law of the published ones, the scenarios in equal shares.
+    """Draw serves from the distribution of the published ones, each scenario equally often.
 
-    Each run of as many serves as there are scenarios has every scenario once, in random order.
-    Serve k of a seed (and list of scenarios) is always the same serve.
+    Every S consecutive serves of S scenarios contain each scenario once, in random order. Serve k
+    of a seed and list of scenarios is always the same serve.
 
-    Position and velocity are uniform under the conditions at the head of this module. Drawing
-    them so would waste 97 of 100 draws on other landing regions. Instead the landing point and
-    the vertical speed are drawn uniformly, the horizontal velocity follows from them, and a draw
-    is kept with a probability proportional to |d horizontal velocity / d landing point|.
+    Position and velocity are uniform under the conditions at the head of this module. Sampling them
+    directly would reject 97 % of the draws for their landing region. Instead, the landing point and
+    the vertical speed are uniform and determine the horizontal velocity, and a draw is accepted
+    with a probability proportional to |d horizontal velocity / d landing point|.
 
-    The scenarios are names out of court.SCENARIOS, by default all. The other arguments and the
-    errors are those of `pj.hit.draw`.
+    Args:
+        num: as in `pj.hit.draw`, also for the errors.
+        seed: as in `pj.hit.draw`.
+        scenarios: names in court.SCENARIOS; all of them by default.
+        first: as in `pj.hit.draw`.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
@@ -114,10 +115,10 @@ def generate_serves(
     if unknown or not names:
         rule = f"names out of {' '.join(court.SCENARIOS)}"
         raise ArgumentError("scenarios", rule, shown=repr(unknown[0]) if unknown else "none")
-    places = np.array([court.SCENARIOS.index(name) for name in names])
-    size = _ROUNDS * len(places)
+    chosen = np.array([court.SCENARIOS.index(name) for name in names])
+    size = _ROUNDS * len(chosen)
     begin = first // size
-    blocks = [_draw_block(places, seed, b) for b in range(begin, (first + num - 1) // size + 1)]
+    blocks = [_draw_block(chosen, seed, b) for b in range(begin, (first + num - 1) // size + 1)]
     scenario, position, velocity = (np.concatenate(parts) for parts in zip(*blocks, strict=True))
     return Serves(
         position=position,
@@ -129,27 +130,26 @@ def generate_serves(
 
 
 def _random(seed: int, stream: int, block: int) -> np.random.Generator:
-    """Return the generator of one block, which does not depend on earlier draws."""
+    """Return the random generator of one block, independent of other blocks."""
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, block))
     return np.random.Generator(np.random.Philox(sequence))
 
 
-def _draw_block(places: np.ndarray, seed: int, block: int):
-    """Scenario, position and velocity of _ROUNDS runs through the scenarios at `places`."""
+def _draw_block(chosen: np.ndarray, seed: int, block: int):
+    """Return scenario, position and velocity of a block: each chosen scenario _ROUNDS times."""
     random = _random(seed, _SERVE_STREAM, block)
-    scenario = random.permuted(np.tile(places, (_ROUNDS, 1)), axis=1).ravel()
-    position, velocity = np.zeros((2, len(scenario), 3))
+    scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
+    states = np.zeros((2, len(scenario), 3))
     pending = np.arange(len(scenario))
     while pending.size:
-        drawn_position, drawn_velocity, kept = _draw(scenario[pending], random)
-        position[pending[kept]] = drawn_position[kept]
-        velocity[pending[kept]] = drawn_velocity[kept]
-        pending = pending[~kept]
-    return scenario, position, velocity
+        draws, accepted = _draw(scenario[pending], random)
+        states[:, pending[accepted]] = draws[:, accepted]
+        pending = pending[~accepted]
+    return scenario, *states
 
 
 def _draw(scenario: np.ndarray, random: np.random.Generator):
-    """One draw a scenario: position (N, 3), velocity (N, 3), and whether to keep it."""
+    """Draw position and velocity (2, N, 3) for N scenarios, and whether to accept them (N,)."""
     regions = court.scenario_regions(scenario)
     bounds = court.region_bounds(DEPTH)
     uniform = random.random((len(scenario), 6))
@@ -161,23 +161,23 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
     serve, land = point_in(regions[:, 0], uniform[:, :2]), point_in(regions[:, 1], uniform[:, 2:4])
     land[:, 0] *= -1.0
     rise = RISE_SPEED[0] + uniform[:, 4] * (RISE_SPEED[1] - RISE_SPEED[0])
-    way = land - serve
-    distance = np.linalg.norm(way, axis=1)
+    line = land - serve
+    distance = np.linalg.norm(line, axis=1)
     aim = _aim_table()
-    horizontal = way / distance[:, None] * aim.speed.ev(distance, rise)[:, None]
+    horizontal = line / distance[:, None] * aim.speed.ev(distance, rise)[:, None]
 
     position = np.column_stack([serve, np.full(len(serve), SERVE_HEIGHT)])
     velocity = np.column_stack([horizontal, rise])
     names = np.array([name[:2] for name in court.SCENARIOS])[scenario]
-    kept = aim.time.ev(distance, rise) <= MAX_FLIGHT_TIME
-    kept &= velocity[:, 0] <= -MIN_APPROACH_SPEED
-    kept &= (velocity[:, 1] >= 0.0) | ~np.isin(names, ONE_SIDED)
-    kept &= uniform[:, 5] * aim.max_density < aim.density.ev(distance, rise)
-    return position, velocity, kept
+    accepted = aim.time.ev(distance, rise) <= MAX_FLIGHT_TIME
+    accepted &= velocity[:, 0] <= -MIN_APPROACH_SPEED
+    accepted &= (velocity[:, 1] >= 0.0) | ~np.isin(names, ONE_SIDED)
+    accepted &= uniform[:, 5] * aim.max_density < aim.density.ev(distance, rise)
+    return np.stack([position, velocity]), accepted
 
 
 class _AimTable(NamedTuple):
-    """What a serve over a distance [m] with a vertical speed [m/s] needs, as smooth tables."""
+    """Properties of serves by their horizontal distance [m] and vertical speed [m/s]."""
 
     speed: RectBivariateSpline  # [m/s], horizontal
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|
@@ -187,25 +187,25 @@ class _AimTable(NamedTuple):
 
 @functools.cache
 def _aim_table() -> _AimTable:
-    """Tables over every distance and vertical speed that a serve can have."""
+    """Return splines over the whole range of distances and vertical speeds."""
     shortest, longest = 2.0 * court.DEAD_ZONE, math.hypot(2.0 * DEPTH, 2.0 * court.HALF_WIDTH)
     axes = np.linspace(shortest, longest, 40), np.linspace(*RISE_SPEED, 12)
     distance, rise = np.meshgrid(*axes, indexing="ij")
     speed, slope, time = _aim(distance, rise)
-    # Along the way the landing point answers with 1/slope, across it with distance/speed.
+    # Determinant: slope along the line to the landing point, speed / distance across it.
     density = slope * speed / distance
     tables = (RectBivariateSpline(*axes, values) for values in (speed, density, time))
     return _AimTable(*tables, max_density=float(density.max()))
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return speed [m/s] that carries a serve over a distance, its slope [1/s] and the time [s]."""
+    """Return horizontal speed [m/s], its derivative by the distance [1/s], and flight time [s]."""
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
     slope, time = np.zeros_like(speed), np.zeros((2, *speed.shape))
     for _ in range(_AIM_STEPS):
-        # The second ball is a little faster: its lead gives the slope.
+        # A second, slightly faster ball yields the derivative by a difference.
         pair = np.stack([speed, speed * (1.0 + 1e-5)])
         velocity = np.stack([pair, np.zeros_like(pair), np.broadcast_to(rise, pair.shape)], axis=-1)
         time, point = landing(position, velocity, DRAG, GRAVITY)
@@ -216,10 +216,10 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
 
 
 def advance(serves: Serves, delay: float) -> Serves:
-    """The same serves `delay` seconds later, flown with drag.
+    """Return the serves after `delay` [s] of flight.
 
     Raises:
-        ArgumentError: the delay is negative or not finite, or a ball is down by then.
+        ArgumentError: the delay is negative or not finite, or a ball lands earlier.
     """
     if not 0.0 <= delay < math.inf:
         raise ArgumentError("delay", "finite and >= 0", delay)
@@ -235,10 +235,9 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Hover positions (N, 3) [m] spread evenly over the hitting half, at START_HEIGHT.
+    """Return hover positions (N, 3) [m], uniform over the hitting half without the dead zone.
 
-    The dead zone at the net is left out. A serve of given `index` has the same start whichever
-    rows are asked for with it.
+    The position depends on the index of the serve and the seed alone.
     """
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
@@ -260,9 +259,9 @@ def to_cases(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
-    """Return a batch of cases, with the setting of [Yu2023bat], from N serves.
+    """Make a batch of cases of serves, by default with the numbers of [Yu2023bat].
 
-    The other arguments and the errors are those of `pj.hit.draw`; `seed` is for `uniform_starts`.
+    Arguments and errors are as in `pj.hit.draw`. The seed determines uniform starts.
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)
