@@ -1,4 +1,4 @@
-"""The functions `pj.catch.planner` and `judge`; `case` and `draw` are in modules of their own."""
+"""The functions `pj.catch.planner` and `pj.catch.judge`."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.spec import DECISIONS, TASK, TRAINED
 
-_HALF_STEP = 1e-4  # [s], of the central difference
+_HALF_STEP = 1e-4  # [s], of central differences
 
 
 def planner(
@@ -27,29 +27,26 @@ def planner(
     recovery: str | None = None,
     **options: object,
 ) -> Planner[CatchCase, CatchPlan]:
-    """Return the catch planner of a name, behind a decision about order and times.
+    """Make the catch planner of a name, with a decision on the order and times of catches.
 
-    * `exact`: the ball is in the net by construction; the one to use.
-    * `catch`: the published planner of [Yu2023catch], which meets the ball by penalties.
-    * `mpp`: the motion primitives that [Yu2023catch] compares with; nothing is optimised.
+    * `exact`: recommended; every plan has the balls in the net.
+    * `catch`: the planner of [Yu2023catch], which moves the net to the balls by penalties.
+    * `mpp`: the baseline of [Yu2023catch], sampled motion primitives without optimisation.
 
     Args:
-        name: one of these, or one that another package offers.
-        decide: "best" plans the most promising of all orders and keeps the earliest last catch,
-            "greedy" catches next what it can reach first, "given" takes order and times of the
-            cases, "policy" asks a network that was trained by reinforcement; "policy:rush6"
-            asks one that was trained on that suite alone, and "policy:FILE" one of your own; or
-            a decision with settings, such as `Best(finalists=3)`.
-        recovery: as of `pj.hit.planner`.
-        effort: as of `pj.hit.planner`. Of 1,000 `throws` it is above that of a very long search by
-            38, 0.06 and 0.00 % (median), 76, 1.5 and 0.00 % (90 % quantile); of two balls,
-            `parabola2`, by 95, 11 and 0.00 %, and 182, 17 and 0.02 %.
-        **options: fields of that planner's dataclass, for example `rounds`.
+        name: one of these, or a planner of another package.
+        decide: "best" plans the most promising orders and selects the earliest last catch.
+            "greedy" catches next the target that it can reach first. "given" takes order and times
+            from the cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is your
+            own. Or a decision with settings, such as `Best(finalists=3)`.
+        recovery: as in `pj.hit.planner`.
+        effort: as in `pj.hit.planner`.
+        **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:
-        A planner for `pj.plan`; its `planner` is an `ExactCatch`, `PaperCatch` or `MppCatch`, or
-        with a recovery a planner that has such a one. The plans hold the order and the times that
-        were decided.
+        A planner for `pj.plan`, whose field `planner` is an `ExactCatch`, `PaperCatch` or
+        `MppCatch`, or with a recovery a planner with such a field. Its plans contain the decided
+        order and times.
 
     Raises:
         ValueError: there is no planner or decision of that name, the planner has no such effort,
@@ -67,14 +64,13 @@ def planner(
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:
-    """Judge one plan, or a batch, by the physics alone.
+    """Judge one plan, or a batch of plans, by physics independent of the planners.
 
-    The referee computes the positions of targets of the library's classes itself. It calls the
-    method `at` of a target of any other class, in float64; the target's velocity is the central
-    difference over 2e-4 s.
-    Arguments, result and errors are those of `pj.hit.judge`; `referee_catches` has the settings.
+    The referee computes positions of targets of the library's classes itself. For other classes it
+    calls their method `at` in float64 and takes velocities by central differences over 2e-4 s.
+    Arguments, result and errors are as in `pj.hit.judge`, with the settings of `referee_catches`.
     """
-    known = (BallPath, HarmonicPath, PathTable)  # classes that the referee follows by itself
+    known = (BallPath, HarmonicPath, PathTable)  # classes that the referee computes itself
     if isinstance(cases, CatchCase) and type(cases.targets) not in known:
         settings = {"target_states": _states_by_class, **settings}
     return judge_by(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
@@ -83,10 +79,7 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
 def _states_by_class(
     targets: TargetPath, order: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N).
-
-    The velocity of the class itself is not used, because the planner has used it.
-    """
+    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N)."""
     lanes = np.arange(len(order))[:, None]
     with jax.enable_x64(True):
         ordered = jax.tree.map(lambda leaf: _double(leaf)[lanes, order], targets)

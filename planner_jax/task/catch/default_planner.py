@@ -64,7 +64,7 @@ _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # replaces it 
 # Before Newton's method with several targets, in place of `_FIRST`, which ends too far away.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
-# For more than `_FEW` targets, each of which must be caught, the first two rounds are longer.
+# If more than `_FEW` targets must all be caught, the first two rounds are longer.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))

@@ -12,7 +12,7 @@ class Suite:
     num_targets: int
     horizon: float  # [s], latest time at which a target of the suite may be caught
     description: str
-    # Results of [Yu2023catch, Tables I and III]: for `throws` of 50 real throws, for other suites of
+    # Results of [Yu2023catch, Tables I and III], for `throws` with 50 real throws, otherwise with
     # 1,000 simulated cases. The paper gives no ranges, so its cases are similar, not the same.
     success: float | None = None  # [%], of the planner
     time_ratio: float | None = None  # optimal time ratio

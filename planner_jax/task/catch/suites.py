@@ -1,68 +1,60 @@
 """Named, seeded suites of catch cases: the throws and the simulations of [Yu2023catch].
 
-The paper names its cases (Sections VII-A and VII-B, Table III) and gives none of the ranges
-from which it draws them. Those below are this library's, chosen to be no easier than what the
-paper says of its own, and part of each suite's name: a change of a range is another suite.
+The paper names its cases (Sections VII-A and VII-B, Table III) without the ranges from which it
+draws them. The ranges below are chosen such that no case is easier than the paper reports.
 
-All draws are uniform. World frame, z up, SI units; planning begins at time 0 with the quadrotor
-in hover at (0, 0, 1), within the limits of `case`.
+All quantities are uniform. World frame, z up, SI units. At time 0 the quadrotor is in hover at
+(0, 0, 1).
 
-Throws. The ball leaves a machine at (4, 0, 0.8) and lands in a rectangle around the origin.
-Its velocity follows from landing point and flight time. It may be caught until it falls through
-0.45 m, where an upright quadrotor at its least height of 0.25 m holds its net 0.2 m above.
+Throws: a ball leaves a machine at (4, 0, 0.8) and lands in a rectangle around the origin. Landing
+point and flight time determine its velocity. It may be caught until it falls through 0.45 m, the
+height of the net of an upright quadrotor at its least height of 0.25 m.
 
-| suite | drag [1/s] | landing [m x m] | flight [s] | planned after [s] |
+| suite | drag [1/s] | landing [m x m] | flight [s] | launch before time 0 [s] |
 |---|---|---|---|---|
 | throws | 0.5 | 2 x 0.8 | 1.4 to 1.78 | 0.3 |
 | hard | 0.5 | 4 x 3 | 1.4 to 1.78 | 0.5 |
 | parabola1 | 0 | 2 x 0.8 | 1.4 to 2 | 0.3 |
-| parabola2 | 0 | 2 x 0.8, each | 1.4 to 1.6; 1.7 to 2 | 0.3; 0 |
+| parabola2, ball 1 | 0 | 2 x 0.8 | 1.4 to 1.6 | 0.3 |
+| parabola2, ball 2 | 0 | 2 x 0.8 | 1.7 to 2 | 0 |
 
-With drag, 1.78 s is the flight whose apex is at the hall's 4.2 m, less than the 1.9 s that the
-paper allows; the shortest flight has an apex of 2.7 m, just under the 2.8 m above which the
-paper first outputs a ball. At most 1.48 s are left before the ball is down, where the paper has
-1.6 s; that its catches took less than 1.3 s is an outcome and not a bound here. Without drag
-the paper allows any height and t < 2. The second ball of `parabola2` leaves when planning begins.
+With drag, a flight of 1.78 s has its apex at 4.2 m, the height of the paper's hall; the paper
+allows 1.9 s. The shortest flight has its apex at 2.7 m; the paper first detects balls above 2.8 m.
+At most 1.48 s are left for a catch, in the paper 1.6 s. Without drag the paper allows any height.
 
-Others. Every target comes near the vertical axis through the origin, the quadrotor's, at a
-height of 1 to 3.5 m, and no farther away than `reach` while it may be caught.
+Other targets come near the vertical axis through the origin and stay within a cylinder around it.
 
-| suite | speed [m/s] | height [m] | may be caught [s] | reach [m] |
+| suite | horizontal speed [m/s] | height [m] | horizon [s] | radius [m] |
 |---|---|---|---|---|
-| harmonic2 | level 1 to 1.5, sinking up to 2.5 | 1 to 3.5 | 7 | 9 |
-| triangle3 | level 1 to 1.5 | 1.5 to 2.5 | 6 | 7.3 |
-| hexagon6 | level 1 to 1.5 | 1.5 to 2.5 | 10 | 11.3 |
-| square4, pentagon5, heptagon7 | as hexagon6 | | | |
+| harmonic2 | 1 to 1.5 | 1 to 3.5 | 7 | 9 |
+| triangle3 | 1 to 1.5 | 1.5 to 2.5 | 6 | 7.3 |
+| square4, pentagon5, hexagon6, heptagon7 | 1 to 1.5 | 1.5 to 2.5 | 10 | 11.3 |
 
-- harmonic2: height 2 to 2.5 m plus a swing of 0.6 to 1 m at 1.5 to 2.5 rad/s, any phase; each
-  target drifts in a direction of its own, and after 2 to 5 s is within 1.5 m of the axis.
-- triangle3: three targets at the corners of an equilateral triangle, 3 to 4 m from its centre,
-  which is up to 0.5 m from the axis on either of e1, e2; each flies along a side of it, all at
-  one speed and height, in directions 120 degrees apart. They stay an equilateral triangle, and
-  are closest to each other, 1.5 to 2 m from the centre, after 1.7 to 3.5 s.
-- hexagon6: six targets 1 to 1.5 m from the centre of a level hexagon, all at one velocity; the
-  centre is up to 0.5 m from the axis on either of e1, e2 after 4 to 6 s.
-- square4, pentagon5, heptagon7: the same with four, five and seven targets at the corners of a
-  regular polygon.
+- harmonic2: two targets at a height of 2 to 2.5 m plus an oscillation of 0.6 to 1 m at 1.5 to
+  2.5 rad/s. Each drifts in its own direction and is within 1.5 m of the axis after 2 to 5 s.
+- triangle3: three targets at the corners of an equilateral triangle, 3 to 4 m from its centre. Each
+  flies along a side, all with the same speed, height and sense of rotation. They are closest to
+  each other after 1.7 to 3.5 s. The centre is within 0.5 m of the axis in x and in y.
+- hexagon6 and the other polygons: targets at the corners of a regular polygon, 1 to 1.5 m from its
+  centre, all with the same velocity. The centre is within 0.5 m of the axis in x and in y after 4
+  to 6 s.
 
-The targets of triangle3, hexagon6 and the other polygons fly level. Three velocities 120 degrees
-apart, as the paper has them, lie in one plane, and in the level one no target sinks, which would
-ease its catch: the net must lean over by 60 degrees at least, 90 less theta_safe, at every catch.
+These polygons fly horizontally. The net must then lean by at least 60 degrees, 90 degrees less
+theta_safe, at every catch.
 
-Rushes. The targets of `triangle3` and `hexagon6`, each of which may be caught until a moment of
-its own: in a random order the first until `first`, each other one `after` later, and every one up
-to half of `spread` sooner or later. What can be caught first is often not what has to be.
+Rushes: targets of `triangle3` and `hexagon6` with different horizons. In a random order, the first
+horizon is `first`, and each further one is `after` later. A uniform number from -spread / 2 to
+spread / 2 is added to each. The target that can be caught first is often not the most urgent one.
 
 | suite | targets of | first [s] | after [s] | spread [s] |
 |---|---|---|---|---|
 | rush3 | triangle3 | 2.35 | 0.9 | 0.5 |
 | rush6 | hexagon6 | 3.8 | 0.9 | 0.6 |
 
-Swarms. Light balls that sink at a constant speed, more of them than can be caught: any may be
-left, and the score is how many are caught. Each begins within 6 m of the vertical axis through
-the origin, at a height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts at up to 0.3 m/s, and may be
-caught until it falls through 0.45 m. `swarm8` and `swarm12` have as many as their names say.
-Where balls may be caught for long, what can be caught next is far from what should be.
+Swarms (`swarm8`, `swarm12`): balls that sink at constant speed, more than can be caught. They are
+optional, and the score is the number of caught balls. Each starts within 6 m of the axis at a
+height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts at up to 0.3 m/s, and may be caught until it falls
+through 0.45 m.
 """
 
 import dataclasses
@@ -91,19 +83,19 @@ from planner_jax.task.catch.case import GRAVITY, CatchCase, case
 from planner_jax.task.catch.spec import SUITES, TASK
 from planner_jax.task.quadrotor import require_own_robot
 
-LAUNCH = (4.0, 0.0, 0.8)  # [m], of every throw
+LAUNCH = (4.0, 0.0, 0.8)  # [m], launch point of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
 _BISECTIONS = 60
-_PARALLEL = SUITES["hexagon6"].horizon  # [s], of all targets that fly in parallel
+_PARALLEL = SUITES["hexagon6"].horizon  # [s], of the suites with parallel targets
 
 
 @dataclasses.dataclass(frozen=True)
 class _Throw:
-    """From which ranges a thrown ball is drawn."""
+    """Ranges of a thrown ball."""
 
-    land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the rectangle
+    land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground
-    delay: float = 0.3  # [s], from the launch to the planning
+    delay: float = 0.3  # [s], from the launch to time 0
     drag: float = 0.5  # [1/s]
 
 
@@ -129,17 +121,15 @@ def draw(
     num_targets: int | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
-    """Draw a batch of cases of a suite in float64, and cast it.
+    """Draw a batch of cases in float64, and cast it to a type.
 
-    Order and times are placeholders until a decision sets them. The arguments that are not in this
-    list, and the errors, are those of `pj.hit.draw`.
+    Further arguments and the errors are as in `pj.hit.draw`.
 
-    * `suite`: a key of `SUITES`, "throws" by default, or a suite that another package offers.
-    * `limit_scale`: factor on the limits of speed and body rate, and on the difference between
+    * `suite`: a key of `SUITES`, "throws" by default, or a suite of another package.
+    * `limit_scale`: factor on the limits of speed and body rate, and on the differences between
       the limits of the thrust and the thrust of hover.
-    * `robot`: with a net; suites of other packages have their own.
-    * `num_targets`: N, number of targets in the shape, at least the suite's own; further targets
-      are absent copies of the first.
+    * `robot`: quadrotor with a net; suites of other packages have their own.
+    * `num_targets`: N, at least the suite's number; further targets are absent copies of the first.
     """
     suite = suite_named(suite, "throws")
     require_draw(num, seed, first)
@@ -154,12 +144,11 @@ def draw(
     if size < own:
         raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
-    # One row a case: what stands in front is passed over.
+    # One row of random numbers a case: skip the rows of earlier cases.
     columns, make_targets = _PATHS[suite]
     random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
     targets, horizon = make_targets(random.random((num, columns)))
-    # Which of the suite's targets has each place.
-    place = np.where(np.arange(size) < own, np.arange(size), 0)
+    place = np.where(np.arange(size) < own, np.arange(size), 0)  # index into the suite's targets
     cases = case(
         jax.tree.map(lambda leaf: jnp.asarray(leaf[:, place], dtype), targets),
         horizon[:, place],
@@ -173,10 +162,10 @@ def draw(
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """Draw `num` cases of a suite of `SUITES` by a key of `jax.random`: pure, in float32."""
+    """Draw `num` cases of a suite of `SUITES` by a key of `jax.random`, as a pure function."""
     columns, make_targets = _PATHS[suite]
-    found = make_targets(jax.random.uniform(key, (num, columns)))
-    targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), found)
+    paths = make_targets(jax.random.uniform(key, (num, columns)))
+    targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), paths)
     one = draw(1, suite)
     cases = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape[1:])), one)
     times = one.times / one.horizon[:, :1] * horizon[:, :1]
@@ -184,17 +173,17 @@ def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
 
 
 def _module(array: PyTree) -> ModuleType:
-    """What computes with an array: jax.numpy or NumPy."""
+    """Return jax.numpy or NumPy, whichever an array is of."""
     return jnp if isinstance(array, jax.Array) else np
 
 
 def _between(uniform: PyTree, low: float, high: float) -> PyTree:
-    """PyTree of [0, 1) spread over an interval."""
+    """Return uniform numbers of [0, 1) scaled to an interval."""
     return low + uniform * (high - low)
 
 
 def _unit(angle: PyTree) -> PyTree:
-    """Level unit vectors (..., 3) at angles (...) [rad]."""
+    """Return horizontal unit vectors (..., 3) at angles (...) [rad]."""
     xp = _module(angle)
     return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
 
@@ -203,7 +192,7 @@ def _unit(angle: PyTree) -> PyTree:
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Thrown balls from three numbers each, and when they fall through `CATCH_HEIGHT`."""
+    """Return thrown balls from three numbers each, and horizons at `CATCH_HEIGHT`."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -214,18 +203,18 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Position (B, 3), velocity (B, 3) at the planning and horizon (B,) of one ball a row."""
+    """Return position (B, 3) and velocity (B, 3) at time 0 and horizon (B,) of one ball a row."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
     flight = _between(uniform[:, 2], *throw.flight)
     launch = np.broadcast_to(LAUNCH, land.shape)
-    # The landing point is affine in the velocity at the launch.
+    # The landing point is affine in the launch velocity.
     without, _ = _fly(launch, xp.zeros_like(land), flight, throw.drag)
     share, _ = _fly(xp.zeros_like(land), xp.ones_like(land), flight, throw.drag, gravity=0.0)
     delay = np.full(len(land), throw.delay)
     pos, vel = _fly(launch, (land - without) / share, delay, throw.drag)
-    # A ball is above that height, or rises to it, until it falls through it.
+    # Bisection: at `early` the ball has not yet fallen through the height.
     rise = xp.maximum(vel[:, 2], 0.0) / GRAVITY
     early, late = xp.minimum(0.5 * rise, flight - delay), flight - delay
     for _ in range(_BISECTIONS):
@@ -236,13 +225,12 @@ def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
 
 
 def earliest_throw(name: str) -> tuple[BallState, float]:
-    """The shortest throw of a suite of single throws, to the middle of where it throws.
+    """Return the ball at time 0 and the horizon [s] of a suite's shortest throw to its centre.
 
-    Returns:
-        The ball when planning begins, NumPy leaves (3,) in float32, and its horizon [s].
+    Leaves of the ball are NumPy arrays (3,) in float32.
 
     Raises:
-        ValueError: no such suite.
+        ValueError: the suite is not one of single throws.
     """
     if name not in _THROWS or len(_THROWS[name]) > 1:
         raise ArgumentError("suite", "one of single throws", name)
@@ -253,28 +241,29 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Balls (B, 3) after `time` (B,) [s] with linear drag [1/s] [Yu2023catch, eq. 9]."""
+    """Return balls (B, 3) after `time` (B,) [s] with linear drag [1/s] [Yu2023catch, eq. 9]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:
         return pos + vel * t + 0.5 * pull * t**2, vel + pull * t
-    kept = -xp.expm1(-drag * t) / drag
-    last = pull / drag  # the velocity at which drag carries the ball
-    return pos + (vel - last) * kept + last * t, last + (vel - last) * xp.exp(-drag * t)
+    decayed = -xp.expm1(-drag * t) / drag
+    terminal = pull / drag  # velocity
+    vel = vel - terminal
+    return pos + vel * decayed + terminal * t, terminal + vel * xp.exp(-drag * t)
 
 
 # Lines and swings.
 
 
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
-    """Targets that fly straight on from `pos` (B, N, 3) at `vel`."""
+    """Return targets with positions `pos` (B, N, 3) at time 0 and constant velocities `vel`."""
     ball = BallState(pos=pos, vel=vel)
     drag, gravity = host_leaf(np.zeros(pos.shape)), host_leaf(np.zeros(pos.shape[:2]))
     return BallPath(ball, drag=drag, gravity=gravity)
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
-    """Two swings from nine numbers each."""
+    """Return two oscillating targets from nine numbers each."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
@@ -287,18 +276,18 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Three targets on the sides of an equilateral triangle, from seven numbers."""
+    """Return three targets on the sides of an equilateral triangle, from seven numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
     radius, speed = _between(u[:, 4:5], 3.0, 4.0), _between(u[:, 5:6], 1.0, 1.5)
-    side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # to the left or to the right
+    side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # sense of rotation
     targets = _lines(centre[:, None] + radius * _unit(corner), -speed * _unit(corner + side))
     return targets, np.full(corner.shape, SUITES["triangle3"].horizon)
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Targets in parallel at the corners of a regular polygon, from eight numbers."""
+    """Return parallel targets at the corners of a regular polygon, from eight numbers."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -313,14 +302,14 @@ def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 def _rush(
     uniform: PyTree, *, of: Callable, num: int, first: float, after: float, spread: float
 ) -> tuple[BallPath, PyTree]:
-    """Targets of another suite with horizons of their own, from two numbers more for each."""
+    """Return targets of another suite with different horizons, from two further numbers each."""
     xp, own = _module(uniform), uniform[:, : -2 * num]
     order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
     return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Balls that sink all around, from six numbers each."""
+    """Return sinking balls, from six numbers each."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])
@@ -332,8 +321,8 @@ def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 
 _hexagon = functools.partial(_polygon, num=6)
 
-# Suite -> the number C of random numbers a case, and the function that makes of numbers (B, C) of
-# [0, 1), NumPy or JAX, the targets, leaves (B, N, ...), and the horizons (B, N) [s].
+# Suite -> the number C of random numbers of a case, and the function from numbers (B, C) in [0, 1),
+# NumPy or JAX, to targets, leaves (B, N, ...), and horizons (B, N) [s].
 _PATHS: dict[str, tuple[int, Callable[[PyTree], tuple[TargetPath, PyTree]]]] = {
     **{
         name: (3 * len(throws), functools.partial(_throws, throws=throws))

@@ -1,4 +1,4 @@
-"""The functions `pj.hit.draw`, `planner` and `judge`; `case` is in a module of its own."""
+"""The functions `pj.hit.draw`, `pj.hit.planner` and `pj.hit.judge`."""
 
 from collections.abc import Sequence
 
@@ -29,19 +29,19 @@ def draw(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
-    """Draw serves as a batch of cases; see `generate_serves` and `to_cases`.
+    """Draw serves as a batch of cases.
 
     Args:
         num: number of cases, >= 1.
-        suite: "court", the default, or one of the six real scenarios of [Yu2023bat], "S.1" to
-            "S.6", or a suite that another package offers.
-        seed: >= 0. Case k of a suite and seed is always the same case.
+        suite: "court" (default), a real scenario of [Yu2023bat], "S.1" to "S.6", or a suite of
+            another package.
+        seed: seed of the suite, >= 0. Case k of a suite and seed is always the same case.
         first: index of the first case, >= 0.
         start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
-        delay: [s] from the serve to the moment at which planning starts.
-        limit_scale: factor on the speed, acceleration and body-rate limits; not on the stroke's.
-        robot: with a racket; suites of other packages have their own.
-        dtype: of every floating leaf.
+        delay: [s], flight of the ball before planning starts.
+        limit_scale: factor on the limits of speed, acceleration and body rate.
+        robot: quadrotor with a racket; suites of other packages have their own.
+        dtype: type of every floating leaf.
 
     Raises:
         ValueError: an argument is out of its range, or there is no such suite.
@@ -65,27 +65,24 @@ def draw(
 def planner(
     name: str = "exact", *, effort: str = "feasible", recovery: str | None = None, **options: object
 ) -> Planner[HitCase, HitPlan]:
-    """Return the hit planner of a name, with some of its fields set.
+    """Make the hit planner of a name.
 
-    * `exact`: contact, impact and landing hold by construction; the one to use.
-    * `bat`: the published planner of [Yu2023bat], impact and trajectory optimised together.
+    * `exact`: recommended; every plan satisfies the equations of contact, impact and landing.
+    * `bat`: the planner of [Yu2023bat], which optimises impact and trajectory together.
     * `bat-lite`: `bat` without the transition point before the impact.
-    * `juggle`: a primitive to a stroke that is fixed beforehand; nothing is optimised.
+    * `juggle`: the baseline of [Yu2023bat], a primitive to a fixed stroke without optimisation.
 
     Args:
-        name: one of these, or one that another package offers.
-        recovery: the motion behind the last contact, within all limits: "brake" to rest where it
-            is cheapest, "home" for the way back to where the case begins; by default the plan ends
-            at the contact.
-        effort: "feasible" is done with a case as soon as every limit holds; "good" and "best"
-            search on for less cost. Of 1,000 hits of `court` it is above that of a very long
-            search by 469, 0.00 and 0.00 % (median), 2,467, 0.05 and 0.00 % (90 % quantile), in
-            0.05, 3.6 and 21 s on two CPU cores that had other work.
-        **options: fields of that planner's dataclass, for example `rounds`.
+        name: one of these, or a planner of another package.
+        recovery: trajectory after the last contact, within all limits: "brake" to the cheapest
+            standstill, "home" back to the start. By default the plan ends at the contact.
+        effort: "feasible" stops as soon as every limit holds. "good" and "best" continue to lower
+            the cost.
+        **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:
-        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`; with a recovery a
-        planner whose `planner` is one of these.
+        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`. With a recovery
+        it is the field `planner` of the planner that is returned.
 
     Raises:
         ValueError: there is no planner of that name, or it has no such effort.
@@ -101,19 +98,19 @@ def planner(
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
-    """Judge one plan, or a batch of plans, by the physics alone.
+    """Judge one plan, or a batch of plans, by physics independent of the planners.
 
     Args:
         cases: one case, or a batch.
-        plans: of the cases.
-        **settings: such as `drag_after_impact` and `tolerance`; see `referee_hits`.
+        plans: one plan for each case.
+        **settings: settings of `referee_hits`, such as `drag_after_impact` and `tolerance`.
 
     Returns:
-        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and what was
-        measured.
+        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and measured
+        quantities.
 
     Raises:
         TypeError: the cases or plans are of another task.
-        ValueError: shapes that do not fit, or a setting out of its range.
+        ValueError: cases and plans differ in batch shape, or a setting is out of its range.
     """
     return judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)
