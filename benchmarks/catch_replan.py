@@ -119,7 +119,7 @@ def balls_of(case: CatchCase) -> pj.BallPath:
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
     """When to catch, and the plan."""
-    case = case.decided(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
+    case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
 
 

@@ -47,7 +47,7 @@ def cost_gaps(
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
-        cases, planner = cases.decided(plans.choice), planner.planner
+        cases, planner = cases.with_choice(plans.choice), planner.planner
     longer = _longer(planner, cases, card)
     if longer is None:
         return None

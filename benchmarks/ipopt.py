@@ -85,7 +85,7 @@ class Setup:
         self.module = importlib.import_module(f"planner_jax.benchmarks.ipopt_peer.{module}")
         decided = self.cases
         if isinstance(made, DecidedPlanner):
-            decided = self.cases.decided(pj.plan(made, self.cases).choice)
+            decided = self.cases.with_choice(pj.plan(made, self.cases).choice)
         peer = importlib.import_module("planner_jax.benchmarks.ipopt_peer.peer")
         with jax.enable_x64(True):
             exact = lambda x: jnp.asarray(x, float) if x.dtype.kind == "f" else jnp.asarray(x)  # noqa: E731

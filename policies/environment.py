@@ -174,7 +174,7 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
         number = jnp.maximum(jnp.sum(taken, axis=1), 1)
         violation, ratio = found.violation, jnp.sum(jnp.where(taken, off, 0.0), axis=1) / number
     else:
-        far = jax.vmap(shortfall)(cases.decided(choices), choices)
+        far = jax.vmap(shortfall)(cases.with_choice(choices), choices)
         solved, times = far <= 0.0, choices.times
         violation, ratio = jnp.log1p(far), jnp.zeros_like(far)
     last, caught = (greedy.times - times)[:, -1] / greedy.times[:, -1], jnp.zeros(len(times))
@@ -198,11 +198,11 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
 def _planned(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
     """Choices (B, N) and their plans; where targets are optional, in the length that is best."""
     if not cases.optional:
-        return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.decided(choices))
+        return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
     num = several.times.shape[1]
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), several)
-    tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).decided(flat)
+    tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
     found = solve_batch(ExactCatch(), _attempt(iterations), tried)
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
     # The first that is solved is the longest.

@@ -188,7 +188,7 @@ def test_plans_follow_the_decision_and_best_catches_both_in_time(pairs):
     assert plans.order[1].tolist() == [1, 0]
     verdict = referee_catches(pairs, plans)
     assert verdict.success[:2].all(), [verdict.sentence(k) for k in range(2)]
-    same = plan(by(Given()), pairs.decided(plans.choice))
+    same = plan(by(Given()), pairs.with_choice(plans.choice))
     np.testing.assert_array_equal(same.order, plans.order)
     np.testing.assert_array_equal(same.decided_times, plans.decided_times)
     np.testing.assert_allclose(same.times[:2], plans.times[:2], rtol=1e-5)
@@ -259,7 +259,7 @@ def test_greedy_plans_have_the_order_of_the_estimate(pairs):
 
 def test_a_decision_sets_order_and_times_alone(triangles):
     choice = greedy(triangles)
-    after = triangles.decided(choice)
+    after = triangles.with_choice(choice)
     assert after.order is choice.order
     assert after.times is choice.times
     assert after.targets is triangles.targets
@@ -402,7 +402,7 @@ def test_a_search_takes_more_of_a_swarm_than_greed(swarm):
     assert number[:, 0].mean() > np.asarray(greedy(swarm).taken.sum(axis=1)).mean()
     times = np.asarray(found.times)
     assert (np.diff(times, axis=2) > 0.0).all()
-    decided = swarm.decided(jax.tree.map(lambda leaf: leaf[:, 0], found))
+    decided = swarm.with_choice(jax.tree.map(lambda leaf: leaf[:, 0], found))
     plans = plan(by(Given()), decided)
     kept = Best().rank(plans)
     fewer = Best().rank(dataclasses.replace(plans, times=np.maximum(plans.times, 0) * 0.0))

@@ -215,7 +215,7 @@ def test_a_point_that_is_carried_to_velocities_as_variables_is_the_same_plan(cas
 
     @jax.jit
     def both(point):
-        carried = SUPPLE.carried(point, PLANNER)
+        carried = SUPPLE.convert_point(point, PLANNER)
         plans = PLANNER.decode(point, context), SUPPLE.decode(carried, context)
         return carried, plans, PLANNER.objective(point, context), SUPPLE.objective(carried, context)
 
@@ -225,7 +225,7 @@ def test_a_point_that_is_carried_to_velocities_as_variables_is_the_same_plan(cas
         supple.trajectory.coeffs[:, :4], usual.trajectory.coeffs[:, :4], atol=2e-3
     )
     np.testing.assert_allclose(costs[1].cost, costs[0].cost, rtol=1e-3)
-    np.testing.assert_array_equal(SUPPLE.carried(carried, SUPPLE), carried)
+    np.testing.assert_array_equal(SUPPLE.convert_point(carried, SUPPLE), carried)
 
 
 def test_velocities_as_variables_have_exact_derivatives(float64, cases):

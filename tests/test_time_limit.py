@@ -26,7 +26,7 @@ class Task:
     def batch_shape(self):
         return np.shape(self.number)
 
-    def decided(self, choice):
+    def with_choice(self, choice):
         return self.replace(number=self.number + choice)
 
 

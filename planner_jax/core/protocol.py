@@ -206,7 +206,7 @@ class Decision(Protocol):
         ...
 
     def propose(self, case: PyTree, /) -> PyTree:
-        """Return choices for one case, best first, for `case.decided`; leaves (F, ...); pure."""
+        """Return choices for `case.with_choice`, best first, leaves (F, ...); a pure function."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:

@@ -160,7 +160,7 @@ def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchP
     """Plan a catch at the time at which the ball can first be caught."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
-    return solve_cases(planner, case.decided(choice), attempt)
+    return solve_cases(planner, case.with_choice(choice), attempt)
 
 
 def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> CatchPlan:

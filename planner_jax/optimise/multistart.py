@@ -202,7 +202,7 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
     optimum = None
     for stage in _stages(attempt):
         problem = planner.changed(stage.settings)
-        points = _of_each(functools.partial(problem.carried, before=before), points)
+        points = _of_each(functools.partial(problem.convert_point, before=before), points)
         optimum = _of_each(functools.partial(search, problem, stage.solver), points)
         before = problem
         points, spent = optimum.point, spent + optimum.iterations
@@ -238,7 +238,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
     optimum = None
     for stage in _stages(attempt):
         problem = planner.changed(stage.settings)
-        points = over_lanes(functools.partial(problem.carried, before=before))(points)
+        points = over_lanes(functools.partial(problem.convert_point, before=before))(points)
         before = problem
         optimum = minimise_lanes(problem.objective, points, of_starts, stage.solver, problem.curved)
         points, spent = optimum.point, spent + optimum.iterations

@@ -105,7 +105,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """
         return jnp.zeros((), bool)
 
-    def carried(self, point: Array, before: "OptimisedPlanner") -> Array:
+    def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
         """Return a point (n,) of `before`, this planner with other settings, in own variables.
 
         The point is the same unless the settings change the variables of the planner.

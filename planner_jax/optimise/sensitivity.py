@@ -112,9 +112,9 @@ class Differentiated(OptimisedPlanner):
         """Those of the planner."""
         return self.planner.guesses(context.inner, num)
 
-    def carried(self, point: Array, before: OptimisedPlanner) -> Array:
+    def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
         """As the planner does."""
-        return self.planner.carried(point, cast(Differentiated, before).planner)
+        return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
         """That of the planner."""

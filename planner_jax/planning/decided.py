@@ -54,7 +54,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
             self.decision.check(cases)
         choices = _propose_all(self.decision, cases)
         choice = choices[0] if len(choices) == 1 else plan_of(self, cases).choice
-        return self.planner.settle(cases.decided(choice), plan_of)
+        return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
         """Return the plans of one case or of a batch, with the choices made in them."""
@@ -67,7 +67,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
             choices = _propose_all(self.decision, cases)
         if len(choices) == 1:
             choice = choices[0] if is_resident(cases) else jax.device_get(choices[0])
-            decided = cases.decided(choice)
+            decided = cases.with_choice(choice)
             plans, unsolved = drive(self.planner, decided)
         else:
             if alone:
@@ -87,7 +87,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         num = len(choices)
         if not drive.is_pure:
             cases, choices = jax.tree.map(np.asarray, (cases, choices))
-        tried = [cases.decided(choice) for choice in choices]
+        tried = [cases.with_choice(choice) for choice in choices]
         together = jax.tree.map(lambda *leaves: xp.concatenate(leaves), *tried)
         attempts = self.planner.attempts
         at_all = 1 if self.planner.starts_long(cases) else max(len(attempts) - 1, 1)
@@ -136,4 +136,4 @@ def first_choice(decision: Decision, cases: PyTree) -> PyTree:
 
     The function is pure, and its result constant to derivatives.
     """
-    return cases.decided(_propose_all(decision, lax.stop_gradient(cases))[0])
+    return cases.with_choice(_propose_all(decision, lax.stop_gradient(cases))[0])

@@ -114,7 +114,7 @@ class CatchPilot:
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
-        return self.planner.planner.solve(left.decided(choice), self.search)
+        return self.planner.planner.solve(left.with_choice(choice), self.search)
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:

@@ -115,7 +115,7 @@ class CatchCase:
         """N, the number of targets, present or absent."""
         return np.shape(self.present)[-1]
 
-    def decided(self, choice: CatchChoice) -> "CatchCase":
+    def with_choice(self, choice: CatchChoice) -> "CatchCase":
         """Return the case, or the batch, with the order, times and targets of a choice."""
         present = self.present & choice.taken
         return dataclasses.replace(self, order=choice.order, times=choice.times, present=present)

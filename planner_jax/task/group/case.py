@@ -69,7 +69,7 @@ class InterceptGroup:
         """N, the number of targets that the shape holds."""
         return np.shape(self.present)[-1]
 
-    def decided(self, choice: GroupChoice) -> "InterceptGroup":
+    def with_choice(self, choice: GroupChoice) -> "InterceptGroup":
         """The group, or the batch, with an order."""
         return dataclasses.replace(self, order=choice.order)
 

@@ -249,7 +249,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         across = tangent_basis(impact.stroke.normal)
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
-    def carried(self, point: Array, before: OptimisedPlanner) -> Array:
+    def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
         """Return a point (n,) of a planner without velocities, with zero offsets of velocities."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
