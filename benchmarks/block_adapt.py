@@ -23,9 +23,9 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.baselines.block.library.adapt import adapt_planner
+from planner_jax.baselines.block.library.command import build_library
 from planner_jax.benchmarks.block_library import library_options
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
-from planner_jax.cli.library import build_library
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 
 WARM = 50  # balls before the clock counts

@@ -25,6 +25,7 @@ import pytest  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
 from typecheck import PACKAGES, accept_leaves  # noqa: E402
 
+pytest.register_assert_rewrite("sweeps", "tests.sweeps")
 accept_leaves()
 install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.check")
 

@@ -1,10 +1,32 @@
-"""What the tests of every task's sweep share, besides the fixture `finished`."""
+"""Helpers and tests that the sweeps of several tasks share, besides the fixture `finished`."""
 
 import io
+import json
+import shutil
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
+import pytest
+
+import planner_jax as pj
+from planner_jax.optimise.settings import LbfgsConfig, Round
+from planner_jax.runs.run_folder import LOCK, RunFolder
+from planner_jax.sweep.report import write_report
+from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
+from planner_jax.sweep.sweep import Sweep
+from planner_jax.task.hit.default_planner import ExactHit
+
+
+def quick_hit(**options):
+    """Return the planner of hits with its first round alone, so that one program is compiled."""
+    return ExactHit(rounds=ExactHit().rounds[:1], **options)
+
+
+def quick_catch(**options):
+    """Return the planner of catches with one short round: one program, shared by modules."""
+    rounds = (Round(1, LbfgsConfig(max_steps=20)),)
+    return pj.catch.planner(rounds=rounds, **{"decide": "greedy", **options})
 
 
 def columns(out):
@@ -33,3 +55,88 @@ def stop_after(monkeypatch, sweep, num_chunks):
 
     real = sweep.plan
     monkeypatch.setattr(sweep, "plan", plan)
+
+
+class RunTests:
+    """Tests of the finished run of a module; a subclass has the sweep and what is its own."""
+
+    sweep: Sweep
+    figures: tuple[str, ...]
+    other: str  # name of the other planner
+    not_finite: tuple[str, ...]  # columns of a row whose plan is not finite
+    lists: tuple[str, ...]  # columns of lists of such a row
+
+    def test_a_finished_run_holds_manifest_rows_table_figures_and_page(self, finished, request):
+        out, manifest = finished
+        settings = request.module.SETTINGS
+        assert manifest == json.loads((out / "manifest.json").read_text())
+        assert (manifest["kind"], manifest["state"]) == (self.sweep.kind, "complete")
+        assert type(settings)(**manifest["parameters"]) == settings.of(self.sweep.task)
+        page = (out / "index.html").read_text()
+        for name in self.figures:
+            assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
+            assert f'src="figures/{name}"' in page
+        assert (out / "table.md").stat().st_size > 0
+        assert len(list((out / "plans").iterdir())) == -(-settings.num // settings.batch)
+        assert pq.read_table(out / "baselines")["planner"].to_pylist() == [self.other]
+        assert [path.name for path in out.rglob(".*")] == [LOCK]
+
+    def test_the_summary_counts_successes_and_statuses(self, finished):
+        rows, summary = columns(finished[0]), finished[1]["summary"]
+        num, successes = len(rows["index"]), int(rows["success"].sum())
+        assert 0 < successes < num == summary["num"]
+        assert summary["successes"] == successes
+        assert summary["success_rate"] == pytest.approx(successes / num)
+        assert sum(summary["status_counts"].values()) == num
+        assert sum(summary["failed_limits"].values()) == num - successes
+        assert summary["plans_per_second_warm"] > 0.0
+        assert summary["compile_seconds"] == finished[1]["times"]["compile_seconds"]
+
+    def test_every_column_has_its_unit_and_meaning(self, finished):
+        for field in pq.ParquetDataset(finished[0] / "plans").schema:
+            assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
+
+    def test_a_report_is_drawn_again_from_the_folder_alone(self, finished, tmp_path):
+        out, _ = finished
+        shutil.copytree(out / "plans", tmp_path / "plans")
+        shutil.copy(out / "manifest.json", tmp_path)
+        write_report(RunFolder(tmp_path))
+        for name in ("table.md", "index.html"):
+            assert (tmp_path / name).read_text() == (out / name).read_text()
+        assert {path.name for path in (tmp_path / "figures").iterdir()} == set(self.figures)
+
+    def test_a_plan_that_is_not_finite_is_reported(self, finished, tmp_path):
+        out, manifest = finished
+        table = pq.read_table(out / "plans").slice(manifest["example"], 1)
+        row = table.to_pylist()[0] | dict.fromkeys(self.not_finite, float("nan"))
+        row |= {"index": 0, "success": False, "sentence": "not finite", "failed_limit": "finite"}
+        row |= {name: [float("nan")] * len(row[name]) for name in self.lists}
+        folder = RunFolder(tmp_path)
+        folder.write_manifest({**manifest, "example": 0})
+        folder.plans.write_rows(pa.Table.from_pylist([row], schema=table.schema))
+        write_report(folder)
+        assert "not finite" in (tmp_path / "index.html").read_text()
+
+    @pytest.mark.parametrize("num_chunks", [0, 1])
+    def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
+        self, finished, tmp_path, monkeypatch, request, num_chunks
+    ):
+        """Parts and texts that a killed process was writing are removed."""
+        out, settings, task = tmp_path / "run", request.module.SETTINGS, self.sweep.task
+        monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
+        monkeypatch.setattr(type(self.sweep), "other_planners", lambda *_: {})
+        with monkeypatch.context() as patch:
+            stop_after(patch, type(self.sweep), num_chunks)
+            with pytest.raises(SweepInterrupted):
+                start_sweep(task, settings, out, progress=False)
+        folder = RunFolder(out)
+        assert folder.read_manifest()["state"] == "interrupted"
+        (out / "plans").mkdir(exist_ok=True)
+        (out / "plans" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
+        (out / ".4711.tmp.table.md").write_bytes(b"half a table")
+        manifest = resume_sweep(task, out, progress=False, num=settings.num)
+        assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
+        assert rows_of(out) == rows_of(finished[0])
+        assert manifest["summary"]["successes"] == finished[1]["summary"]["successes"]
+        assert [path.name for path in out.rglob(".*")] == [LOCK]
+        assert resume_sweep(task, out, progress=False) == manifest

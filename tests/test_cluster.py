@@ -1,7 +1,6 @@
 """Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
 
 import dataclasses
-import functools
 import os
 import signal
 import subprocess
@@ -14,6 +13,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError, MissingExtra, install_line
+from planner_jax.host import machine
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import WorkersFailed
 from planner_jax.sweep import cluster, run
@@ -337,18 +337,41 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:os.fork.. was called:RuntimeWarning")  # JAX may have begun here
+@pytest.mark.filterwarnings("ignore:os.fork.. was called:RuntimeWarning")  # JAX may run here
 def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     tmp_path, monkeypatch
 ):
-    """The cluster is told of two GPUs, and its workers compute on the CPU."""
+    """The cluster claims one GPU and four cores for two workers, which compute on the CPU.
+
+    They compute with four threads each, and so do the run and the plain sweep.
+    """
     ray = pytest.importorskip("ray")
+    init = ray.init
+    monkeypatch.setattr(ray, "init", lambda **how: init(**{**how, "num_cpus": 4, "num_gpus": 1}))
+    monkeypatch.setenv("NPROC", "4")
+    monkeypatch.setenv("PJRT_NPROC", "4")
     plain, out = tmp_path / "plain", tmp_path / "run"
     options = "--num 32 --batch 2 --planner juggle --out".split()
     command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options, str(plain)]
     subprocess.run(command, check=True, capture_output=True)
-    monkeypatch.setattr(ray, "init", functools.partial(ray.init, num_gpus=2))
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
-    settings = HitSettings(num=32, batch=2, planner="juggle")
-    start_sweep(TASK, settings, out, progress=False, workers="ray")
+    machine.threads_of_a_computation.cache_clear()  # this process plans nothing itself
+    try:
+        settings = HitSettings(num=32, batch=2, planner="juggle")
+        start_sweep(TASK, settings, out, progress=False, workers="ray")
+    finally:
+        machine.threads_of_a_computation.cache_clear()
     assert rows_of(out) == rows_of(plain)
+
+
+@pytest.mark.slow
+def test_a_bad_case_of_a_worker_of_a_real_cluster_is_one_line_and_leaves_nothing(tmp_path):
+    """The serves of a later chunk have landed before the planning starts."""
+    pytest.importorskip("ray")
+    options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run".split()
+    command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]
+    ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    error = ended.stderr.splitlines()[-1]
+    assert ended.returncode == 2 and "Traceback" not in ended.stderr
+    assert error.startswith("planner-jax: error: --delay must be shorter than each serve's flight")
+    assert not list(tmp_path.iterdir())

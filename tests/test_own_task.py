@@ -127,11 +127,11 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     settings = ["--planner", "scipy", "--num", "6", "--batch", "1", "--out", "run"]
     whole = command(tmp_path, "sweep", "meet", *settings[:-1], "whole")
     assert whole.code == 0, whole.err
-    running = process(tmp_path, "sweep", "meet", *settings)
-    while not list(tmp_path.glob("run/parts/part-*.parquet")):
-        assert running.poll() is None
-    running.send_signal(signal.SIGINT)
-    _, err = running.communicate()
+    with process(tmp_path, "sweep", "meet", *settings) as running:
+        while not list(tmp_path.glob("run/plans/part-*.parquet")):
+            assert running.poll() is None
+        running.send_signal(signal.SIGINT)
+        _, err = running.communicate()
     assert running.returncode == 130
     assert err.splitlines()[-1].endswith("planner-jax sweep meet --resume --out run")
     assert manifest_of(tmp_path / "run")["state"] == "interrupted"

@@ -10,6 +10,7 @@ from flown_plans import SOLVED, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.cli.main import main
+from planner_jax.cli.plan.answer import sampled
 from planner_jax.core.errors import ArgumentError, NoRecovery
 from planner_jax.plane.target import TurningPath
 from planner_jax.recovery.after_plan import append_recovery, is_rested
@@ -27,7 +28,6 @@ from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.rows import planned_row
-from planner_jax.sweep.single import sampled
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 NUM = 8

@@ -8,11 +8,10 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.sweep.catch.settings import SingleCatchSettings
-from planner_jax.sweep.catch.single import SingleCatch
-from planner_jax.sweep.hit.settings import SingleHitSettings
-from planner_jax.sweep.hit.single import SingleHit
-from planner_jax.sweep.single import Margin
+from planner_jax.cli.plan.answer import Margin
+from planner_jax.cli.plan.catch import SingleCatch
+from planner_jax.cli.plan.hit import SingleHit
+from planner_jax.cli.plan.settings import SingleCatchSettings, SingleHitSettings
 from planner_jax.task.hit.plan import HitPlan
 
 HIT = "--pos 4 0.3 1.2 --vel -7 -1e-1 6 --target 4 0 0"

@@ -1,42 +1,30 @@
 """The catch sweep: rows, table and figures of a suite, resuming, and what it refuses."""
 
-import json
-import shutil
 from types import SimpleNamespace
 
 import jax
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from sweeps import columns, rows_of, stop_after
+from sweeps import RunTests, columns, quick_catch
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError
-from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.referee.catch import referee_catches
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.columns import rows_of as columns_of
-from planner_jax.runs.run_folder import LOCK, RunFolder
+from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
+from planner_jax.sweep.catch.figures import target_positions
 from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.catch.sweep import CatchSweep, CatchTally
-from planner_jax.sweep.catch.targets import target_positions
-from planner_jax.sweep.report import write_report
-from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
+from planner_jax.sweep.run import resume_sweep
 from planner_jax.task.catch.spec import SUITES
 
 TASK = pj.task_named("catch")
 NUM, BATCH = 8, 4
 # Some of these fail, with one short round.
 SETTINGS = CatchSettings(suite="parabola2", decide="greedy", num=NUM, batch=BATCH, seed=2)
-FIGURES = ("flight.png", "motion.png", "outcomes.png")
-
-
-def one_round(settings):
-    """The planner with one round, so that one program is compiled: that of other modules."""
-    rounds = (Round(1, LbfgsConfig(max_steps=20)),)
-    return pj.catch.planner(rounds=rounds, **settings.planner_options())
 
 
 def open_source(settings, batch):
@@ -46,39 +34,31 @@ def open_source(settings, batch):
 @pytest.fixture(autouse=True, scope="module")
 def quick_planners():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(CatchSweep, "planner", lambda _, settings: one_round(settings))
-        patch.setattr(CatchSweep, "other_planners", lambda _, s: {"mpp": one_round(s)})
+        patch.setattr(
+            CatchSweep, "planner", lambda _, settings: quick_catch(**settings.planner_options())
+        )
+        patch.setattr(
+            CatchSweep, "other_planners", lambda _, s: {"mpp": quick_catch(**s.planner_options())}
+        )
         yield
 
 
-def test_a_finished_run_holds_manifest_rows_table_figures_and_page(finished):
-    out, manifest = finished
-    assert manifest == json.loads((out / "manifest.json").read_text())
-    assert manifest["state"] == "complete" and manifest["kind"] == "sweep catch"
-    assert CatchSettings(**manifest["parameters"]) == SETTINGS.of(TASK)
-    page = (out / "index.html").read_text()
-    for name in FIGURES:
-        assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
-        assert f'src="figures/{name}"' in page
-    assert pq.read_table(out / "baselines")["planner"].to_pylist() == ["mpp"]
-    assert [path.name for path in out.rglob(".*")] == [LOCK]
+class TestRun(RunTests):
+    sweep = CatchSweep(TASK)
+    figures = ("flight.png", "motion.png", "outcomes.png")
+    other = "mpp"
+    not_finite = ()
+    lists = ("coeffs", "durations", "catch_times", "net_distance")
 
 
-def test_the_summary_counts_the_rows(finished):
-    out, manifest = finished
-    rows, summary = columns(out), manifest["summary"]
-    successes = int(rows["success"].sum())
-    assert len(rows["index"]) == summary["num"] == NUM and 0 < successes < NUM
-    assert summary["success_rate"] == pytest.approx(successes / NUM)
-    assert sum(summary["failed_limits"].values()) == NUM - successes
+def test_the_summary_counts_targets_and_times(finished):
+    rows, summary = columns(finished[0]), finished[1]["summary"]
     assert summary["caught"] == pytest.approx(rows["num_caught"].mean() / 2)
     times, decided, caught = rows["catch_times"], rows["decided_times"], rows["caught"]
     assert summary["mean_catch_time"] == pytest.approx(times[caught].mean())
     solved = np.isin(rows["status"], ["CONVERGED", "FEASIBLE"])
     ratio = np.mean(np.abs(times - decided) / times, axis=1)
     assert summary["optimal_time_ratio"] == pytest.approx(ratio[solved].mean(), rel=1e-5)
-    assert summary["plans_per_second_warm"] > 0.0
-    assert summary["compile_seconds"] == manifest["times"]["compile_seconds"]
 
 
 def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
@@ -86,11 +66,6 @@ def test_a_planner_that_decides_itself_has_no_optimal_time_ratio(finished):
     tally.add(pq.read_table(finished[0] / "plans"))
     assert tally.summary()["optimal_time_ratio"] is None
     assert CatchSweep(TASK).tally(CatchSettings(planner="mpp"))._decides is False
-
-
-def test_every_column_has_its_unit_and_meaning(finished):
-    for field in pq.ParquetDataset(finished[0] / "plans").schema:
-        assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
 
 
 def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
@@ -134,44 +109,6 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished):
     np.testing.assert_array_equal(verdict.success, rows["success"])
     np.testing.assert_array_equal(verdict.failed_limit, rows["failed_limit"])
     np.testing.assert_allclose(verdict.net_distance, rows["net_distance"], atol=1e-5)
-
-
-def test_a_report_is_drawn_again_from_the_folder_alone(finished, tmp_path):
-    out, _ = finished
-    shutil.copytree(out / "plans", tmp_path / "plans")
-    shutil.copy(out / "manifest.json", tmp_path)
-    write_report(RunFolder(tmp_path))
-    assert (tmp_path / "table.md").read_text() == (out / "table.md").read_text()
-    assert {path.name for path in (tmp_path / "figures").iterdir()} == set(FIGURES)
-
-
-def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
-    out, manifest = finished
-    (tmp_path / "manifest.json").write_bytes((out / "manifest.json").read_bytes())
-    table = pq.read_table(out / "plans").slice(manifest["example"], 1)
-    row = table.to_pylist()[0]
-    row |= {"index": 0, "success": False, "sentence": "not finite", "caught": [False, False]}
-    for name in ("coeffs", "durations", "catch_times", "net_distance"):
-        row[name] = [float("nan")] * len(row[name])
-    folder = RunFolder(tmp_path)
-    folder.write_manifest({**manifest, "example": 0})
-    folder.plans.write_rows(pa.Table.from_pylist([row], schema=table.schema))
-    write_report(folder)
-    assert "not finite" in (tmp_path / "index.html").read_text()
-
-
-def test_an_interrupted_sweep_is_resumed_to_the_same_rows(finished, tmp_path, monkeypatch):
-    out = tmp_path / "run"
-    monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
-    monkeypatch.setattr(CatchSweep, "other_planners", lambda *_: {})
-    with monkeypatch.context() as patch:
-        stop_after(patch, CatchSweep, 1)
-        with pytest.raises(SweepInterrupted):
-            start_sweep(TASK, SETTINGS, out, progress=False)
-    assert RunFolder(out).read_manifest()["state"] == "interrupted"
-    manifest = resume_sweep(TASK, out, progress=False, suite="parabola2")
-    assert manifest["state"] == "complete" and len(manifest["sessions"]) == 2
-    assert rows_of(out) == rows_of(finished[0])
 
 
 @pytest.mark.parametrize(
@@ -253,19 +190,3 @@ def test_the_published_protocol_reaches_the_referee_when_it_is_asked_for(monkeyp
     settings = CatchSettings(planner="catch", tolerance=0.05, net_test="ball")
     CatchSweep(TASK).judge(None, None, settings)
     assert asked == {"tolerance": 0.05, "net_test": "ball"}
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"suite": "nowhere"}, "suite must be one of throws, .*, got 'nowhere'"),
-        ({"planner": "juggle"}, "planner must be one of exact, .*, got 'juggle'"),
-        ({"decide": "late"}, "decide must be one of best, greedy, random, .*, got 'late'"),
-        ({"tolerance": float("nan")}, "tolerance must be finite and >= 0, got nan"),
-        ({"limit_scale": -1.0}, "limit_scale must be from 0.001 to 1000, got -1"),
-        ({"num": 0}, "num must be >= 1, got 0"),
-    ],
-)
-def test_a_setting_out_of_its_range_is_named(given, message):
-    with pytest.raises(ArgumentError, match=message):
-        CatchSettings(**given).of(TASK)

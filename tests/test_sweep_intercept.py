@@ -1,19 +1,17 @@
 """The intercept sweep: rows that hold a case and its drive, figures, counts."""
 
 import dataclasses
-import json
 from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
-from sweeps import columns
+from sweeps import RunTests, columns
 
 import planner_jax as pj
 from planner_jax.plane.obstacles import Obstacles
@@ -23,21 +21,17 @@ from planner_jax.referee.intercept import referee_intercepts
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
-from planner_jax.sweep.intercept.drive import sampled_drive
-from planner_jax.sweep.intercept.figures.plane import instants
+from planner_jax.sweep.intercept.figures import instants, sampled_drive
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
-from planner_jax.sweep.report import write_report
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.searches import Search
 
 TASK = pj.task_named("intercept")
 NUM, BATCH = 12, 6
 SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some of these fail
-FIGURES = ("plane.png", "motion.png", "outcomes.png")
 
 
 def one_search():
@@ -114,25 +108,17 @@ def rows(finished):
     return pq.read_table(finished[0] / "plans").to_pylist()
 
 
-def test_a_finished_run_holds_rows_figures_and_page(finished):
-    out, manifest = finished
-    assert manifest == json.loads((out / "manifest.json").read_text())
-    assert manifest["state"] == "complete" and manifest["kind"] == "sweep intercept"
-    assert InterceptSettings(**manifest["parameters"]) == SETTINGS.of(TASK)
-    page = (out / "index.html").read_text()
-    for name in FIGURES:
-        assert (out / "figures" / name).read_bytes().startswith(b"\x89PNG")
-        assert f'src="figures/{name}"' in page
-    for field in pq.ParquetDataset(out / "plans").schema:
-        assert field.metadata.keys() == {b"unit", b"meaning"} and field.metadata[b"meaning"]
+class TestRun(RunTests):
+    sweep = InterceptSweep(TASK)
+    figures = ("plane.png", "motion.png", "outcomes.png")
+    other = "lattice"
+    not_finite = ("meeting_time", "failed_time", "miss", "mover_clearance")
+    lists = ("speed", "curvature")
 
 
-def test_the_summary_counts_the_rows(finished):
-    out, manifest = finished
-    found, summary = columns(out), manifest["summary"]
+def test_the_summary_has_means_over_the_successes(finished):
+    found, summary = columns(finished[0]), finished[1]["summary"]
     good = found["success"].astype(bool)
-    assert 0 < good.sum() < NUM == len(good) == summary["num"]
-    assert summary["successes"] == good.sum()
     for name in ("meeting_time", "miss", "rms_acceleration"):
         assert summary[f"mean_{name}"] == pytest.approx(found[name][good].mean(), rel=1e-5)
 
@@ -198,21 +184,6 @@ def test_a_target_of_another_class_has_a_way_and_no_leaves():
     of_target = {c.name: c.values(batch) for c in COLUMNS if c.name.startswith("target_")}
     assert of_target.pop("target_way").shape == (1, WAY_POINTS, 2)
     assert list(of_target.values()) == [None, None, None]
-
-
-def test_a_plan_that_is_not_finite_is_reported_too(finished, tmp_path):
-    out, manifest = finished
-    table = pq.read_table(out / "plans").slice(manifest["example"], 1)
-    row = table.to_pylist()[0]
-    row |= {"index": 0, "success": False, "sentence": "not finite", "failed_limit": "not finite"}
-    row |= dict.fromkeys(("meeting_time", "failed_time", "miss", "mover_clearance"), float("nan"))
-    for name in ("speed", "curvature"):
-        row[name] = [float("nan")] * len(row[name])
-    folder = RunFolder(tmp_path)
-    folder.write_manifest({**manifest, "example": 0})
-    folder.plans.write_rows(pa.Table.from_pylist([row], schema=table.schema))
-    write_report(folder)
-    assert "not finite" in (tmp_path / "index.html").read_text()
 
 
 @pytest.mark.parametrize(

@@ -266,7 +266,7 @@ def add_library(library: Parser) -> None:
 
 def _library(name: str, given: Options) -> None:
     keep_compiled_programs()
-    run = pkgutil.resolve_name(f"planner_jax.cli.library:{name}_library")
+    run = pkgutil.resolve_name(f"planner_jax.baselines.block.library.command:{name}_library")
     parts = Path(f"{given['path']}.parts")
     rest = functools.partial(_how_to_continue, parts, f"go on with: {_own_command()}", "what.json")
     rule = "FILE must be one that can be written"

@@ -21,9 +21,9 @@ from planner_jax.runs.environment import require_backend
 from planner_jax.runs.settings import recovery_options, require_recovery
 
 if TYPE_CHECKING:
+    from planner_jax.cli.plan.answer import Answer
     from planner_jax.core.protocol import Plan
     from planner_jax.core.rules import Case
-    from planner_jax.sweep.single import Answer
 
 
 def add_plan(task: Task, parser: Parser) -> None:
@@ -63,8 +63,8 @@ def _write_answer(
     task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
 ) -> None:
     """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
+    from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
-    from planner_jax.sweep.single import write_pictures
 
     out.mkdir()
     written = [out / "plan.npz"]

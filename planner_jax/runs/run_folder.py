@@ -6,6 +6,7 @@ of the file `.lock`, which the system frees when the process ends.
 """
 
 import contextlib
+import dataclasses
 import datetime
 import fcntl
 import json
@@ -16,14 +17,16 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import is_scratch, replacing
 from planner_jax.runs.dataset import Dataset
-from planner_jax.runs.manifest import MANIFEST, Entries, read_written, to_write
+from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_write
 
 LOCK = ".lock"
+FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # in figures
 _TRIES, _BETWEEN = 20, 0.01  # of a lock that is taken, and seconds from one to the next
 
 
@@ -187,3 +190,33 @@ class RunFolder:
             rule = f"a run whose {place} is whole"
             shown = f"{str(self.path)!r}, where it {why}; {remedy}"
             raise ArgumentError(self.name, rule, shown=shown)
+
+
+@dataclasses.dataclass(frozen=True)
+class RunRows:
+    """What the figures of a run are drawn from."""
+
+    folder: RunFolder
+    manifest: Entries
+    failures: list[Row]  # the first few rows that failed
+
+    def sample(self) -> list[Row]:
+        """Return rows taken evenly from the run; where nearly all succeed, failures are added."""
+        last = self.manifest["summary"]["num"] - 1
+        spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
+        shown = self.folder.plans.pick(spread)
+        missing = FAILURES_SHOWN - sum(not row["success"] for row in shown)
+        others = [row for row in self.failures if row["index"] not in spread]
+        return shown + others[: max(missing, 0)]
+
+    def same_case(self) -> list[tuple[str, Row]]:
+        """Return planner and row of the run's example, and of other planners for the same case."""
+        own = self.folder.plans.pick([self.manifest["example"]])[0]
+        others = self.folder.baselines
+        rows = others.read().to_pylist() if others.files() else []
+        name = self.manifest["parameters"]["planner"]
+        return [(name, own), *((row["planner"], row) for row in rows)]
+
+    def columns(self, *names: str) -> pa.Table:
+        """Return some columns of all rows."""
+        return self.folder.plans.read(names)

@@ -1,56 +1,21 @@
 """Table, figures and page of a run, from nothing but its folder."""
 
-import dataclasses
 import html
 import math
 import shlex
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import pyarrow as pa
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.run_folder import FAILURES_SHOWN, RunFolder, RunRows
 from planner_jax.runs.settings import SweepSettings, settings_of_manifest
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, headline, to_html, to_markdown
 from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of_run
-
-_CASES_SHOWN = 60
-_FAILURES_SHOWN = 12
-
-
-@dataclasses.dataclass(frozen=True)
-class RunRows:
-    """What the figures of a run are drawn from."""
-
-    folder: RunFolder
-    manifest: Entries
-    failures: list[Row]  # the first few rows that failed
-
-    def sample(self) -> list[Row]:
-        """Return rows taken evenly from the run; where nearly all succeed, failures are added."""
-        last = self.manifest["summary"]["num"] - 1
-        spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
-        shown = self.folder.plans.pick(spread)
-        missing = _FAILURES_SHOWN - sum(not row["success"] for row in shown)
-        others = [row for row in self.failures if row["index"] not in spread]
-        return shown + others[: max(missing, 0)]
-
-    def same_case(self) -> list[tuple[str, Row]]:
-        """Return planner and row of the run's example, and of other planners for the same case."""
-        own = self.folder.plans.pick([self.manifest["example"]])[0]
-        others = self.folder.baselines
-        rows = others.read().to_pylist() if others.files() else []
-        name = self.manifest["parameters"]["planner"]
-        return [(name, own), *((row["planner"], row) for row in rows)]
-
-    def columns(self, *names: str) -> pa.Table:
-        """Return some columns of all rows."""
-        return self.folder.plans.read(names)
 
 
 def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
@@ -132,9 +97,9 @@ def _failed_rows(plans: Dataset) -> list[Row]:
     for rows in plans.parts(["success"]):
         failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()
         first += len(rows)
-        if len(failed) >= _FAILURES_SHOWN:
+        if len(failed) >= FAILURES_SHOWN:
             break
-    return plans.pick(failed[:_FAILURES_SHOWN])
+    return plans.pick(failed[:FAILURES_SHOWN])
 
 
 _STYLE = """

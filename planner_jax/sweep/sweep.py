@@ -4,7 +4,7 @@ import contextlib
 import dataclasses
 import pkgutil
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, Generic
+from typing import ClassVar, Generic
 
 import numpy as np
 from jaxtyping import PyTree
@@ -18,14 +18,12 @@ from planner_jax.core.registry import Task, task_named
 from planner_jax.planning.plan import plan
 from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.settings import AnySettings, SweepSettings
 from planner_jax.runs.source import DrawnSource, Source, filled_in
 from planner_jax.runs.summary import Tally
 from planner_jax.runs.table import RateTable, own_cells
-from planner_jax.sweep.figures.outcomes import outcomes_figure
-
-if TYPE_CHECKING:
-    from planner_jax.sweep.report import RunRows
+from planner_jax.sweep.figures import outcomes_figure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,7 +33,7 @@ class RunFigure:
     name: str  # of the file
     caption: str
     size: tuple[float, float]  # width and height [inch]
-    draw: Callable[[Figure, "RunRows"], None]  # takes an empty figure and a `report.RunRows`
+    draw: Callable[[Figure, RunRows], None]  # takes an empty figure and a `report.RunRows`
 
 
 class Sweep(Generic[AnySettings]):

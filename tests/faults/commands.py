@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import random
 import signal
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from planner_jax.cli.main import main
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 class Ended(NamedTuple):
@@ -32,24 +35,38 @@ def run(*arguments: str | Path) -> Ended:
 
 
 def start(
-    *arguments: str | Path, cwd: Path, cache: str | None = None, blocks: int | None = None
+    *arguments: str | Path,
+    cwd: Path,
+    module: str = "planner_jax",
+    cache: str | None = None,
+    blocks: int | None = None,
+    cores: int | None = None,
 ) -> subprocess.Popen:
-    """A command in a process of its own.
+    """Start a command in a process of its own.
 
     Args:
         *arguments: of `planner-jax`.
-        cwd: folder where it runs.
+        cwd: folder where the command runs.
+        module: that Python runs.
         cache: folder of compiled programs; the usual one if not given.
-        blocks: of 1,024 bytes that a file may have at most.
+        blocks: greatest size of a file, in units of 1,024 bytes.
+        cores: number of cores that the process may use; all if not given.
     """
-    cached = {"JAX_COMPILATION_CACHE_DIR": cache} if cache else {}
-    command = [sys.executable, "-m", "planner_jax", *map(str, arguments)]
+    path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    environment = {"PYTHONFAULTHANDLER": "1", "PYTHONPATH": path}
+    if cache:
+        environment["JAX_COMPILATION_CACHE_DIR"] = cache
+    command = [sys.executable, "-m", module, *map(str, arguments)]
+    if cores is not None:
+        usable = sorted(os.sched_getaffinity(0))
+        some = random.SystemRandom().sample(usable, min(cores, len(usable)))
+        command = ["taskset", "--cpu-list", ",".join(map(str, some)), *command]
     if blocks is not None:
         command = ["bash", "-c", f'ulimit -f {blocks}; exec "$@"', "limited", *command]
     return subprocess.Popen(
         command,
         cwd=cwd,
-        env={**os.environ, **cached, "PYTHONFAULTHANDLER": "1"},
+        env={**os.environ, **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

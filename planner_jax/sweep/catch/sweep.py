@@ -9,10 +9,9 @@ from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable, own_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
-from planner_jax.sweep.catch.figures.flight import flight_figure
-from planner_jax.sweep.catch.figures.motion import motion_figure
+from planner_jax.sweep.catch.figures import flight_figure, motion_figure
 from planner_jax.sweep.catch.settings import CatchSettings
-from planner_jax.sweep.figures.motion import CAPTION as MOTION
+from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan

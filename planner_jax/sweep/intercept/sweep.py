@@ -7,10 +7,9 @@ from jaxtyping import PyTree
 from planner_jax.robot.car import CarPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.sweep.figures.motion import CAPTION as MOTION
+from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
-from planner_jax.sweep.intercept.figures.motion import motion_figure
-from planner_jax.sweep.intercept.figures.plane import plane_figure
+from planner_jax.sweep.intercept.figures import motion_figure, plane_figure
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values

@@ -61,7 +61,7 @@ TASK = Task(
     },
     suites={name: suite.description for name, suite in SUITES.items()},
     sweep="planner_jax.sweep.catch.settings:CatchSettings",
-    single="planner_jax.sweep.catch.settings:SingleCatchSettings",
+    single="planner_jax.cli.plan.settings:SingleCatchSettings",
     flight="planner_jax.sims.settings:CatchFly",
     bench={"decide": "greedy"},
     contact="times",

@@ -39,7 +39,7 @@ TASK = Task(
         "S.6": "Balls that come from one side and go to the other side.",
     },
     sweep="planner_jax.sweep.hit.settings:HitSettings",
-    single="planner_jax.sweep.hit.settings:SingleHitSettings",
+    single="planner_jax.cli.plan.settings:SingleHitSettings",
     flight="planner_jax.sims.settings:HitFly",
     contact="stroke.time",
 )

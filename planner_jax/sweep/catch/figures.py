@@ -1,15 +1,81 @@
-"""One plan in space: targets, quadrotor, and the net at every catch [Yu2023catch, Figs 6, 8]."""
+"""Figures of a catch run: one plan in space and along its time."""
 
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from planner_jax.ball.flight import BallState
+from planner_jax.ball.target import BallPath, HarmonicPath
 from planner_jax.runs import style
+from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.style import Look
-from planner_jax.sweep.catch.targets import SampledCatch, sampled_catch
-from planner_jax.sweep.quadrotor import sample_motion
-from planner_jax.sweep.report import RunRows
+from planner_jax.sweep.figures import DASHED, Drawn, quadrotor_figure
+from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
+
+
+def target_paths(row: Row) -> BallPath | HarmonicPath:
+    """Return the targets, leaves with a leading axis N."""
+
+    def leaf(name: str, *trailing: int) -> jax.Array:
+        return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
+
+    if row["swing_pos"] is None:
+        ball = BallState(leaf("ball_pos", 3), leaf("ball_vel", 3))
+        return BallPath(ball, leaf("drag", 3), leaf("ball_gravity"))
+    vectors = {name: leaf(f"swing_{name}", 3) for name in ("pos", "vel", "amplitude")}
+    return HarmonicPath(**vectors, rate=leaf("swing_rate"), phase=leaf("swing_phase"))
+
+
+def target_positions(row: Row, times: np.ndarray) -> np.ndarray:
+    """Return where all targets are at some times (K,) [s], (N, K, 3) [m]."""
+    return np.asarray(_positions(target_paths(row), jnp.asarray(times, jnp.float32)))
+
+
+@jax.jit
+def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
+    return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
+
+
+class SampledCatch(NamedTuple):
+    """A row, and its quadrotor, net and N targets at K times."""
+
+    row: Row
+    motion: SampledMotion
+    axis: np.ndarray  # (K, 3) thrust direction
+    centre: np.ndarray  # (K, 3) [m], of the hoop
+    radius: float  # [m], of the hoop
+    targets: np.ndarray  # (N, K, 3) [m]
+    catches: np.ndarray  # (n,) places of the n catches among the times
+
+
+def sampled_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
+    """Return a row whose plan has been sampled, with the physics of the manifest's `setting`."""
+    thrust = net_thrust(motion, setting["gravity"])
+    axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
+    centre = motion.pos + setting["net_height"] * axis
+    targets = target_positions(row, motion.time)
+    times = np.array(row["catch_times"])[: int(np.sum(row["present"]))]
+    catches = np.abs(motion.time[:, None] - times).argmin(axis=0)
+    return SampledCatch(row, motion, axis, centre, setting["net_radius"], targets, catches)
+
+
+def due_distance(plan: SampledCatch) -> np.ndarray:
+    """Return distance (K,) [m] from the net's centre to the target that is to be caught next.
+
+    NaN at the first time after a catch, so that curves have a gap there.
+    """
+    times, num = plan.motion.time, len(plan.catches)
+    place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
+    due = np.array(plan.row["order"])[np.minimum(place, num - 1)]
+    distance = np.linalg.norm(plan.targets[due, np.arange(len(times))] - plan.centre, axis=1)
+    return np.where(np.diff(place, prepend=0) > 0, np.nan, distance)
+
 
 _SAMPLES = 1601
 _ROTORS = 0.165  # [m], half the diagonal between the paper's propellers
@@ -94,3 +160,30 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
     axes.plot(*(centre + plan.radius * circle)[:, where].T, color=style.RED, linewidth=1.5, **look)
     axes.plot(*(pos + _ROTORS * circle)[:, where].T, color=style.BLUE, linewidth=1.2, **look)
     axes.plot(*np.stack([pos, centre])[:, where].T, color=style.GREY, linewidth=1.2, **look)
+
+
+_PANELS = ("speed", "body_rate", "thrust", "jerk")
+_LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
+
+
+def motion_figure(figure: Figure, run: RunRows) -> None:
+    """Draw net distance, speed, body rate, thrust and jerk of plans for the same case."""
+    quadrotor_figure(figure, run, _PANELS, _draw_distances, _word)
+
+
+def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
+    """Draw distance of the net to the target that it catches next."""
+    for plan in plans:
+        away = due_distance(sampled_catch(plan.row, plan.motion, setting))
+        axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)
+        caught = np.maximum(np.array(plan.row["net_distance"], float), _LEAST_DISTANCE)
+        axes.plot(plan.row["catch_times"], caught, "o", color=plan.look["color"], markersize=5)
+    axes.set_yscale("log")
+    axes.axhline(setting["net_radius"], **DASHED)
+    style.label(axes, "", "distance [m]", "Net to next target (red: net's radius)")
+
+
+def _word(row: Row) -> str:
+    num = row["num_caught"]
+    farthest = 1e3 * max(row["net_distance"][:num])
+    return f"{num} caught by {row['catch_times'][num - 1]:.2f} s, {farthest:.3g} mm off at most"

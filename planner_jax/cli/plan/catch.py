@@ -6,8 +6,8 @@ from jaxtyping import PyTree
 
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
-from planner_jax.sweep.catch.settings import SingleCatchSettings
-from planner_jax.sweep.single import Answer, Margin, Single
+from planner_jax.cli.plan.answer import Answer, Margin, Single
+from planner_jax.cli.plan.settings import SingleCatchSettings
 from planner_jax.task.catch.case import GRAVITY
 
 

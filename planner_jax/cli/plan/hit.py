@@ -3,8 +3,8 @@
 import numpy as np
 from jaxtyping import PyTree
 
-from planner_jax.sweep.hit.settings import SingleHitSettings
-from planner_jax.sweep.single import Answer, Margin, Single
+from planner_jax.cli.plan.answer import Answer, Margin, Single
+from planner_jax.cli.plan.settings import SingleHitSettings
 
 
 class SingleHit(Single[SingleHitSettings]):

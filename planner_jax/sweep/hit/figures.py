@@ -1,4 +1,4 @@
-"""The court from above and from the side, with serves, plans, returned balls and failures."""
+"""Figures of a hit run: the court, one case in space, and one plan along its time."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,9 +8,10 @@ from matplotlib.patches import Rectangle
 
 from planner_jax.runs import style
 from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.style import Look
+from planner_jax.sweep.figures import DASHED, FORBIDDEN, Drawn, quadrotor_figure
 from planner_jax.sweep.quadrotor import sample_motion
-from planner_jax.sweep.report import RunRows
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import fly, landing
 
@@ -131,3 +132,33 @@ def path_figure(figure: Figure, run: RunRows) -> None:
     style.label(above, "", "y [m]", f"From above ({end})")
     words = "orange: ball, blue: quadrotor, green: returned ball, ring: target; red: what fails"
     style.label(side, "x [m]", "z [m]", f"From the side ({words})")
+
+
+_PANELS = ("speed", "acceleration", "body_rate", "thrust")
+
+
+def motion_figure(figure: Figure, run: RunRows) -> None:
+    """Draw height, speed, acceleration, body rate and thrust of plans for the same serve."""
+    quadrotor_figure(figure, run, _PANELS, _draw_heights, _word)
+
+
+def _word(row: Row) -> str:
+    return f"lands {1e3 * row['landing_error']:.2g} mm from the target"
+
+
+def _draw_heights(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
+    """Draw height of the quadrotor, and of the ball down to the floor as if nobody hit it."""
+    row, physics = plans[-1].row, (setting["drag"], setting["gravity"])
+    pos, vel = np.array(row["ball_pos"]), np.array(row["ball_vel"])
+    time, path = ball_path(pos, vel, float(landing(pos, vel, *physics)[0]), *physics)
+    look: Look = {"color": style.INK, "linewidth": 1.2, "linestyle": ":"}
+    axes.plot(time, path[:, 2], label="ball, if nobody hits it", **look)
+    axes.legend(loc="upper right", fontsize=8.5)
+    for plan in plans:
+        plan.draw(axes, lambda motion: motion.pos[:, 2])
+        end = (plan.motion.time[-1], plan.motion.pos[-1, 2])
+        axes.plot(*end, "o", color=plan.look["color"], markersize=5)
+    axes.axhline(setting["min_height"], **DASHED)
+    axes.axhspan(0.0, setting["min_height"], **FORBIDDEN)
+    axes.set_ylim(bottom=0.0)
+    style.label(axes, "", "height z [m]", "Propeller plane and ball")

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from planner_jax.cli.plan.settings import SingleSettings
 from planner_jax.core.errors import CaseError
 from planner_jax.core.protocol import Status
 from planner_jax.core.registry import Task
@@ -18,13 +19,11 @@ from planner_jax.referee.rotors import rotor_thrusts
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.columns import RefereedBatch, rows_of
 from planner_jax.runs.manifest import Row
-from planner_jax.runs.run_folder import RunFolder
+from planner_jax.runs.run_folder import RunFolder, RunRows
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.style import draw
 from planner_jax.runs.table import align
 from planner_jax.sweep.quadrotor import SampledMotion, body_rate, net_thrust, sample_motion
-from planner_jax.sweep.quadrotor_settings import SingleSettings
-from planner_jax.sweep.report import RunRows
 from planner_jax.sweep.sweep import sweep_of
 
 SingleT = TypeVar("SingleT", bound=SingleSettings)

@@ -15,15 +15,21 @@ from planner_jax.baselines.block.library.coverage import Coverage, check, covera
 from planner_jax.baselines.block.library.file import load_library, save_library
 from planner_jax.baselines.block.library.table import Library, Setting, fingerprint
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.choices import require, require_memory, require_one_of, require_seed
+from planner_jax.core.choices import (
+    require,
+    require_memory,
+    require_one_of,
+    require_seed,
+    require_size,
+)
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600, read_arm
 from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import require_count
-from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.task.block.scene import Box, paper_scene
+
+_CASE_BYTES = 60_000  # memory that a ball takes while motions for it are refereed
 
 
 def build_library(
@@ -90,9 +96,9 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
     """Let the referee judge the motions for random balls, so many for each home."""
-    require_count("num", num, 1)
+    require_size("num", num)
     require_seed(seed)
-    require_memory("num", num, BlockSettings.CASE_BYTES)
+    require_memory("num", num, _CASE_BYTES)
     library = load_library(path)
     require_backend()
     for home in range(len(library.table.homes)):

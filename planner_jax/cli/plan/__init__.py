@@ -1,0 +1,1 @@
+"""The command `plan`: one case in a few numbers, planned and refereed."""

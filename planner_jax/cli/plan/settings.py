@@ -1,0 +1,149 @@
+"""Settings of the command `plan` of each task.
+
+Nothing here imports JAX, so that a command's help is quick.
+"""
+
+import dataclasses
+import math
+from typing import ClassVar
+
+from planner_jax.core.choices import require
+from planner_jax.core.registry import Task, split_name
+from planner_jax.runs.manifest import Entries
+from planner_jax.runs.settings import option, recovery_option, recovery_options, require_recovery
+from planner_jax.sweep.quadrotor_settings import checked_robot, robot_option
+from planner_jax.task.catch.spec import DECISIONS, TRAINED
+from planner_jax.task.hit.spec import DRAG
+
+_OWN = "(default: the robot's)"
+_MOST_BALLS = 6  # all orders of these are tried
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleSettings:
+    """What the single cases of all quadrotor tasks have; a task's own class adds its own.
+
+    A field of several numbers has as many words in its `metavar`.
+
+    Raises:
+        ArgumentError: a value breaks a rule.
+    """
+
+    planner: str | None = option(None, "NAME", "")  # None: the task's first
+    start: tuple[float, ...] | None = option(None, "X Y Z", "where the quadrotor hovers [m]")
+    speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
+    body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
+    min_thrust: float | None = option(None, "A", f"least thrust over mass [m/s^2] {_OWN}")
+    max_thrust: float | None = option(None, "A", f"greatest thrust over mass [m/s^2] {_OWN}")
+    min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
+    gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
+    robot: object = robot_option("the task's")
+    recovery: str = recovery_option("brake")  # its setpoints leave for a controller
+
+    RUN: ClassVar[str]  # what answers, "module:Class"
+    PLANNER: ClassVar[tuple[str, ...]] = ()  # names of the settings that are the planner's options
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # of those that are no argument of the task's `case`
+    TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
+        require_recovery(self.recovery)
+        for field in dataclasses.fields(self):
+            value = vars(self)[field.name]
+            if isinstance(value, list):  # as a parser has it
+                value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
+                object.__setattr__(self, field.name, value)
+            for number in _numbers(value):
+                # Only a thrust may have no bound.
+                sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
+                require(sound, field.name, "finite", f"{number:g}")
+
+    def of(self, task: Task) -> "SingleSettings":
+        """Return the same with the name of the task's planner filled in, or checked.
+
+        Raises:
+            ArgumentError: the task has no planner of the name.
+        """
+        name = next(iter(task.all_planners())) if self.planner is None else self.planner
+        task.split_planner(name)
+        return dataclasses.replace(self, planner=name)
+
+    def planner_options(self) -> Entries:
+        """Return options of the planner that these settings decide."""
+        own = {name: vars(self)[name] for name in self.PLANNER}
+        return own | recovery_options(self.recovery)
+
+    def case_options(self) -> Entries:
+        """Named arguments of the task's `case` that are given."""
+        apart = {"planner", "recovery", *self.PLANNER, *self.ELSEWHERE}
+        given = vars(self).items()
+        return {name: value for name, value in given if value is not None and name not in apart}
+
+
+def _numbers(value: object) -> list[float]:
+    if isinstance(value, tuple):
+        return [number for each in value for number in _numbers(each)]
+    return [value] if isinstance(value, float) else []
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleHitSettings(SingleSettings):
+    """A ball, a target, and what may be other than in the paper."""
+
+    pos: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m]")
+    vel: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m/s]")
+    target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "where it is to land [m]")
+    acceleration: float | None = option(None, "A", "greatest [m/s^2] (default: the robot's)")
+    hitting_speed: tuple[float, ...] | None = option(
+        None, "X Y Z", "greatest at the impact, by axis [m/s] (default: 4 3 4)"
+    )
+    min_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 2.2)")
+    max_apex: float | None = option(None, "Z", "of the returned ball [m] (default: 6.2)")
+    restitution: float | None = option(None, "B", "of the racket (default: the robot's)")
+    drag: float | None = option(None, "K", f"of the ball, quadratic [1/m] (default: {DRAG})")
+
+    TOOL: ClassVar[str] = "racket"
+    RUN: ClassVar[str] = "planner_jax.cli.plan.hit:SingleHit"
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "target")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class SingleCatchSettings(SingleSettings):
+    """One ball by `pos` and `vel`, or any number of `balls`, and until when."""
+
+    pos: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m]")
+    vel: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m/s]")
+    ball: tuple[tuple[float, ...], ...] = option(
+        (), "X Y Z VX VY VZ", "place and velocity of a ball now; once for each of several"
+    )
+    horizon: float = option(dataclasses.MISSING, "S", "until when to catch [s]")
+    drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
+    net_height: float | None = option(None, "L", "over the propellers [m] (default: the robot's)")
+    net_radius: float | None = option(None, "R", "of the hoop [m] (default: the robot's)")
+    max_angle: float | None = option(
+        None, "A", "between the net's axis and a ball's way back [rad] (default: the robot's)"
+    )
+    decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
+
+    TOOL: ClassVar[str] = "net"
+    RUN: ClassVar[str] = "planner_jax.cli.plan.catch:SingleCatch"
+    PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ("pos", "vel", "ball", "horizon", "drag")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("pos", "vel"):
+            given = vars(self)[name] is not None
+            rule = "left out beside --ball" if self.ball else "given, or --ball"
+            require(given != bool(self.ball), name, rule, shown="both" if given else "nothing")
+        num = len(self.ball)
+        require(num <= _MOST_BALLS, "ball", f"given at most {_MOST_BALLS} times", num)
+        require(self.drag is None or self.drag >= 0.0, "drag", ">= 0", self.drag)
+        split_name(DECISIONS, "decide", self.decide, TRAINED)
+
+    @property
+    def balls(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
+        """Place and velocity of every ball."""
+        if self.pos is not None and self.vel is not None:
+            return [(self.pos, self.vel)]
+        return [(ball[:3], ball[3:]) for ball in self.ball]
