@@ -46,8 +46,8 @@ from planner_jax.trajectory.polynomial import snap_energy
 # By task: the suite, and the module that writes its problem down.
 TASKS = {"hit": ("court", "hits"), "catch": ("throws", "catches")}
 BATCH, GPU_BATCH = 1024, 65536
-# What the batched interior-point solver jaxipm has over IPOPT at most: Viljoen et al., "Scaling
-# nonlinear optimization: many problems, one GPU" (arXiv 2606.26341), quadrotors on one L40S.
+# What the batched interior-point solver jaxipm has over IPOPT at most: [Viljoen2026], quadrotors on
+# one L40S.
 JAXIPM = 32.85
 TIGHTEST = 1e-6  # tolerance of the searches whose iterates are looked at
 NO_MORE = 1e-4  # relative, by which a cost may be above another one and still counts as no more
@@ -94,7 +94,7 @@ class Setup:
             self.batches = {}
             told = peer.told_of(self.module, self.planner, self.contexts)
             for label, learned in (("learned", True), ("smooth", False)):
-                planner = self.planner.with_settings((("learned", learned),))
+                planner = self.planner.changed((("learned", learned),))
                 first = lambda context, planner=planner: planner.guesses(context, 1)[0]  # noqa: E731
                 starts = np.asarray(jax.jit(jax.vmap(first))(self.contexts))
                 self.batches[label] = peer.Batch(told, starts)

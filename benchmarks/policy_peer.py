@@ -151,7 +151,7 @@ def train_own(suite: str, decisions: int, seed: int) -> Any:
             decisions,
             seed,
             network="mlp",
-            num_envs=LANES,
+            lanes=LANES,
             minibatches=MINIBATCHES,
             updates=PASSES,
         )

@@ -35,7 +35,7 @@ def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
 def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """The pose (4, 4) that takes points (M, 3) [m] nearest to others (M, 3) [m].
 
-    In closed form by a singular value decomposition (W. Kabsch, 1976), never a mirror image.
+    In closed form by a singular value decomposition [Kabsch1976], never a mirror image.
 
     Raises:
         ValueError: fewer than three points, or all on one line; one line.
@@ -59,8 +59,8 @@ def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
     """The pose X (4, 4) of the camera that solves A X = X B over every pair of views.
 
     The rotation is that which best takes the rotation vectors of the camera's motions to those of
-    the robot's, by a singular value decomposition as in F. C. Park and B. J. Martin, Robot sensor
-    calibration (1994); the place then follows from linear least squares.
+    the robot's, by a singular value decomposition as in [Park1994]; the place then follows from
+    linear least squares.
 
     Args:
         flange: (K, 4, 4) A_k, poses of the flange in the base frame, K >= 3.

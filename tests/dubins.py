@@ -1,9 +1,9 @@
 """The shortest path of a car that only drives forward and has a greatest curvature.
 
 It is the shortest of Dubins's six words: three arcs, or an arc, a straight line and an arc, at the
-greatest curvature (L. E. Dubins, 1957). The lengths are closed forms (A. M. Shkel and V. Lumelsky,
-Classification of the Dubins set, 2001), computed for all six words at once, so that a batch needs
-no branches. World frame in the plane, SI units, headings counter-clockwise from the x axis.
+greatest curvature [Dubins1957]. The lengths are closed forms [Shkel2001], computed for all six
+words at once, so that a batch needs no branches. World frame in the plane, SI units, headings
+counter-clockwise from the x axis.
 """
 
 import jax

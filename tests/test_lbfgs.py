@@ -54,7 +54,7 @@ def test_final_cost_is_as_low_as_scipys(float64):
 
 
 def two_loop_by_the_book(steps, changes, grad):
-    """Nocedal and Wright, algorithm 7.4, written out for lists of pairs, oldest first."""
+    """[Nocedal2006, algorithm 7.4] written out for lists of pairs, oldest first."""
     q, alphas = grad.copy(), []
     for s, y in zip(reversed(steps), reversed(changes), strict=True):
         alphas.append(s @ q / (y @ s))

@@ -2,6 +2,7 @@
 
 import re
 import subprocess
+import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -21,7 +22,8 @@ def cited_keys() -> dict[str, str]:
     return {
         key: name
         for name in names
-        for key in re.findall(rf"\[({KEY})(?=[\],;])", (ROOT / name).read_text())
+        for cited in re.findall(rf"\[{KEY}[^\[\]]*\]", (ROOT / name).read_text())
+        for key in re.findall(KEY, cited)
     }
 
 
@@ -41,3 +43,8 @@ def test_no_text_cites_a_paper_by_a_private_number() -> None:
         check=False,
     )
     assert not found.stdout
+
+
+def test_the_page_of_equations_follows_the_citations_in_the_code() -> None:
+    stale = subprocess.run([sys.executable, "-m", "tests.citations"], cwd=ROOT, check=False)
+    assert not stale.returncode, "run python -m tests.citations --write"

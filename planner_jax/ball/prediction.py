@@ -1,7 +1,7 @@
 """Where the ball will be: an integrated state table, smoothed by cubic convolution.
 
 [Yu2023bat, Section III-C] (eqs 8-10): the flight is integrated once into a table of states,
-and Keys' kernel (a = -1/2) reads it at any time with a continuous gradient.
+and Keys' kernel (a = -1/2) [Keys1981] reads it at any time with a continuous gradient.
 """
 
 import functools

@@ -159,8 +159,13 @@ def require_rule(
 ) -> None:
     """Raise `CaseError` for the first case that breaks a rule.
 
-    `value` and `holds` have the shape batch + shape, `words` states the rule, and `other` is the
-    name of the array with which the value is compared.
+    Args:
+        name: name of the value, for the message.
+        value: batch + shape.
+        holds: batch + shape, bool, where the rule holds.
+        words: the rule in words.
+        batch: () or (B,).
+        other: name of the array with which the value is compared.
     """
     broken = ~np.asarray(holds)
     if not broken.any():
@@ -174,9 +179,11 @@ def require_rule(
 
 
 def require_shapes(cases: PyTree) -> None:
-    """Raise `ArgumentError` unless every array has the shape and kind of numbers of its field.
+    """Raise unless every array, traced or not, has the shape and kind of numbers of its field.
 
-    Arrays may be traced.
+    Raises:
+        ValueError: another shape; one line with the field and both shapes.
+        TypeError: another kind of numbers.
     """
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
@@ -229,7 +236,11 @@ _KINDS = {
 
 
 def is_sound(cases: PyTree) -> PyTree:
-    """Return whether every number of each case keeps its rules, bool of the batch shape; pure."""
+    """Return whether every number of each case keeps its rules; pure.
+
+    Returns:
+        Bool of the batch shape, a jax array if the cases hold one.
+    """
     batch = cases.batch_shape
     held = [ruled.holds() for ruled in all_ruled(cases)]
     # Joined before the reduction: one loop of a compiled program instead of one for each array.

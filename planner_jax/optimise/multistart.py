@@ -1,4 +1,4 @@
-"""The iteration of the solver, for one case and several starts, or for a batch of cases."""
+"""The loop around the solver, for one case and several starts."""
 
 import dataclasses
 import functools
@@ -31,15 +31,15 @@ from planner_jax.optimise.settings import (
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import OptimisedPlanner
 
-# Up to this number iterations are counted, which spares a GPU the test for the end.
+# So few iterations are counted, so that a GPU need not tell the host whether to go on.
 _COUNTED = 16
 
 
 @struct.dataclass
 class Optimum:
-    """The result of the search of one lane."""
+    """Where one lane ended."""
 
-    point: Array  # (n,), the best feasible iterate, or the iterate of least violation
+    point: Array  # (n,), the best feasible iterate, or the least infeasible one
     evaluation: Evaluation
     iterations: Array  # () int32
     stationary: Array  # () bool
@@ -48,9 +48,13 @@ class Optimum:
 def minimise(
     objective: Objective, start: Array, config: Solver, curved: Curved | None = None
 ) -> Optimum:
-    """Minimise from one start (n,) until stationary or out of iterations.
+    """Minimise from one start until stationary or out of iterations.
 
-    `curved` returns derivatives for Newton's method, if there is a faster function than products.
+    Args:
+        objective: of a point (n,).
+        start: (n,).
+        config: the method's sizes and switches, static.
+        curved: what `NewtonConfig` takes, where there is a quicker one than products of its own.
     """
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
@@ -58,7 +62,7 @@ def minimise(
         config = _with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
     state = _method(config).init(start, config)
-    if config.max_steps == 1:  # without a loop, so that XLA can fuse across the iteration
+    if config.max_steps == 1:  # without a loop, around which nothing would be joined
         return _optimum_of(step(state), config)
     state = lax.while_loop(lambda s: _method(config).is_unfinished(s.numbers, config), step, state)
     return _optimum_of(state, config)
@@ -73,18 +77,25 @@ def minimise_lanes(
 ) -> Optimum:
     """Minimise on many lanes, each with its own start and context.
 
-    The starts are (n, B), and the contexts and the optima have the lanes last on every leaf.
-    `objective` and `curved` take one point and one context.
+    Args:
+        objective: of one point (n,) and one context.
+        starts: (n, B).
+        contexts: a pytree, the lanes last on every leaf.
+        config: the method's sizes and switches, static.
+        curved: as for `minimise`, of one point and one context.
+
+    Returns:
+        The optima, with the lanes last on every leaf.
     """
     if config.max_steps == 0:
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
-    def search(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
+    def searched(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
         @over_lanes
         def step(state: PyTree, context: PyTree) -> PyTree:
-            by_point = curved and (lambda x: curved(x, context))
-            return _step(lambda x: objective(x, context), by_point, state, config)
+            of_point = curved and functools.partial(_given, curved, context)
+            return _step(lambda x: objective(x, context), of_point, state, config)
 
         if steps <= _COUNTED:
             return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
@@ -95,32 +106,38 @@ def minimise_lanes(
         )
 
     state = over_lanes(lambda start: _method(config).init(start, config))(starts)
-    state = search(state, contexts, config, config.max_steps)
+    state = searched(state, contexts, config, config.max_steps)
     if isinstance(config, NewtonConfig) and config.stragglers is not None:
         newton, (share, steps, groups) = _method(config), config.stragglers
         longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
 
-        def next_group(progress: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
-            number, state = progress
+        def next_group(made: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
+            number, state = made
             lanes = newton.most_to_gain(state.numbers, longer, num)
-            some, own = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
-            later = search(some, own, longer, steps)
+            some, given = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
+            later = searched(some, given, longer, steps)
             place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
             return number + 1, jax.tree.map(place, state, later)
 
-        def is_open(progress: tuple[Array, PyTree]) -> Array:
-            number, state = progress
+        def is_open(made: tuple[Array, PyTree]) -> Array:
+            number, state = made
             return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, longer))
 
         _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return _optimum_of(state, config)
 
 
+def _given(
+    curved: Callable[[Array, PyTree], Curvature], context: PyTree, point: Array
+) -> Curvature:
+    return curved(point, context)
+
+
 def _method(config: Solver) -> ModuleType:
     """Return the module of a method."""
     if isinstance(config, LbfgsConfig):
         return lbfgs
-    from planner_jax.optimise import newton  # only planners that search for low costs need it
+    from planner_jax.optimise import newton  # only planners that search for low costs take it
 
     return newton
 
@@ -133,7 +150,7 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Return the settings with the number of iterations that a straggler may take."""
+    """Return the settings with the iterations of a straggler."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -158,10 +175,17 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
     """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
 
-    The plan of the best start has its `status` and `iterations` set. For a batch `solve_batch` is
-    faster.
+    For a batch `solve_batch` is quicker.
+
+    Args:
+        planner: the problem; what it has of arrays is shared by all lanes.
+        attempt: how many starts and iterations.
+        case: one case.
+
+    Returns:
+        The planner's plan of the best start, its `status` and `iterations` set.
     """
-    last = planner.with_settings(attempt.settings)
+    last = planner.changed(attempt.settings)
     context = last.prepare(case)
 
     def search(problem: "OptimisedPlanner", solver: Solver, start: Array) -> Optimum:
@@ -169,15 +193,15 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
             lambda x: problem.objective(x, context),
             start,
             solver,
-            lambda x: problem.curvature_at(x, context),
+            lambda x: problem.curved(x, context),
         )
 
-    before = planner.with_settings(_stages(attempt)[0].settings)
+    before = planner.changed(_stages(attempt)[0].settings)
     points = before.guesses(context, attempt.starts)
     spent = jnp.zeros(len(points), jnp.int32)
     optimum = None
     for stage in _stages(attempt):
-        problem = planner.with_settings(stage.settings)
+        problem = planner.changed(stage.settings)
         points = _of_each(functools.partial(problem.convert_point, before=before), points)
         optimum = _of_each(functools.partial(search, problem, stage.solver), points)
         before = problem
@@ -192,31 +216,38 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases with one round's starts and iterations; pure."""
-    last, num = planner.with_settings(attempt.settings), attempt.starts
+    """Plan a batch of cases with one round's starts and iterations; pure.
+
+    Args:
+        planner: the problem; what it has of arrays is shared by all lanes.
+        attempt: how many starts and iterations.
+        cases: B of them, a leading axis on every leaf.
+
+    Returns:
+        The plans, with a leading axis on every leaf.
+    """
+    last, num = planner.changed(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
     contexts = over_lanes(last.prepare)(lanes)
-    before = planner.with_settings(_stages(attempt)[0].settings)
+    before = planner.changed(_stages(attempt)[0].settings)
     starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
     # A lane of the solver is one start of one case; the starts of a case are neighbours.
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
-    of_starts = _repeat(contexts, num)
+    of_starts = _repeated(contexts, num)
     spent = jnp.zeros(points.shape[1:], jnp.int32)
     optimum = None
     for stage in _stages(attempt):
-        problem = planner.with_settings(stage.settings)
+        problem = planner.changed(stage.settings)
         points = over_lanes(functools.partial(problem.convert_point, before=before))(points)
         before = problem
-        optimum = minimise_lanes(
-            problem.objective, points, of_starts, stage.solver, problem.curvature_at
-        )
+        optimum = minimise_lanes(problem.objective, points, of_starts, stage.solver, problem.curved)
         points, spent = optimum.point, spent + optimum.iterations
         if stage.keep is not None:
             costs = optimum.evaluation.cost.reshape(-1, num)
             kept = jax.vmap(functools.partial(_cheapest, num=stage.keep))(costs)
             kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
             points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
-            of_starts = _repeat(contexts, num)
+            of_starts = _repeated(contexts, num)
     assert optimum is not None  # a round has a stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
@@ -228,7 +259,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches in order; the last one is the search of the round itself."""
+    """Return the searches in their order; the last is the search of the round itself."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
@@ -239,7 +270,7 @@ def _of_each(function: Callable, starts: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
 
 
-def _repeat(contexts: PyTree, num: int) -> PyTree:
+def _repeated(contexts: PyTree, num: int) -> PyTree:
     """Return the context of every start: the context of each case `num` times."""
     if num == 1:
         return contexts
@@ -247,7 +278,7 @@ def _repeat(contexts: PyTree, num: int) -> PyTree:
 
 
 def _cheapest(costs: Array, num: int) -> Array:
-    """Return the indices (num,) of the least of costs (S,); non-finite costs come last."""
+    """Return the indices (num,) of the least of costs (S,); costs that are not finite come last."""
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 

@@ -7,7 +7,7 @@ plan's own claims (status, cost, stroke) are not trusted; only its impact time i
 frame, z up, ground at z = 0, SI units.
 
 [Yu2023bat] is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
-rates are those of the Hopf fibration at zero heading (Watterson and Kumar).
+rates are those of the Hopf fibration at zero heading [Watterson2020].
 """
 
 import dataclasses

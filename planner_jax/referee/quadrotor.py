@@ -1,8 +1,8 @@
 """Tests of a quadrotor's trajectory in float64: motion, peaks, head state, joints, rest.
 
 No code is shared with the planners but the case's own extra limits (`referee.extras`). Polynomial
-pieces are sampled; attitude and body rate come from flatness (the Hopf fibration at zero heading;
-Watterson and Kumar). World frame, z up, SI units.
+pieces are sampled; attitude and body rate come from flatness (the Hopf fibration at zero heading
+[Watterson2020]). World frame, z up, SI units.
 """
 
 import dataclasses

@@ -1,7 +1,6 @@
 """Inverse kinematics in closed form, for arms that are ortho-parallel with a spherical wrist.
 
-Brandstoetter, Angerer and Hofbaur, "An analytical solution of the inverse kinematics problem of
-industrial serial manipulators with an ortho-parallel basis and a spherical wrist" (2014): axis 2
+After [Brandstoetter2014]: axis 2
 is perpendicular to axis 1, axis 3 parallel to axis 2. Axes 4, 5 and 6 meet in one point, the wrist
 centre, each perpendicular to the next. The paper's seven lengths a1, a2, b, c1, c2, c3, c4 are
 computed from the frames of an `Arm`, whose origins and senses of rotation are arbitrary.

@@ -1,8 +1,7 @@
 """A quadrotor: limits, differential flatness [Yu2023bat, eq. 1], bounds on reach, and plans.
 
 The body z axis follows the net thrust  tau = a + g e_3  (per unit mass). With the heading
-held at zero, the Hopf fibration gives the body rates from tau and the jerk alone
-(Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)").
+held at zero, the Hopf fibration gives the body rates from tau and the jerk alone [Watterson2020].
 """
 
 import dataclasses

@@ -23,9 +23,8 @@ from planner_jax.robot.quadrotor_model import (
 )
 
 # Mass and diagonal: the manufacturer's data sheet (27 g; 92 mm from motor to motor). Inertia, drag
-# torque and greatest thrust: J. Foerster, "System Identification of the Crazyflie 2.0 Nano
-# Quadrocopter", ETH Zurich 2015. Lag and tool are assumptions. The tool is a net, since a racket
-# would weigh about as much as the robot.
+# torque and greatest thrust: [Foerster2015]. Lag and tool are assumptions. The tool is a net, since
+# a racket would weigh about as much as the robot.
 CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
@@ -37,10 +36,10 @@ CRAZYFLIE = QuadrotorModel(
     "drag torque); lag, net and limits assumed",
 )
 
-# Mass and static thrust (870 g, 35 N): E. Kaufmann et al., "Champion-level drone racing using deep
-# reinforcement learning", Nature 620, 2023, whose frame has propellers of 6 inches. The diagonal is
-# usual for such frames: 330 mm. Inertia is an assumption: 60 g of motor and propeller at the end
-# of each arm, the remainder within 4 cm of the centre. So are drag torque, lag and tools.
+# Mass and static thrust (870 g, 35 N): [Kaufmann2023], whose frame has propellers of 6 inches. The
+# diagonal is usual for such frames: 330 mm. Inertia is an assumption: 60 g of motor and propeller
+# at the end of each arm, the remainder within 4 cm of the centre. So are drag torque, lag and
+# tools.
 RACER = QuadrotorModel(
     name="racer",
     mass=0.87,

@@ -11,7 +11,7 @@ from planner_jax.runs.manifest import Entries
 
 
 def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """Return the 95 % interval of a success rate after Wilson (1927).
+    """Return the 95 % interval of a success rate [Wilson1927].
 
     Args:
         successes: how many trials succeeded.

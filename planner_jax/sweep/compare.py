@@ -115,9 +115,9 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     """Return how much more often a run succeeds than the first one.
 
     Of the same cases only those count that one run alone solves: given how many these are, either
-    run is as likely to have each of them if neither is better (McNemar's test, exact), and the
-    interval is Clopper and Pearson's for its share of them. Of other cases the interval is
-    Newcombe's, from Wilson's of both rates.
+    run is as likely to have each of them if neither is better (the exact test of [McNemar1947]),
+    and the interval is of [Clopper1934] for its share of them. Of other cases the interval is of
+    [Newcombe1998], from both intervals of [Wilson1927].
     """
     change = other.rate - first.rate
     if other_cases(first, other):

@@ -1,8 +1,8 @@
 """MINCO with piece durations in fixed proportion: constant matrices in normalised time.
 
-MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints ([Yu2023bat,
-eq. 19]; Wang, Zhou, Xu, Gao, "Geometrically Constrained Trajectory Optimization for
-Multicopters"). It has degree 2s - 1 on every piece and is 2s - 2 times differentiable.
+MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints
+[Wang2022; Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times
+differentiable.
 
 Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that
 h = T / M. One constant matrix in time over h then maps the boundary rows and the waypoints to the

@@ -104,8 +104,8 @@ def select(
     Every turn rate gets its probability by Bayes, with the prior for turns and none for place and
     velocity, by quadrature along the rate. The path is that of the median rate, which is zero
     unless the target turns to one side rather than not: a weak turn is taken for less than it
-    looks, and the path does not jump as observations change (posterior median thresholding,
-    Johnstone and Silverman, Ann. Statist. 32, 2004). With a threshold a test chooses instead
+    looks, and the path does not jump as observations change (posterior median thresholding
+    [Johnstone2004]). With a threshold a test chooses instead
     between the line and the turn of least squares. What the prediction says about its error is
     the same for both: all rates at their probabilities, zero among them.
 

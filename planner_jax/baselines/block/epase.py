@@ -5,7 +5,7 @@ joint, either way, and straight to the goal, which is tried first. States within
 count as one state. The heuristic is the distance to the goal in the space of the joints, the cost
 the length of the path there.
 
-ePA*SE (Mukherjee, Aine and Likhachev 2022) evaluates edges in parallel, on 64 cores in the paper;
+ePA*SE [Mukherjee2022] evaluates edges in parallel, on 64 cores in the paper;
 without its threads it is this search. Here all edges of a state are evaluated in one batch, by one
 thread. Where the paper's code stops within 0.1 rad of the goal, a path here ends at the goal.
 """

@@ -1,8 +1,7 @@
 """The quickest motion of the joints along a way, by TOPP-RA.
 
-Pham and Pham, "A new approach to time-optimal path parameterization based on reachability
-analysis" (2018), the package `toppra`: [Natarajan2024] times the ways of its baselines with it. A
-cubic spline leads through the way's points, and the arm begins and ends at rest.
+The method of [Pham2018], by the package `toppra`: [Natarajan2024] times the ways of its baselines
+with it. A cubic spline leads through the way's points, and the arm begins and ends at rest.
 """
 
 import importlib

@@ -1,8 +1,7 @@
 """The baseline `rrt-connect` of [Natarajan2024]: RRT-Connect by OMPL, timed by TOPP-RA; one thread.
 
-Kuffner and LaValle, "RRT-Connect: An efficient approach to single-query path planning" (2000). A
-tree grows from either end by edges of up to `reach`, the length that the code behind the paper
-has. Edges are looked at in one batch each.
+The method of [Kuffner2000]. A tree grows from either end by edges of up to `reach`, the length that
+the code behind the paper has. Edges are looked at in one batch each.
 """
 
 import dataclasses

@@ -88,10 +88,10 @@ class MppCatch(Planner):
 
     What is taken from where:
 
-    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of Mueller, Hehn, D'Andrea
-      2015 (its ref. [1]) to a catch whose height is fixed by hand, below 2 m, so that the
-      target's fall gives time and place; velocity and acceleration there are sampled and the
-      primitive of least mean squared jerk is kept; limits are only looked at afterwards.
+    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of [Mueller2015] to a catch
+      whose height is fixed by hand, below 2 m, so that the target's fall gives time and place;
+      velocity and acceleration there are sampled and the primitive of least mean squared jerk is
+      kept; limits are only looked at afterwards.
     - Eq. 22: the net's centre at the target. Eq. 25, as the end state is the one thing that
       the paper has this planner check: every sampled acceleration has the net face the target.
     - Assumed, as the paper gives none of it: the height, 1.2 m, about that of the net in

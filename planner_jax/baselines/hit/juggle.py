@@ -9,10 +9,11 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
-from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
+from planner_jax.baselines.hit.common import largest_violation, make_impact
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
+from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
@@ -59,10 +60,10 @@ class JuggleHit(Planner):
 
     The "Juggle" of [Yu2023bat]. What is taken from where:
 
-    - Mueller, Lupashin, D'Andrea 2011 (its ref. [7]) and Dong et al. 2015 ([8]): the ball is
+    - [Mueller2011] and [Dong2015]: the ball is
       met where it falls through a fixed height; the returned ball rises to a fixed apex;
       two components of the racket's velocity are fixed and the third follows from the impact.
-    - Mueller, Hehn, D'Andrea 2015 ([9]): the primitive of least jerk to that state.
+    - [Mueller2015]: the primitive of least jerk to that state.
     - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the
       primitive), and its tau_z = 1.1 g at the impact.
     - The published trials: v_x = v_y = 0 in every recorded hit; the quadrotor at 1.43 to

@@ -81,8 +81,7 @@ def words_to_point(x, y, lengths):
 def length_to_point(x, y):
     """Return the least length to a point with any heading: CS or, inside of a circle, CC.
 
-    The shortest paths to a point are of these kinds (X.-N. Bui, J.-D. Boissonnat, P. Soueres and
-    J.-P. Laumond, Shortest path synthesis for Dubins non-holonomic robot, ICRA 1994).
+    The shortest paths to a point are of these kinds [Bui1994].
     """
     y = abs(y)
     best = np.inf

@@ -1,8 +1,7 @@
 """Hybrid A*: a way for a car that only drives forward, among polygons that stand.
 
 A search over cells of place and heading, with one continuous state a cell, along arcs that the car
-can drive (D. Dolgov, S. Thrun, M. Montemerlo and J. Diebel, Practical search techniques in path
-planning for autonomous driving, 2008). It is the first half of [Qu2022]'s path planning (Section
+can drive [Dolgov2008]. It is the first half of [Qu2022]'s path planning (Section
 III-B). Shots, free Dubins ways from a node to the goal, are tried the more often, the nearer the
 goal is; the cheapest one ends the search once nothing that is left can be cheaper, where the paper
 takes the first. Unlike the rest of `plane` it runs on the host, one search at a time; its loops are
@@ -35,7 +34,7 @@ class HybridAstar:
     cell: float = 0.1  # [m], side of a cell
     headings: int = 72  # bins of a turn
     turn_price: float = 0.05  # of a metre at the tightest curvature, in metres
-    # By how much, relative, the heuristic is stretched (weighted A*, I. Pohl, 1970), and so how far
+    # By how much, relative, the heuristic is stretched (weighted A* [Pohl1970]), and so how far
     # the cost may be above the least on the lattice.
     slack: float = 0.1
     margin: float = 0.01  # [m], from polygons, for what lies between samples and nodes

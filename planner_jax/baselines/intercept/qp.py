@@ -5,8 +5,7 @@
 with Q, E and R constant, e, lower and upper free. All that depends on the matrices is done once, in
 double precision on the host: x = base e + Z y with Z' Q Z = 1 leaves the point y of least length
 between pairs of parallel planes. From y = 0, the optimum without bounds, the dual method of
-D. Goldfarb and A. Idnani (A numerically stable dual method for solving strictly convex quadratic
-programs, Mathematical Programming 27, 1983) takes one plane after another into its working set: as
+[Goldfarb1983] takes one plane after another into its working set: as
 many steps as planes are active in the end, when none has to leave again. Its linear algebra is
 products with matrices, no factorisation, so that a batch is a batch of products.
 """

@@ -72,9 +72,9 @@ class SpeedPlanner:
     solver: QpConfig = QpConfig()
 
 
-# Tilted lines are this library's, continued `edges` the paper's. EM is the speed step of H. Fan et
-# al., Baidu Apollo EM Motion Planner, arXiv:1807.08048: bounds at samples, every 0.1 s of a horizon
-# of 10 s, from intervals that are free for a whole piece, or only at that moment.
+# Tilted lines are this library's, continued `edges` the paper's. EM is the speed step of [Fan2018]:
+# bounds at samples, every 0.1 s of a horizon of 10 s, from intervals that are free for a whole
+# piece, or only at that moment.
 SPEED_PLANNERS = {
     "trapezoid": SpeedPlanner(),
     "trapezoid-twice": SpeedPlanner(rounds=2),

@@ -103,29 +103,21 @@ class BlockSweep(Sweep[BlockSettings]):
         """Return the planner of a run; `ArgumentError` where its file is no library."""
         planner = super().planner(settings)
         if settings.perception:
-            for name in ("replan", "observe_longer"):
+            for name in ("refit", "wait"):
                 value = vars(settings)[name]
                 may = isinstance(planner, OnlineBlock) or value == 0.0
                 require(may, name, "0 for a planner other than online", value)
             own = not isinstance(planner, LibraryBlock)
             require(own, "planner", "one that plans for the very ball", settings.planner)
-            names = (
-                "observe",
-                "overhead",
-                "replan",
-                "observe_longer",
-                "noise",
-                "frame_rate",
-                "seed",
-            )
+            names = ("sense", "overhead", "refit", "wait", "noise", "frame_rate", "seed")
             return SeeingArms(planner, **{name: vars(settings)[name] for name in names})
-        if settings.planning_budget is not None:
-            return CountedPlanner(planner, settings.planning_budget)
+        if settings.count is not None:
+            return CountedPlanner(planner, settings.count)
         return planner
 
     def other_planners(self, settings: BlockSettings) -> Entries:
         """Return the task's other planners; none where a camera or a clock matters."""
-        if settings.perception or settings.planning_budget is not None:
+        if settings.perception or settings.count is not None:
             return {}
         return super().other_planners(settings)
 

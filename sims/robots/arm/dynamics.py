@@ -11,7 +11,7 @@ def inverse_dynamics(
 ) -> Array:
     """Return torques of the joints (6,) [N m] of a motion, without friction and rotors.
 
-    The forward recursion (Luh, Walker and Paul 1980) in the base frame adds to the motion of each
+    The forward recursion [Luh1980] in the base frame adds to the motion of each
     link what its joint adds; the backward one adds up the forces and moments of the links beyond
     a joint, moments about the origin of the base frame.
 

@@ -2,7 +2,7 @@
 
 [Yu2023bat, Section VI-C], and [Yu2023catch, Section VII-A]: position and velocity feedback with the
 plan's acceleration and jerk gives the wanted thrust and, at zero heading, attitude and body
-rate (Watterson and Kumar, "Control of quadrotors using the Hopf fibration on SO(3)"); the
+rate [Watterson2020]; the
 attitude's error corrects the body rate, and the body rate's error asks for a torque. What the
 rotors take up only with a lag is asked of them with that lag undone.
 
