@@ -1,8 +1,7 @@
-"""Brings pages from outside of docs/ into the site, and says where a link leads nowhere.
+"""Add pages from outside of docs/ to the site, and report links that lead nowhere.
 
-README, CONTRIBUTING, CHANGELOG and the GPU log are written to be read in the repository; here they
-become pages. A link to a file that is no page, such as a module, keeps its words and loses its
-target, after a look at whether the file is there.
+README, CONTRIBUTING, CHANGELOG and the GPU log are written for the repository; here they become
+pages. A link to a file that is no page, such as a module, becomes plain text if the file exists.
 """
 
 import logging
@@ -25,7 +24,8 @@ log = logging.getLogger("mkdocs.hooks")
 
 
 def for_site(text: str, source: str) -> str:
-    """A page of the repository, at the path `source` in it, with links as the site has them."""
+    """Rewrite the links of the page at the path `source` of the repository for the site."""
+    home = posixpath.dirname(PAGES.get(source) or source.removeprefix("docs/"))
 
     def link(found: re.Match) -> str:
         mark, words, target, anchor = found.groups()
@@ -33,7 +33,9 @@ def for_site(text: str, source: str) -> str:
         if not (ROOT / path).exists():
             log.warning("%s links to %s, which is not there", source, target)
         page = PAGES.get(path) or (path.startswith("docs/") and path.removeprefix("docs/"))
-        return f"{mark}[{words}]({page}{anchor or ''})" if page else words
+        if not page:
+            return words
+        return f"{mark}[{words}]({posixpath.relpath(page, home or '.')}{anchor or ''})"
 
     parts = _CODE.split(text)
     parts[::2] = [_LINK.sub(link, part) for part in parts[::2]]
@@ -41,7 +43,7 @@ def for_site(text: str, source: str) -> str:
 
 
 def on_files(files, config):
-    """Add the pages from outside."""
+    """Add the pages from outside of docs/."""
     for source, page in PAGES.items():
         text = for_site((ROOT / source).read_text(encoding="utf-8"), source)
         files.append(File.generated(config, page, content=text))
@@ -49,6 +51,6 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, **_):
-    """The pages of docs/."""
+    """Rewrite the links of a page of docs/."""
     inside = page.file.src_uri not in PAGES.values()
     return for_site(markdown, f"docs/{page.file.src_uri}") if inside else markdown
