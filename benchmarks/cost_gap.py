@@ -69,7 +69,7 @@ def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
 
 def to_the_optimum(planner: OptimisedPlanner) -> OptimisedPlanner:
     """The planner with the long search in the place of its rounds."""
-    return planner.changed((("rounds", (TO_THE_OPTIMUM,)),))
+    return planner.with_settings((("rounds", (TO_THE_OPTIMUM,)),))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:

@@ -27,13 +27,13 @@ from planner_jax.task.intercept.plan import InterceptPlan
 # Row -> settings that differ from the task's own.
 ROWS: dict[str, dict[str, dict[str, Any]]] = {
     "sensing": {
-        "everything known": {"known": True, "noise": "none", "latency": 0.0, "replan": 0.0},
-        "everything known, planned anew": {"known": True, "noise": "none", "latency": 0.0},
-        "target known, noise and latency": {"known": True},
+        "everything known": {"known_target": True, "noise": "none", "latency": 0.0, "replan": 0.0},
+        "everything known, planned anew": {"known_target": True, "noise": "none", "latency": 0.0},
+        "target known, noise and latency": {"known_target": True},
         "target predicted": {},
         "target predicted, never planned anew": {"replan": 0.0},
-        "ten looks a second": {"looks": 10.0},
-        "movers seen as well": {"see_movers": True},
+        "ten looks a second": {"observation_rate": 10.0},
+        "movers seen as well": {"predict_movers": True},
     },
     "replan": {f"planned anew at {rate:g} Hz": {"replan": rate} for rate in (0.0, 1.0, 2.0, 10.0)},
     "latency": {f"latency {1e3 * age:g} ms": {"latency": age} for age in (0.0, 0.05, 0.1)},
@@ -87,7 +87,7 @@ def flown(
 
     First plans depend on what was seen before the start alone: they are made once for all rows.
     """
-    task, key = settings.flight(), (settings.known, settings.see_movers, settings.noise)
+    task, key = settings.flight(), (settings.known_target, settings.predict_movers, settings.noise)
     began = time.perf_counter()
     flights = fly_intercepts(
         task.loop(),
@@ -95,8 +95,8 @@ def flown(
         settings.seed,
         replan=settings.rate,
         plan=first_plans.get(key),
-        known=settings.known,
-        see_movers=settings.see_movers,
+        known_target=settings.known_target,
+        predict_movers=settings.predict_movers,
     )
     first_plans[key] = flights.first_plan
     return flights, time.perf_counter() - began

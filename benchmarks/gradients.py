@@ -108,7 +108,7 @@ def _measure(
     def differentiated(where: Any, **more: Any) -> Any:
         return pj.gradient(planner, where, of=quantity, by=_BY[options.task], **more)
 
-    resident, optimal = jax.device_put(jax.tree.map(jnp.asarray, cases)), planner.polished()
+    resident, optimal = jax.device_put(jax.tree.map(jnp.asarray, cases)), planner.with_polish()
     seconds = _timed(
         {
             "plan": lambda: pj.plan(planner, resident),

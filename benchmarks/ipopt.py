@@ -94,7 +94,7 @@ class Setup:
             self.batches = {}
             told = peer.told_of(self.module, self.planner, self.contexts)
             for label, learned in (("learned", True), ("smooth", False)):
-                planner = self.planner.changed((("learned", learned),))
+                planner = self.planner.with_settings((("learned", learned),))
                 first = lambda context, planner=planner: planner.guesses(context, 1)[0]  # noqa: E731
                 starts = np.asarray(jax.jit(jax.vmap(first))(self.contexts))
                 self.batches[label] = peer.Batch(told, starts)

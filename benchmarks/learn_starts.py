@@ -181,7 +181,7 @@ TASKS = {
     "hard-hit": _Learnt(
         "hit/start_exact-12-supple.npz",
         hard_hits,
-        pj.hit.ExactHit(learned=False).changed(SUPPLE),
+        pj.hit.ExactHit(learned=False).with_settings(SUPPLE),
         hard_hits,
         hidden=(160, 160),
         floor=3e-5,

@@ -5,7 +5,7 @@
 
 Every hundredth case breaks a rule of its class, another rule and another bad value from one to the
 next: NaN, infinity, a number below or above what is allowed. Both batches, sound and poisoned, stay
-in jax arrays; a case of the poisoned one is mark_bad_input if its status is BAD_INPUT.
+in jax arrays; a case of the poisoned one is marked if its status is BAD_INPUT.
 """
 
 import argparse
@@ -72,7 +72,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
         same &= alike.reshape(num, -1).all(axis=1)
     return {
         "poisoned": lanes.size,
-        "mark_bad_input": int((found.status[lanes] == pj.Status.BAD_INPUT).sum()),
+        "marked": int((found.status[lanes] == pj.Status.BAD_INPUT).sum()),
         "others": others.size,
         "unchanged": int(same[others].sum()),
         "marked_others": int((found.status[others] == pj.Status.BAD_INPUT).sum()),
@@ -89,9 +89,9 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     bench.count(np.arange(found["others"]) < found["solved_others"])
     bench.say(
         f"{options.task}, {options.num:,} cases, {jax.devices()[0].device_kind}: "
-        f"{found['mark_bad_input']:,} of {found['poisoned']:,} poisoned cases are mark_bad_input; "
+        f"{found['marked']:,} of {found['poisoned']:,} poisoned cases are marked; "
         f"{found['unchanged']:,} of {found['others']:,} others have the same bits, "
-        f"{found['marked_others']:,} of them are mark_bad_input"
+        f"{found['marked_others']:,} of them are marked"
     )
 
 

@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "estimate": {"iterations": 0},
     "no last": {"weights": {"last": 0.0}},
     "no ratio": {"weights": {"ratio": 0.0}},
-    "small": {"network": "mlp", "lanes": 100, "minibatches": 4, "share": 0.1},
+    "small": {"network": "mlp", "num_envs": 100, "minibatches": 4, "share": 0.1},
 }
 FIGURES = ("success", "last", "ratio", "seconds")
 
@@ -58,7 +58,7 @@ def asked(
     """The training of a variant."""
     part = Part(steps=int(share * decisions), iterations=(iterations,))
     terms = tuple({**WEIGHTS, **(weights or {})}.items())
-    usual = Training(suites=(suite,), parts=(part,), seed=seed, weights=terms, judged=0)
+    usual = Training(suites=(suite,), parts=(part,), seed=seed, weights=terms, eval_cases=0)
     return dataclasses.replace(usual, **others)
 
 

@@ -151,7 +151,7 @@ def train_own(suite: str, decisions: int, seed: int) -> Any:
             decisions,
             seed,
             network="mlp",
-            lanes=LANES,
+            num_envs=LANES,
             minibatches=MINIBATCHES,
             updates=PASSES,
         )

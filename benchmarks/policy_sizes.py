@@ -1,15 +1,15 @@
 """Numbers of targets that a policy was not trained on, beside training on each of them.
 
     python -m benchmarks.policy_sizes [--sizes 4,5,7] [--num 1000] [--seed 777]
-        [--decisions 1500000] [--policy FILE] [--begin FILE] [--out DIR]
+        [--decisions 1500000] [--policy FILE] [--init-from FILE] [--out DIR]
 
 The suites are `square4`, `pentagon5` and `heptagon7`: as `hexagon6`, with other numbers of targets.
 Rows: `best` plans the six most promising of all orders (of seven targets, of those that a search
 finds), `greedy` one; "policy" is that of --policy, by default the shipped one, as it is; "trained"
-is what a training on that very suite makes of the weights of --begin, by default those of --policy,
-with as many decisions as --decisions says and the weights of the shipped policy's reward. Every
-plan is by `exact` and refereed; last catches and optimal time ratios (OTR) are of what the referee
-accepts. Seconds are those of training, compilation included.
+is what a training on that very suite makes of the weights of --init-from, by default those of
+--policy, with as many decisions as --decisions says and the weights of the shipped policy's reward.
+Every plan is by `exact` and refereed; last catches and optimal time ratios (OTR) are of what the
+referee accepts. Seconds are those of training, compilation included.
 """
 
 import argparse
@@ -36,10 +36,10 @@ def trained(suite: str, options: argparse.Namespace) -> tuple[Policy, float]:
     training = Training(
         suites=(suite,),
         parts=(Part(options.decisions, (usual_iterations(suite),)),),
-        lanes=510 if jax.default_backend() == "cpu" else 8190,
+        num_envs=510 if jax.default_backend() == "cpu" else 8190,
         weights=tuple(REWARD.items()),
-        begin=options.begin or options.policy,
-        judged=0,
+        init_from=options.init_from or options.policy,
+        eval_cases=0,
     )
     began = time.perf_counter()
     with tempfile.TemporaryDirectory() as scratch:
@@ -86,7 +86,7 @@ def main() -> None:
     parser.add_argument("--decisions", type=at_least(1000), default=1_500_000, metavar="N")
     shipped = "or one that is shipped"
     parser.add_argument("--policy", metavar="FILE", default="catch", help=f"{shipped}: catch")
-    parser.add_argument("--begin", metavar="FILE", help=f"{shipped} (default: as --policy)")
+    parser.add_argument("--init-from", metavar="FILE", help=f"{shipped} (default: as --policy)")
     options = parser.parse_args()
     sizes = chosen(parser, "--sizes", options.sizes, SUITES)
     with begin(parser, options) as bench:

@@ -102,7 +102,7 @@ def _with_iterations(planner: Any, iterations: int) -> Any:
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
     first, *rest = planner.rounds
     solver = dataclasses.replace(first.solver, max_steps=iterations)
-    return planner.changed((("rounds", (dataclasses.replace(first, solver=solver), *rest)),))
+    return planner.with_settings((("rounds", (dataclasses.replace(first, solver=solver), *rest)),))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -30,11 +30,13 @@ class TrainSettings:
         (2e6, 4e6, 4e6, 4e6), "N", "of each part, after which the run may be interrupted"
     )
     learning_rate: float = option(LEARNING_RATE, "R", "at the start of each part")
-    begin: str | None = option(
+    init_from: str | None = option(
         None, "FILE", "a checkpoint of first weights, or the name of a shipped one: catch, rush6"
     )
-    lanes: int | None = option(None, "B", "decided at once (default: 8190, 510 on a CPU)")
-    judged: int = option(256, "N", "cases of each suite by which it is watched")
+    num_envs: int | None = option(
+        None, "B", "cases that are decided in parallel (default: 8190, 510 on a CPU)"
+    )
+    eval_cases: int = option(256, "N", "cases of each suite for the evaluation after each part")
     seed: int = option(0, "K", "of weights and cases")
 
     DESCRIPTION: ClassVar[str] = (
@@ -54,7 +56,10 @@ class TrainSettings:
         rate = self.learning_rate
         require(0.0 < rate <= 1.0, "learning_rate", "> 0 and at most 1", rate)
         require_seed(self.seed)
-        for name, value, least in (("judged", self.judged, 0), ("lanes", self.lanes, 60)):
+        for name, value, least in (
+            ("eval_cases", self.eval_cases, 0),
+            ("num_envs", self.num_envs, 60),
+        ):
             require_count(name, value, least, none=True)
             require_memory(name, value or 0, _CASE_BYTES)
 

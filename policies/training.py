@@ -75,15 +75,15 @@ class Training:
     parts: tuple[Part, ...]
     network: str = "attention"
     seed: int = 0
-    lanes: int = 8190  # decided at once; a multiple of the number of suites
+    num_envs: int = 8190  # decided at once; a multiple of the number of suites
     updates: int = 4  # of all data
     minibatches: int = 6
     divergence: float = 0.01  # wanted of an update, by which the learning rate is set
     entropy: float = 1e-4
     # Of each term, one or one a suite.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
-    begin: str | None = None  # a checkpoint by whose weights it begins, or a shipped one's name
-    judged: int = 256  # cases of each suite by which it is watched; 0: it is not
+    init_from: str | None = None  # a checkpoint by whose weights it begins, or a shipped one's name
+    eval_cases: int = 256  # cases of each suite by which it is watched; 0: it is not
 
 
 def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
@@ -120,7 +120,7 @@ def _train_parts(
     told, begun = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
         stopping.check()
-        decisions = math.prod(_rows_and_updates(part, training.lanes)) * training.lanes
+        decisions = math.prod(_rows_and_updates(part, training.num_envs)) * training.num_envs
         kept = keeper.restored(number, params)
         if kept is not None:
             params = kept
@@ -128,11 +128,11 @@ def _train_parts(
             continue
         title = f"part {number + 1} of {len(training.parts)}"
         with told.part(number, title, begun, decisions) as tell:
-            if number == 0 and training.judged:
+            if number == 0 and training.eval_cases:
                 told.judge(number, 0, judge_policy(training, network, params[1]))
             params = _by_ppo(training, part, number, network, params, tell)
         begun += decisions
-        if training.judged:
+        if training.eval_cases:
             suites = judge_policy(training, network, params[1])
             told.judge(number, begun, suites)
             if progress:
@@ -146,7 +146,7 @@ def _train_parts(
 
 def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
     """Train as `planner-jax train` does; arguments and errors of `train`."""
-    lanes = settings.lanes or (510 if jax.default_backend() == "cpu" else 8190)
+    lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
     step = len(settings.suites) * minibatches  # one share a suite, and even minibatches
     iterations = tuple(map(usual_iterations, settings.suites))
@@ -157,10 +157,10 @@ def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
         ),
         network=settings.network,
         seed=settings.seed,
-        lanes=lanes // step * step,
+        num_envs=lanes // step * step,
         minibatches=minibatches,
-        begin=settings.begin,
-        judged=settings.judged,
+        init_from=settings.init_from,
+        eval_cases=settings.eval_cases,
     )
     return train(training, out)
 
@@ -170,7 +170,7 @@ def judge_policy(training: Training, network: Any, params: Any) -> dict[str, Any
     decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
     figures = {}
     for suite in training.suites:
-        cases: Any = jax.tree.map(np.asarray, draw(training.judged, suite, _JUDGED_SEED))
+        cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _JUDGED_SEED))
         plans = plan(decided, cases)
         good = solved(plans)
         figures[suite] = {
@@ -215,11 +215,11 @@ def _first_params(training: Training, network: Any) -> Any:
     size = specs.Array((env.observation_size,), jnp.dtype("float32"))
     normaliser = running_statistics.init_state(size)
     own = jax.jit(network.init)(one, seen)
-    if training.begin is not None:
-        given = checkpoint_of(training.begin)
+    if training.init_from is not None:
+        given = checkpoint_of(training.init_from)
         if given.network != network:
             raise ArgumentError(
-                "begin",
+                "init_from",
                 f"the weights of {_words(network)}",
                 verb="hold",
                 shown=_words(given.network),
@@ -264,12 +264,12 @@ def _by_ppo(
         tell: called with decisions of the part and their metrics, once a row of the curve.
     """
     env = _environment(training, part)
-    rows, each = _rows_and_updates(part, training.lanes)
+    rows, each = _rows_and_updates(part, training.num_envs)
     how: dict[str, Any] = dict(
         environment=env,
-        num_timesteps=rows * each * training.lanes,
+        num_timesteps=rows * each * training.num_envs,
         wrap_env=False,
-        num_envs=training.lanes,
+        num_envs=training.num_envs,
         episode_length=1,
         learning_rate=part.learning_rate,
         learning_rate_schedule="ADAPTIVE_KL",
@@ -278,7 +278,7 @@ def _by_ppo(
         entropy_cost=training.entropy,
         discounting=0.0,
         unroll_length=1,
-        batch_size=training.lanes // training.minibatches,
+        batch_size=training.num_envs // training.minibatches,
         num_minibatches=training.minibatches,
         num_updates_per_batch=training.updates,
         clipping_epsilon=0.2,

@@ -93,7 +93,7 @@ class PlaneSensing:
 
     target_std: float = 0.0  # [m], of a coordinate of the target or of a mover
     pose_stds: tuple[float, float] = (0.0, 0.0)  # of a coordinate [m] and of the heading [rad]
-    looks: float = 1.0  # [Hz], of looks at the target during the drive; 0 for none
+    observation_rate: float = 1.0  # [Hz], of looks at the target during the drive; 0 for none
     latency: float = 0.05  # [s]; that of the planner is a part of it
 
     def __post_init__(self) -> None:

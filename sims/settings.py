@@ -219,9 +219,11 @@ class InterceptFly(FlySettings):
     suite: str = option("easy", "NAME", "of interceptions")
     noise: str = option("paper", "NAME", f"of what is seen: {', '.join(PLANE_NOISES)}")
     latency: float = option(0.05, "S", "age of what is seen [s]")
-    looks: float = option(1.0, "HZ", "looks at the target a second, during the drive")
-    known: bool = option(False, "", "the target's way is known, not predicted from looks")
-    see_movers: bool = option(False, "", "movers too are predicted from looks, not known")
+    observation_rate: float = option(1.0, "HZ", "observations of the target during the drive")
+    known_target: bool = option(
+        False, "", "the target's path is known, not predicted from observations"
+    )
+    predict_movers: bool = option(False, "", "movers are predicted from observations, too")
     slip: bool = option(False, "", "tyres that slip")
 
     TASK: ClassVar[Task] = INTERCEPT
@@ -232,7 +234,7 @@ class InterceptFly(FlySettings):
         require_one_of(PLANE_NOISES, "noise", self.noise)
         require_one_of(INTERCEPT.all_suites(), "suite", self.suite)
         require_moderate("latency", self.latency)
-        require_moderate("looks", self.looks, _FASTEST)
+        require_moderate("observation_rate", self.observation_rate, _FASTEST)
         super().__post_init__()
 
     @property
@@ -243,7 +245,9 @@ class InterceptFly(FlySettings):
             ValueError: a value is out of its range.
         """
         preset = PLANE_NOISES[self.noise]
-        return dataclasses.replace(preset, latency=self.latency, looks=self.looks)
+        return dataclasses.replace(
+            preset, latency=self.latency, observation_rate=self.observation_rate
+        )
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless a period of planning is a whole number of frames."""
@@ -266,13 +270,13 @@ class BlockFly(FlySettings):
     perception: bool = option(
         False, "", "plan with what a camera has seen of the ball, which flies on as it does"
     )
-    sense: float | None = option(
+    observe: float | None = option(
         None, "S", "until the ball's flight is known (default: 0.133, with --perception 0.25)"
     )
-    allowed: float | None = option(
+    planning_budget: float | None = option(
         None,
         "S",
-        "that plans may take; then the arm sets out (default: 0.03, with --perception 0.05)",
+        "for planning, after which the arm starts (default: 0.03, with --perception 0.05)",
     )
     noise: float = option(
         0.02,
@@ -294,7 +298,7 @@ class BlockFly(FlySettings):
         require_one_of(ENCODERS, "encoders", self.encoders)
         require_one_of(REGIMES, "regime", self.regime)
         require_one_of(BLOCK.suites, "suite", self.suite)
-        for name in ("sense", "allowed", "noise", "lag", "latency"):
+        for name in ("observe", "planning_budget", "noise", "lag", "latency"):
             require_moderate(name, getattr(self, name))
         require(abs(self.mass_error) < 1.0, "mass_error", "> -1 and < 1", self.mass_error)
         require_frame_rate(self.frame_rate)
@@ -314,13 +318,13 @@ class BlockFly(FlySettings):
         # [Natarajan2024, Section VI-B]: 82.9 ms for perception and 50 ms for the rest of the
         # system.
         usual = 0.25 if self.perception else 0.133
-        return usual if self.sense is None else self.sense
+        return usual if self.observe is None else self.observe
 
     @property
     def until_set(self) -> float:
         """[s], from then on until the arm sets out."""
         usual = 0.05 if self.perception else 0.03
-        return usual if self.allowed is None else self.allowed
+        return usual if self.planning_budget is None else self.planning_budget
 
     @property
     def drives(self) -> Drives:

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from planner_jax.baselines.hit.common import motion_excess
 from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
 from planner_jax.cost.peaks_kernel import peaks_kernel
-from planner_jax.cost.penalty import crest, greatest_by_tangents, smoothed_hinge
-from planner_jax.cost.quadrotor import motion_excess
+from planner_jax.cost.penalty import crest, greatest_by_tangents, smooth_hinge
 from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
@@ -53,7 +53,7 @@ def sampled(columns, durations, given):
     """The excess over every limit at every sample of a trajectory's segments, and the hinges."""
     motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
     excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
-    return excess, smoothed_hinge(excess + np.array(ALONG.margins)[:, None], ALONG.hinge_width)
+    return excess, smooth_hinge(excess + np.array(ALONG.margins)[:, None], ALONG.hinge_width)
 
 
 @jax.jit

@@ -116,7 +116,7 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
 
         @jax.jit
         def both_ways(point):
-            evaluation, gradient, products, preconditioner = planner.curved(point, context)
+            evaluation, gradient, products, preconditioner = planner.curvature_at(point, context)
             hessian = jax.hessian(cost)(point)
             damping = 2.0 * jnp.abs(hessian).max()
             solved = preconditioner(damping)(direction)

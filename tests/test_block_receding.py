@@ -144,11 +144,11 @@ def test_times_before_a_motion_are_refused(cases):
 @pytest.mark.parametrize(
     ("given", "name"),
     [
-        ({"count": -1.0}, "count"),
+        ({"planning_budget": -1.0}, "planning_budget"),
         ({"frame_rate": 0.0}, "frame_rate"),
         ({"perception": True, "delay": 0.1}, "delay"),
-        ({"perception": True, "count": 0.1}, "count"),
-        ({"perception": True, "refit": 20.0, "wait": 0.1}, "wait"),
+        ({"perception": True, "planning_budget": 0.1}, "planning_budget"),
+        ({"perception": True, "replan": 20.0, "observe_longer": 0.1}, "observe_longer"),
     ],
 )
 def test_settings_that_do_not_fit_are_named(given, name):
@@ -161,12 +161,15 @@ def test_sweeps_show_what_was_seen_and_how_long_planning_took(tmp_path):
     seen = BlockSettings(planner="direct", regime="R1", wide=True, num=4, perception=True)
     manifest = start_sweep(TASK, seen, tmp_path / "seen", progress=False)
     assert 0.0 < manifest["summary"]["fit_error_median"] < 0.3
-    counted = BlockSettings(planner="direct", regime="R1", num=4, count=0.0)
+    counted = BlockSettings(planner="direct", regime="R1", num=4, planning_budget=0.0)
     manifest = start_sweep(TASK, counted, tmp_path / "counted", progress=False)
     assert 0.0 < manifest["summary"]["planning_p50"] <= manifest["summary"]["planning_p99"]
     assert (
         start_sweep(
-            TASK, dataclasses.replace(counted, count=5.0), tmp_path / "late", progress=False
+            TASK,
+            dataclasses.replace(counted, planning_budget=5.0),
+            tmp_path / "late",
+            progress=False,
         )["summary"]["successes"]
         == 0
     )  # the ball is there before

@@ -14,7 +14,7 @@ from planner_jax.core.protocol import Plan, Status, is_solved
 from planner_jax.optimise.multistart import solve_round
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
-from planner_jax.optimise.shipped import shipped_scale
+from planner_jax.optimise.shipped import load_scale
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
@@ -207,7 +207,7 @@ def test_sizes_that_make_no_sense_are_refused(cases):
 def test_the_shipped_scale_is_a_positive_number_for_every_variable_of_a_segment(cases):
     lane = lane_of(cases, 0)
     points = jax.eval_shape(lambda one: PLANNER.guesses(PLANNER.prepare(one), 1), lane)
-    scale = shipped_scale("planner_jax.task.catch", "exact-6")
+    scale = load_scale("planner_jax.task.catch", "exact-6")
     assert points.shape == (1, lane.num_targets * len(scale))
     assert np.isfinite(scale).all() and min(scale) > 0.0
 

@@ -321,7 +321,7 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
         solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
         assert_full_precision(solve, planner, entry.batch)
     if isinstance(planner, OptimisedPlanner):
-        further = planner.polished().attempts[0]
+        further = planner.with_polish().attempts[0]
         assert_full_precision(lambda p, case: p.solve(case, further), planner, case)
     if planner is not entry.planner:
         assert_full_precision(entry.planner.decision.propose, case)

@@ -12,7 +12,7 @@ import planner_jax as pj
 from planner_jax.ball.aim import aim_with_drag, apex_with_drag
 from planner_jax.ball.flight import BallState, fly, racket_impact
 from planner_jax.core.protocol import Status, is_solved
-from planner_jax.optimise.shipped import shipped_scale
+from planner_jax.optimise.shipped import load_scale
 from planner_jax.planning.plan import plan
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.default_planner import ExactHit
@@ -235,7 +235,7 @@ def test_velocities_as_variables_have_exact_derivatives(float64, cases):
     random = np.random.default_rng(2)
     point, direction = guess + 0.2 * random.normal(size=guess.size), random.normal(size=guess.size)
     cost = jax.jit(lambda x: SUPPLE.objective(x, context).cost)
-    curved = SUPPLE.curved(point, context)
+    curved = SUPPLE.curvature_at(point, context)
     np.testing.assert_allclose(
         curved.gradient, jax.jit(jax.grad(cost))(point), rtol=1e-6, atol=1e-9
     )
@@ -292,6 +292,6 @@ def test_a_shipped_scale_is_a_positive_number_for_every_decision_variable(cases,
     lane = jax.tree.map(lambda leaf: leaf[0], cases)
     planner = ExactHit(proportions=(1.0,) * pieces)
     points = jax.eval_shape(lambda one: planner.guesses(planner.prepare(one), 1), lane)
-    scale = shipped_scale("planner_jax.task.hit", f"exact-{pieces}")
+    scale = load_scale("planner_jax.task.hit", f"exact-{pieces}")
     assert points.shape == (1, len(scale))
     assert np.isfinite(scale).all() and min(scale) > 0.0

@@ -19,7 +19,7 @@ from tests.derivatives import assert_gradient_matches_differences
 # Smooth ways, around whose middle obstacles are put.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
-HIT = FREE.changed((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
+HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
 

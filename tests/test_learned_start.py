@@ -9,7 +9,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.benchmarks.learn_starts import make_untrained, to_bytes
-from planner_jax.optimise.shipped import REACH, StartNetwork, cheaper_start, shipped_network
+from planner_jax.optimise.shipped import REACH, StartNetwork, load_network, select_start
 from planner_jax.planning.decided import first_choice
 
 
@@ -56,9 +56,9 @@ def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
 def test_a_guess_that_costs_more_is_not_taken():
     cost = lambda x: jnp.sum(x**2)  # noqa: E731
     guess = jnp.array([1.0, 1.0])
-    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.array([0.5, 1.0])), [0.5, 1.0])
-    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.array([4.0, 1.0])), guess)
-    np.testing.assert_array_equal(cheaper_start(cost, guess, jnp.full(2, jnp.nan)), guess)
+    np.testing.assert_array_equal(select_start(cost, guess, jnp.array([0.5, 1.0])), [0.5, 1.0])
+    np.testing.assert_array_equal(select_start(cost, guess, jnp.array([4.0, 1.0])), guess)
+    np.testing.assert_array_equal(select_start(cost, guess, jnp.full(2, jnp.nan)), guess)
 
 
 def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():
@@ -76,7 +76,7 @@ def test_an_untrained_network_adds_nothing_and_far_features_count_as_less_far():
     "task, name", [("hit", "exact-12"), ("hit", "exact-12-supple"), ("catch", "exact-6")]
 )
 def test_a_shipped_network_is_what_its_archive_holds(task, name, tmp_path):
-    network = shipped_network(f"planner_jax.task.{task}", name)
+    network = load_network(f"planner_jax.task.{task}", name)
     (tmp_path / "again.npz").write_bytes(to_bytes(network))
     with np.load(tmp_path / "again.npz", allow_pickle=False) as file:
         assert len(file.files) == 2 + 2 * len(network.weights)

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.penalty import smooth_hinge
 from planner_jax.optimise.multistart import minimise, minimise_lanes
-from planner_jax.optimise.newton import by_products, damped_steps
+from planner_jax.optimise.newton import by_products, solve_damped
 from planner_jax.optimise.settings import Curvature, Evaluation, NewtonConfig
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
@@ -43,7 +43,7 @@ def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
         lambda: lambda direction: matrix @ direction,
         preconditioner,
     )
-    return damped_steps(here, jnp.asarray(damping, jnp.float32), config)
+    return solve_damped(here, jnp.asarray(damping, jnp.float32), config)
 
 
 @pytest.mark.parametrize("kept", [None, np.diag(np.diag(CURVED))], ids=["nothing", "diagonal"])
@@ -170,7 +170,7 @@ def test_where_a_limit_begins_just_ahead_the_search_does_not_end_in_front_of_it(
 
     def cost(x):  # x = 0.02 is where a steep penalty begins, and the optimum is just behind
         slope = 1e-6 * jnp.sum((x - 2.0) ** 2) + 1e-5
-        return slope + 10.0 * jnp.sum(smoothed_hinge(x - 0.02, 0.05))
+        return slope + 10.0 * jnp.sum(smooth_hinge(x - 0.02, 0.05))
 
     config = NewtonConfig(
         max_steps=60, subspace=0, damping=1e-9, tolerance=1e-3, trusted=1e-9, patience=6

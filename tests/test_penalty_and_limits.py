@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
+from planner_jax.baselines.catch.paper import steep_hinge
 from planner_jax.cost.penalty import (
-    joined_trapezoid_weights,
-    smoothed_hinge,
-    steep_hinge,
+    join_trapezoid_weights,
+    smooth_hinge,
     trapezoid_weights,
 )
 from planner_jax.cost.quadrotor import (
@@ -27,7 +27,7 @@ GRAVITY = 9.8
 
 float64 = pytest.mark.usefixtures("float64")
 
-SHAPES = {"smoothed": smoothed_hinge, "steep": steep_hinge}
+SHAPES = {"smoothed": smooth_hinge, "steep": steep_hinge}
 
 
 @jax.jit
@@ -97,7 +97,7 @@ def test_penalties_and_their_slopes_are_finite_and_not_negative_in_float32(name)
 
 def sum_of_penalties(point):
     x, width = point
-    shapes = (smoothed_hinge, steep_hinge)
+    shapes = (smooth_hinge, steep_hinge)
     return sum(jnp.sum(shape(x, width)) for shape in shapes)
 
 
@@ -127,7 +127,7 @@ def test_joined_weights_are_those_of_the_pieces_with_shared_ends_added():
     separate, shares = np.zeros(13), (0.5, 1.0, 1.5)
     for piece in range(3):
         separate[4 * piece : 4 * piece + 5] += shares[piece] * trapezoid_weights(4)
-    np.testing.assert_allclose(joined_trapezoid_weights(4, shares), separate, rtol=1e-15)
+    np.testing.assert_allclose(join_trapezoid_weights(4, shares), separate, rtol=1e-15)
 
 
 # Limits

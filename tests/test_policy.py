@@ -168,7 +168,7 @@ def test_the_command_line_names_a_decision_that_takes_no_file(capsys, tmp_path):
         (["--suite", "triangle9"], "--suite must be one or more of throws"),
         (["--network", "deep"], "--network must be attention or mlp, got deep"),
         (["--learning-rate", "0"], "--learning-rate must be > 0 and at most 1, got 0"),
-        (["--suite", "triangle3", "--begin", "nowhere.npz"], "that `planner-jax train` wrote"),
+        (["--suite", "triangle3", "--init-from", "nowhere.npz"], "that `planner-jax train` wrote"),
     ],
 )
 def test_bad_settings_of_a_training_are_a_line(given, says, capsys, tmp_path):

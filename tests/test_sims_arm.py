@@ -236,7 +236,7 @@ def test_the_parts_of_the_time_budget_add_up_and_a_plan_that_is_late_begins_late
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     seconds = np.array([0.01, 0.05, 0.07, 0.02])
     plan = plans(*MOTIONS, contact=0.15 + MOVING, status=[0, 0, 0, 2])
-    found = fly_blocks(BLOCK_WORLD, cases, plan=plan, seconds=seconds, allowed=0.05)
+    found = fly_blocks(BLOCK_WORLD, cases, plan=plan, seconds=seconds, planning_budget=0.05)
     budget = found.budget
     np.testing.assert_allclose(budget.sense, 0.1, atol=1e-6)
     np.testing.assert_allclose(budget.wait, [0.04, 0.0, 0.0, 0.03], atol=1e-6)
@@ -267,8 +267,8 @@ def test_arms_that_only_see_their_balls_do_what_they_decided_on():
         begun=jnp.asarray(none),
         motions=jnp.asarray(2 + np.arange(LANES)),
     )
-    found = fly_blocks(BLOCK_WORLD, cases, decided=decided, allowed=0.05)
-    known = fly_blocks(BLOCK_WORLD, cases, plan=plan, allowed=0.05)
+    found = fly_blocks(BLOCK_WORLD, cases, decided=decided, planning_budget=0.05)
+    known = fly_blocks(BLOCK_WORLD, cases, plan=plan, planning_budget=0.05)
     np.testing.assert_array_equal(found.flown.angles, known.flown.angles)
     np.testing.assert_array_equal(found.miss, known.miss)
     assert found.motions.tolist() == [2, 3, 4, 5] and known.motions.tolist() == [1] * LANES
@@ -352,7 +352,7 @@ def test_the_viewer_places_the_links_of_the_arm(recorded):
 def test_four_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     out = tmp_path / "run"
     command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open"]
-    assert main([*command, "--sense", "0.1", "--allowed", "0.2", "--out", str(out)]) == 0
+    assert main([*command, "--observe", "0.1", "--planning-budget", "0.2", "--out", str(out)]) == 0
     assert "of 4 flights blocked the ball" in capsys.readouterr().out
     manifest = json.loads((out / "manifest.json").read_text())
     assert manifest["kind"] == "fly block"
@@ -397,7 +397,7 @@ def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, ca
         ),
         (lambda: BlockFly(regime="R4"), "regime must be one of R1, R2, R3, got 'R4'"),
         (lambda: BlockFly(suite="hail"), "suite must be one of pole, open, short, got 'hail'"),
-        (lambda: BlockFly(sense=-0.1), "sense must be finite and >= 0, got -0.1"),
+        (lambda: BlockFly(observe=-0.1), "observe must be finite and >= 0, got -0.1"),
         (lambda: BlockFly(torque=0.0), "torque must be finite and > 0, got 0"),
         (lambda: BlockFly(latency=-1.0), "latency must be finite and >= 0, got -1"),
         (lambda: BlockFly(mass_error=-1.0), "mass_error must be > -1 and < 1, got -1"),
@@ -431,8 +431,10 @@ def test_another_robot_arm_or_time_is_refused_in_one_line():
         carried = dataclasses.replace(BLOCK_WORLD, timestep=2.0 * TIMESTEP)
         nothing: Any = (None, None)
         execute(carried, *nothing, since=np.zeros(1), until=np.zeros(1), end=1.0)
-    with pytest.raises(ValueError, match="^allowed must be >= 0 and <= the delay 0.1, got 0.2$"):
-        fly_blocks(BLOCK_WORLD, cases, allowed=0.2)
+    with pytest.raises(
+        ValueError, match="^planning_budget must be >= 0 and <= the delay 0.1, got 0.2$"
+    ):
+        fly_blocks(BLOCK_WORLD, cases, planning_budget=0.2)
     heavy = dataclasses.replace(cases.cases.arm, mass=2.0 * cases.cases.arm.mass)
     with pytest.raises(ValueError, match="^mass must be the same in plan and simulated arm$"):
         require_arm(BLOCK_WORLD, dataclasses.replace(cases.cases, arm=heavy))

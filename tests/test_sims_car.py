@@ -212,8 +212,8 @@ def test_contacts_of_planned_poses_are_those_that_the_referee_finds():
 
 def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
     loop = DriveLoop(CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
-    seen = meetings("easy", 2, seed=4, looks=1.0)
-    of = jax.jit(functools.partial(expected, loop, known=False, see_movers=True))
+    seen = meetings("easy", 2, seed=4, observation_rate=1.0)
+    of = jax.jit(functools.partial(expected, loop, known_target=False, predict_movers=True))
     path, movers = jax.device_get(of(seen, np.float32(3.04)))
     later = dataclasses.replace(seen, target=seen.target + 9.0 * (seen.times > 2.5)[..., None])
     np.testing.assert_array_equal(path.pos, of(later, np.float32(3.04))[0].pos)
@@ -267,7 +267,7 @@ def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(so
     )
     planner = StraightOn(solved)
     flights = fly_intercepts(
-        DriveLoop(CAR_WORLD, NOISY), seen, 5, replan=0.5, planner=planner, known=True
+        DriveLoop(CAR_WORLD, NOISY), seen, 5, replan=0.5, planner=planner, known_target=True
     )
     assert flights.flown.plans.tolist() == [solved] * 3
     assert flights.success.all() and flights.miss.max() < 0.03

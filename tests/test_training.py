@@ -46,11 +46,11 @@ def asked(hasty, tmp_path_factory) -> Any:
         (SUITE,),
         (PART,),
         network="mlp",
-        lanes=LANES,
+        num_envs=LANES,
         minibatches=5,
-        judged=0,
+        eval_cases=0,
         divergence=0.05,
-        begin=str(path),
+        init_from=str(path),
     )
 
 
@@ -98,8 +98,8 @@ def test_curves_of_several_seeds_are_drawn_together_and_of_other_settings_are_no
     (other / "training.json").write_text(json.dumps(to_write({**asked, "seed": 1})))
     draw_curves([out, other], tmp_path / "both.png")
     assert (tmp_path / "both.png").stat().st_size > 10_000
-    (other / "training.json").write_text(json.dumps(to_write({**asked, "lanes": 7})))
-    with pytest.raises(ArgumentError, match=f"same lanes as .*, {LANES}, got 7"):
+    (other / "training.json").write_text(json.dumps(to_write({**asked, "num_envs": 7})))
+    with pytest.raises(ArgumentError, match=f"same num_envs as .*, {LANES}, got 7"):
         draw_curves([out, other], tmp_path / "both.png")
     with pytest.raises(ArgumentError, match="run must be the folder of a training"):
         draw_curves([tmp_path], tmp_path / "both.png")
@@ -156,14 +156,14 @@ def test_weights_of_another_network_or_size_are_refused(network, begun, says, ca
     path, out = tmp_path / "other.npz", tmp_path / "run"
     params = begun.init(jax.random.key(0), jnp.zeros((1, 3, FEATURES)))
     save_checkpoint(path, params, begun, {})
-    given = ["--suite", SUITE, "--network", network, "--begin", str(path), "--out", str(out)]
+    given = ["--suite", SUITE, "--network", network, "--init-from", str(path), "--out", str(out)]
     assert main(["train", *given]) == 2
-    assert f"--begin must hold the {says}" in capsys.readouterr().err
+    assert f"--init-from must hold the {says}" in capsys.readouterr().err
     assert not out.exists()
 
 
 def test_a_shipped_policy_to_begin_with_is_known_by_its_name(capsys, tmp_path):
-    given = ["--suite", SUITE, "--network", "mlp", "--begin", "rush6"]
+    given = ["--suite", SUITE, "--network", "mlp", "--init-from", "rush6"]
     assert main(["train", *given, "--out", str(tmp_path / "run")]) == 2
     assert "weights of mlp (size 6, width 64), got attention (width 64" in capsys.readouterr().err
 

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.cost.penalty import joined_trapezoid_weights
+from planner_jax.cost.penalty import join_trapezoid_weights
 
 ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
 
@@ -89,7 +89,7 @@ class Program:
         self.problem, self.penalised, self.backoff = problem, penalised, backoff
         self._maps = planner.maps
         self._matrices = [ca.DM(self._maps.sample_matrix(planner.nodes, d)) for d in range(ORDERS)]
-        weights = joined_trapezoid_weights(planner.nodes, self._maps.proportions)
+        weights = join_trapezoid_weights(planner.nodes, self._maps.proportions)
         self._weights, self.num_samples = ca.DM(weights).T, len(weights)
         self.num_told = sum(problem.sizes.values())
         self._power = 2 * self._maps.order - 1

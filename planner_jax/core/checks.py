@@ -1,7 +1,7 @@
 """Checks of single arguments: numbers, switches, arrays, paths, instances of a class.
 
 Each check raises one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for a value of the
-wrong kind, `ArgumentError` for a value that breaks the rule.
+wrong kind, `ArgumentError` for a value that breaks the rule. `name` is the NAME of the argument.
 """
 
 import functools
@@ -30,11 +30,6 @@ def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
     """Raise unless an argument is one finite number that keeps a rule.
 
     Of a jax array, which may be traced or on another device, only shape and kind are checked.
-
-    Args:
-        name: name of the argument, for the message.
-        value: a number, or an array without axes.
-        rule: rule for the finite number.
     """
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
@@ -101,16 +96,8 @@ def numbers_of(
 ) -> np.ndarray:
     """Return numbers for every case of a batch, an array of the shape batch + shape.
 
-    Args:
-        name: name of the argument, for the message.
-        value: an array of the shape `shape`, shared by all cases, or batch + shape. Other shapes
-            raise, so that no axis is stretched by accident.
-        batch: () or (B,).
-        shape: shape for one case.
-
-    Raises:
-        ArgumentError: the value has another shape.
-        ArgumentTypeError: the value does not hold numbers.
+    The argument has this shape, or the shape `shape` for numbers that all cases share. Other shapes
+    raise, so that no axis is stretched by accident. `batch` is () or (B,).
     """
     array, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
     if array.shape not in (shape, whole):
@@ -132,11 +119,7 @@ def _require_numeric(name: str, value: object) -> Numbers:
 
 
 def floating(dtype: object) -> np.dtype:
-    """Return a floating-point type that is enabled in JAX, as NumPy's type.
-
-    Raises:
-        ArgumentTypeError: another type, or float64 while JAX computes in float32.
-    """
+    """Return a floating-point type that is enabled in JAX; raise `ArgumentTypeError` otherwise."""
     try:
         kind = np.dtype(dtype)  # type: ignore[call-overload]
     except TypeError:
@@ -149,17 +132,9 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return the leaves of an argument as arrays whose shapes begin with a shape.
+    """Return the leaves of an argument as arrays; raise unless their shapes begin with `shape`.
 
-    Args:
-        name: name of the argument, for the message.
-        tree: the argument, a pytree of arrays.
-        shape: required first axes of every leaf.
-        words: description of these axes, for the message.
-
-    Raises:
-        ArgumentTypeError: there is no leaf, or a leaf is not an array of numbers.
-        ArgumentError: a leaf has other first axes.
+    `words` describes these axes in the message.
     """
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
@@ -186,15 +161,11 @@ def require_path(
     """Raise unless an argument is a target's path, or an array of paths.
 
     Args:
-        name: name of the argument, for the message.
+        name: name of the argument.
         path: a pytree with a method `at(time)`.
         axes: axes that every leaf has in front of the axes of one path.
         dimensions: dimension of the positions, 2 or 3.
         whose: argument that determines the axes, for the message.
-
-    Raises:
-        ArgumentTypeError: the path has no such method, or the method returns no positions.
-        ArgumentError: the path has other axes.
     """
     if isinstance(path, type) or not isinstance(path, _Path):
         raise ArgumentTypeError(name, "a path, with a method at(time)", path)

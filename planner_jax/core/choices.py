@@ -51,26 +51,13 @@ def require_scale(value: float) -> None:
 
 
 def require_memory(name: str, num: int, bytes_each: int) -> None:
-    """Raise `ArgumentError` if `num` elements of `bytes_each` bytes exceed the free memory.
-
-    Args:
-        name: argument that requests the elements.
-        num: number of elements.
-        bytes_each: estimated size of one element.
-    """
+    """Raise `ArgumentError` if `num` elements of `bytes_each` bytes exceed the free memory."""
     free = machine.available_memory()
     _require_space(name, num, bytes_each, free, "which this machine has memory")
 
 
 def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike) -> None:
-    """Raise `ArgumentError` if `num` rows of `bytes_each` bytes exceed the free disk space.
-
-    Args:
-        name: argument that requests the rows.
-        num: number of rows.
-        bytes_each: estimated size of one row.
-        folder: folder of the rows, which need not exist.
-    """
+    """Raise `ArgumentError` if `num` rows exceed the free space of a folder's disk."""
     _require_space(name, num, bytes_each, machine.free_disk(folder), "which the disk has room")
 
 

@@ -36,10 +36,6 @@ class PlanFileError(ArgumentError):
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
     """Write a dataclass, whose leaves are arrays or such dataclasses, whole or not at all.
 
-    Args:
-        path: path of the file; no suffix is added.
-        tree: the dataclass.
-
     Raises:
         ArgumentTypeError: a leaf is not an array of numbers, or `path` is not a path.
     """

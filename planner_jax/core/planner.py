@@ -12,6 +12,7 @@ from typing import ClassVar, Generic, Protocol, Self, TypeVar
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import Array, lax
 from jax.extend.backend import backends
 from jaxtyping import PyTree
@@ -61,11 +62,8 @@ class Drive(Protocol):
     ) -> PyTree:
         """Return plans (B,) after another try at some cases, each the better of old and new.
 
-        Args:
-            plan_of: makes plans of a batch of the cases.
-            cases: (B,).
-            plans: plans so far; NumPy leaves are changed in place.
-            left: (B,) bool, the cases to try again. None is tried after the caller's time limit.
+        `plan_of` makes plans of a batch of the cases. NumPy leaves of `plans` are changed in place.
+        The cases where `left` (B,) is true are tried, unless the caller's time limit has passed.
         """
         ...
 
@@ -158,10 +156,8 @@ class Planner(Generic[CaseT, PlanT]):
     ) -> "tuple[PyTree, PyTree]":
         """Return an `OptimisedPlanner`, and the cases with all that is decided before it starts.
 
-        Args:
-            cases: one case, or a batch.
-            plan_of: plans cases by a planner, to determine the decision. By default the decision is
-                its first proposal, and no plan is made: that is pure, and constant to derivatives.
+        `plan_of` plans cases by a planner, to determine the decision. By default the decision is
+        its first proposal, and no plan is made: that is pure, and constant to derivatives.
 
         Raises:
             TypeError: the planner minimises nothing.
@@ -187,6 +183,27 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
 
+@struct.dataclass
+class PlannerAround(Planner[CaseT, PlanT]):
+    """A planner that calls one other planner for cases of the same class."""
+
+    planner: Planner[CaseT, PlanT]
+
+    @property
+    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """The class of the planner's cases."""
+        return self.planner.case_type
+
+    @property
+    def inner(self) -> Planner:
+        """The planner that is called."""
+        return self.planner
+
+    def replanner(self) -> Planner:
+        """Return the re-planner of the planner that is called."""
+        return self.planner.replanner()
+
+
 def require_planner(planner: object) -> None:
     """Raise `TypeError` unless the argument `planner` is a planner."""
     if not isinstance(planner, Planner) or planner.kind is None:
@@ -196,12 +213,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless a planner is complete and plans cases of the class of these.
-
-    Raises:
-        TypeError: the planner is no planner or no pytree, or the cases are of another class.
-        ValueError: the planner has no attempt.
-    """
+    """Raise unless a planner is complete and plans cases of the class of these."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

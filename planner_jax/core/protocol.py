@@ -142,10 +142,6 @@ def require_settings(planner: PyTree) -> None:
 
     Sizes are whole numbers >= 1, or >= 0 if the default is 0. Weights and times are finite, and >=
     0 unless the default is negative. Attempts are one or more.
-
-    Raises:
-        ArgumentTypeError: a field is of another kind.
-        ArgumentError: a field is too small, not finite, or has no attempt.
     """
     defaults = {field.name: field.default for field in dataclasses.fields(planner)}
     for name, value in fields_of(planner).items():
@@ -261,9 +257,7 @@ def solved(plans: Plan) -> np.ndarray:
 def mark_bad_input(plans: PlanT, cases: PyTree) -> PlanT:
     """Return plans with the status `BAD_INPUT` where a number of the case breaks a rule; pure.
 
-    Args:
-        plans: one plan, or a batch; returned unchanged if the cases have no `rules`.
-        cases: cases of the plans.
+    The plans are returned unchanged if the cases have no `rules`.
     """
     if not has_rules(cases):
         return plans
@@ -300,13 +294,7 @@ def is_better(
 
 
 def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
-    """Return the better of later and earlier plans, case by case; pure.
-
-    Args:
-        later: plans of any batch shape.
-        before: plans of the same cases.
-        where: cases whose plans may change.
-    """
+    """Return the better of later and earlier plans, case by case where `where` is true; pure."""
     chosen = jnp.asarray(where & is_better(later, before))
 
     def pick(old: Array, new: Array) -> Array:
@@ -316,12 +304,9 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
 
 
 def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
-    """Return plans, NumPy leaves changed in place where later plans of some lanes are better.
+    """Return plans, changed in place where later plans of some lanes are better; NumPy leaves.
 
-    Args:
-        plans: a batch.
-        later: plans of `lanes`; further plans behind these are padding.
-        lanes: indices of the batch.
+    `lanes` are indices of the batch. Later plans beyond their number are padding.
     """
     later = jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], later)
     better = is_better(later, jax.tree.map(lambda leaf: leaf[lanes], plans))
@@ -334,11 +319,9 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
 
 
 def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index along the first axis of the selected plan of each case.
+    """Return the index along the first axis of the selected plan of each case, for plans (K, ...).
 
-    Args:
-        plans: plans of the same cases, (K, ...).
-        cost: (K, ...), used instead of the planner's own cost.
+    `cost` (K, ...) replaces the planner's own cost.
     """
     xp = numpy_of(plans.status)
     good = is_solved(plans.status)
@@ -351,10 +334,8 @@ def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
 def first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
     """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
 
-    Args:
-        plan_of: makes the plan at a position () int32 of the sequence.
-        num: () int32, length of the sequence.
-        best: an existing plan; if it is solved, no other is made.
+    `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is
+    solved, no other is made.
     """
 
     def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:

@@ -108,11 +108,7 @@ class Task:
         return planner, file
 
     def make_planner(self, name: object, options: Mapping[str, object]) -> "Planner":
-        """Return the planner of a name.
-
-        Args:
-            name: a key of `all_planners`; a key of `from_file` is followed by ":" and its file.
-            options: keyword arguments of the planner's class or function, after the file.
+        """Return the planner of a key of `all_planners`, with its file if it is in `from_file`.
 
         Raises:
             UnknownName: no planner has this name, or it needs a file or takes none.
@@ -124,11 +120,7 @@ class Task:
         return maker(*filter(None, [file]), **options)
 
     def other_suite(self, name: object) -> "Callable[..., PyTree]":
-        """Return the function `draw(num, seed, first)` of a suite of another package.
-
-        Raises:
-            UnknownName: no suite has this name.
-        """
+        """Return the function `draw(num, seed, first)` of a suite of another package."""
         suite = require_name(self.all_suites(), "suite", name)
         return _load(_other_entries("suites", self.name, self.suites)[suite])
 
@@ -167,11 +159,7 @@ def split_name(
 ) -> tuple[str, str]:
     """Return a known name and the file after it, as in "policy:FILE", or "".
 
-    Args:
-        known: known names.
-        kind: noun for the named objects, for the message.
-        name: one of the names, perhaps followed by ":" and a file.
-        from_file: names that may have a file.
+    `kind` is the noun for the named objects, and `from_file` lists the names that may have a file.
 
     Raises:
         UnknownName: the name is not known, or takes no file.

@@ -159,13 +159,8 @@ def require_rule(
 ) -> None:
     """Raise `CaseError` for the first case that breaks a rule.
 
-    Args:
-        name: name of the value, for the message.
-        value: batch + shape.
-        holds: batch + shape, bool, where the rule holds.
-        words: the rule in words.
-        batch: () or (B,).
-        other: name of the array with which the value is compared.
+    `value` and `holds` have the shape batch + shape, `words` states the rule, and `other` is the
+    name of the array with which the value is compared.
     """
     broken = ~np.asarray(holds)
     if not broken.any():
@@ -179,11 +174,9 @@ def require_rule(
 
 
 def require_shapes(cases: PyTree) -> None:
-    """Raise unless every array, traced or not, has the shape and kind of numbers of its field.
+    """Raise `ArgumentError` unless every array has the shape and kind of numbers of its field.
 
-    Raises:
-        ValueError: another shape; one line with the field and both shapes.
-        TypeError: another kind of numbers.
+    Arrays may be traced.
     """
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
@@ -236,11 +229,7 @@ _KINDS = {
 
 
 def is_sound(cases: PyTree) -> PyTree:
-    """Return whether every number of each case keeps its rules; pure.
-
-    Returns:
-        Bool of the batch shape, a jax array if the cases hold one.
-    """
+    """Return whether every number of each case keeps its rules, bool of the batch shape; pure."""
     batch = cases.batch_shape
     held = [ruled.holds() for ruled in all_ruled(cases)]
     # Joined before the reduction: one loop of a compiled program instead of one for each array.

@@ -1,10 +1,9 @@
-"""The integrated penalties of `cost.along` with their second derivatives: all, or the strong ones.
+"""Penalties of `cost.along` with their second derivatives: all of them, or the strong ones.
 
-Samples are linear in a segment's columns, and a limit looks at few orders of the motion at once. So
-the matrix is a sum over samples and pairs of orders of one number times the outer product of two
-constant rows: one product with a constant matrix for each pair of axes, whatever the number of
-lanes. By `jax.hessian` it would take as many tangents as there are unknowns. Of the matrix only
-those entries are made that are asked for.
+Samples are linear in a segment's columns, and each limit depends on few orders of the motion. So
+the Hessian is a sum over samples and pairs of orders of a number times an outer product of constant
+rows: one product with a constant matrix for each pair of axes, for any number of lanes.
+`jax.hessian` would take one tangent for each unknown. Only the requested entries are computed.
 """
 
 import dataclasses
@@ -19,7 +18,7 @@ from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along
-from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.penalty import smooth_hinge
 from planner_jax.trajectory.polynomial import Motion
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of axes
@@ -29,10 +28,10 @@ Slot = tuple[int, int]  # order of a derivative of the motion, and axis
 
 @struct.dataclass
 class AlongCurvature:
-    """Penalties of one segment, with derivatives by its moving columns and theta = log h.
+    """Penalties of one segment, with derivatives by its variable columns and theta = log h.
 
-    h is the mean duration of a piece. The columns that do not move are the first rows of the state
-    at the begin, which is given: those of order d grow with h^d.
+    h is the mean duration of a piece. The fixed columns are the rows of the initial state; the row
+    of order d is proportional to h^d.
     """
 
     penalty: Array  # ()
@@ -41,22 +40,22 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives at the samples, of which those by the columns are made: for each group of
-    # pairs of axes that have terms in common (terms K, pairs).
+    # Second derivatives at the samples, from which `columns_columns` and `block_and_diagonal` are
+    # computed: for each group of pairs of axes with common terms (terms K, pairs).
     at_samples: tuple[Array, ...]
 
 
 def curvature_along(
     along: Along, columns: Array, piece_duration: Array, parameters: PyTree, given: int = 0
 ) -> AlongCurvature:
-    """Integrated penalties of one segment with first and second derivatives.
+    """Integrate the penalties of one segment, with first and second derivatives.
 
     Args:
         along: constants.
         columns: (G + C, 3) boundary rows and whitened offsets.
-        piece_duration: () [s], mean of the pieces.
-        parameters: that the excess takes.
-        given: G, the columns at the front that do not move.
+        piece_duration: () [s], mean duration of the pieces.
+        parameters: second argument of the excess.
+        given: G, the number of fixed columns, which come first.
     """
     constants = _constants(along, given)
     samples = functools.partial(jnp.asarray, dtype=columns.dtype)
@@ -64,34 +63,34 @@ def curvature_along(
     unit = jnp.matmul(samples(constants.samples), columns, precision=lax.Precision.HIGHEST)
     unit = unit.reshape(3, orders, -1, 3)
     rate = reciprocal(piece_duration)
-    rates = [jnp.ones_like(rate)]
+    powers = [jnp.ones_like(rate)]
     for _ in range(orders - 1):
-        rates.append(rates[-1] * rate)
-    rates = jnp.stack(rates)[:, None, None]
+        powers.append(powers[-1] * rate)
+    rates = jnp.stack(powers)[:, None, None]
     order = np.arange(orders)[:, None, None]
     motion, drift, drift_of_drift = unit * rates  # (orders, K, 3) each
-    # First and second derivative of the samples by theta.
-    moved = drift - samples(order) * motion
-    bent = drift_of_drift - samples(2.0 * order) * drift + samples(order**2) * motion
+    # First and second derivatives of the samples by theta.
+    first = drift - samples(order) * motion
+    second = drift_of_drift - samples(2.0 * order) * drift + samples(order**2) * motion
     value, worst, slope, curvature = _at_samples(along, motion, parameters)
     weight = piece_duration * samples(along.weights())
-    turned = _product(constants.groups, curvature, moved)
+    image = _product(constants.groups, curvature, first)
 
-    def summed(values: Array) -> Array:
+    def integrate(values: Array) -> Array:
         return jnp.sum(weight * jnp.sum(values, axis=(0, 2)))
 
     back = samples(constants.moving_samples)  # (orders, K, C)
     weighed = weight[:, None] * rates
-    slopes = jnp.stack([slope, (1.0 - samples(order)) * slope + turned]) * weighed
+    slopes = jnp.stack([slope, (1.0 - samples(order)) * slope + image]) * weighed
     by, mixed = jnp.einsum("dkc,odka->oca", back, slopes, precision=lax.Precision.HIGHEST)
     return AlongCurvature(
         penalty=jnp.sum(weight * value),
         worst=worst,
         by_columns=by,
-        by_theta=jnp.sum(weight * value) + summed(slope * moved),
+        by_theta=jnp.sum(weight * value) + integrate(slope * first),
         columns_theta=mixed,
         theta_theta=jnp.sum(weight * value)
-        + summed(2.0 * slope * moved + slope * bent + turned * moved),
+        + integrate(2.0 * slope * first + slope * second + image * first),
         at_samples=tuple(
             jnp.stack(
                 [
@@ -111,13 +110,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """All second derivatives by the moving columns, (C, 3, C, 3).
-
-    Args:
-        along: constants, as for `curvature_along`.
-        at_samples: what it found.
-        given: as for it.
-    """
+    """Return all second derivatives by the variable columns, (C, 3, C, 3)."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -126,16 +119,9 @@ def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0)
 def block_and_diagonal(
     along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
 ) -> tuple[Array, Array]:
-    """Second derivatives among the first moving columns, and of each other number by itself.
+    """Return second derivatives among the first columns, and the diagonal of the others.
 
-    Args:
-        along: constants, as for `curvature_along`.
-        at_samples: what it found.
-        num: E, of the first columns.
-        given: as for it.
-
-    Returns:
-        (E, 3, E, 3) and (C - E, 3).
+    Their shapes are (E, 3, E, 3) and (C - E, 3), where E is `num`.
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
@@ -148,9 +134,9 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Penalties (K,), their greatest excess, slopes (orders, K, 3) and second derivatives (K,).
+    """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,).
 
-    Groups of slots that no limit looks at together share the tangents of one derivative.
+    Groups of slots without a common limit share the tangents of one derivative.
     """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
@@ -162,7 +148,7 @@ def _at_samples(
         parts = {"snap": snap[0]} if snap else {}
         samples = Motion(height=pos[:, 2], vel=vel, acc=acc, jerk=jerk, pos=pos, **parts)
         excess = jnp.stack(along.excess(samples, parameters))
-        hinges = smoothed_hinge(excess + margins, along.hinge_width)
+        hinges = smooth_hinge(excess + margins, along.hinge_width)
         penalty = jnp.sum(factors * hinges, axis=0)
         if along.rate is not None:
             penalty = penalty + along.rate(samples, parameters)
@@ -189,7 +175,7 @@ def _at_samples(
 
 
 def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: Array) -> Array:
-    """Second derivatives at the samples times a direction (orders, K, 3)."""
+    """Return the product of second derivatives at samples with a direction (orders, K, 3)."""
     found = {}
     for group in groups:
         for one in group:
@@ -206,7 +192,7 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Second derivatives by pairs of moving columns, (places,) for each pair of axes."""
+    """Return second derivatives by pairs of variable columns, (pairs,) for each pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -219,7 +205,7 @@ def _entries(
 
 
 def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
-    """(num, 3, num, 3) of the entries of all pairs of columns, for each pair of axes."""
+    """Return the matrix (num, 3, num, 3) of the entries of all pairs of columns."""
     blocks = {pair: found.reshape(num, num) for pair, found in entries.items()}
     rows = [
         jnp.stack([blocks[a, b] if a <= b else blocks[b, a].T for b in range(3)], axis=-1)
@@ -230,19 +216,19 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Constants:
-    """What `curvature_along` multiplies with."""
+    """Constant matrices of `curvature_along`."""
 
-    # Samples of all orders from all columns, and the same with each column's rows weighted once
-    # and twice by the power of h with which it grows while it is given: (3 orders K, G + C).
+    # Maps from all columns to samples of all orders, followed by the same maps times the power d
+    # of h in each fixed column and times d^2: (3 orders K, G + C).
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Pairs of axes, and what they have in common: terms, which are pairs of orders.
+    # Pairs of axes with their common terms, which are pairs of orders.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property
     def num_moving(self) -> int:
-        """C."""
+        """C, the number of variable columns."""
         return self.moving_samples.shape[-1]
 
 
@@ -275,7 +261,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """For each group of pairs of axes the matrix (places, terms K) from the samples."""
+    """Return for each group of pairs of axes the matrix (places, terms K) from the samples."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []
@@ -284,7 +270,7 @@ def _matrices(
         for d, e in terms:
             one, other = constants.moving_samples[d], constants.moving_samples[e]  # (K, C) each
             each = one[:, first] * other[:, second]
-            if pairs[0][0] == pairs[0][1] and d != e:  # of the two that are equal one is a term
+            if pairs[0][0] == pairs[0][1] and d != e:  # the equal mixed term is not listed
                 each = each + one[:, second] * other[:, first]
             outer.append(each.T)
         found.append(np.concatenate(outer, axis=1))

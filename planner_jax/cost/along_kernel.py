@@ -1,9 +1,9 @@
 """`integrate_along` on many lanes as one kernel for CUDA.
 
-A thread carries a lane. It reads the columns once, makes the samples one after another, each
-from a row of the constant matrices, and adds up penalties and, by the transposed product,
-slopes. Memory sees the columns, the results and nothing in between. Where there are few lanes,
-several threads share the samples of one.
+One thread computes one lane. It reads the columns once, computes the samples one after another from
+rows of the constant matrices, and sums penalties and, by the transposed product, slopes. Only
+columns and results pass through memory. If there are few lanes, several threads share the samples
+of one lane.
 """
 
 import dataclasses
@@ -21,19 +21,18 @@ from jaxtyping import PyTree
 
 from planner_jax.core.arithmetic import reciprocal
 from planner_jax.cost.along import Along
-from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.penalty import smooth_hinge
 from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import Block, block_width, grid_index, kernel_call
 from planner_jax.trajectory.polynomial import Motion
 
 _THREADS = 128  # lanes of a block
 _ENOUGH = 512  # blocks that keep a large GPU busy
-_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # that a motion has of position to jerk
+_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # of position to jerk that a motion has
 _WORST = 1  # index of the greatest excess among the results
 
-# What is made of the samples: the sum of penalties, and the greatest excess of all; also slopes by
-# columns and durations; also slopes by the parameters; or the derivative of all of these along a
-# direction.
+# Results: the sum of penalties, and the greatest excess; also slopes by columns and durations; also
+# slopes by the parameters; or the derivative of all of these along a direction.
 MODES = ("values", "slopes", "slopes by all", "curvature")
 
 Vectors = list[list[Array]]  # columns or derivatives, each of three numbers
@@ -46,16 +45,16 @@ class Grid:
     trajectories: int
     num_columns: int  # C
     lanes: int
-    threads: int  # of a block, each of which carries a lane
+    threads: int  # of a block, one for each lane
 
     @property
     def blocks(self) -> int:
-        """Blocks of one trajectory."""
+        """Number of blocks of one trajectory."""
         return self.lanes // self.threads
 
     @property
     def shares(self) -> int:
-        """Threads that share the samples of one trajectory of a lane."""
+        """Number of threads that share the samples of one trajectory of a lane."""
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
@@ -68,17 +67,12 @@ def grid_of(
 ) -> tuple[Grid, tuple[int, ...]] | None:
     """Return the grid for some arguments, and the axes that `vmap` has put in front of them.
 
-    Args:
-        along: constants.
-        leaves: of all arguments.
-        points: columns, durations and parameters; of a point, or of a point and a direction.
-
-    Returns:
-        None where a kernel does not support these arguments.
+    `leaves` are the leaves of all arguments, and `points` the columns, durations and parameters of
+    a point, or of a point and a direction. The result is None for arguments without a kernel.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
-    # Extras take vectors and the position, and rotors the snap: neither is computed here.
+    # Extras take vectors and the position, and rotors the snap, which are not computed here.
     if along.rate is not None or along.orders != 4 or threads is None:
         return None
     if any(leaf.dtype != jnp.float32 for leaf in leaves):
@@ -101,15 +95,10 @@ def call_on_grid(
     name: str,
     interpret: bool,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a kernel, from the leaves of its arguments to results with shares of the samples first.
+    """Make a kernel of the leaves of its arguments; its results have shares of the samples first.
 
-    Args:
-        body: of references to the leaves, to the constants, and to the results.
-        grid: of its blocks.
-        shapes: of the results for one trajectory of one lane.
-        constants: that every block reads.
-        name: of the kernel.
-        interpret: run it without a GPU.
+    `body` takes references to the leaves, to the `constants`, which every block reads, and to the
+    results. `shapes` are the results' shapes for one trajectory of one lane.
     """
 
     def whole(shape: tuple[int, ...]) -> Block:
@@ -120,7 +109,7 @@ def call_on_grid(
         index = lambda t, i, s: (s, t, *(0 for _ in shape), i)  # noqa: E731
         return (grid.shares, grid.trajectories, *shape, grid.lanes), jnp.float32, (block, index)
 
-    inputs: dict[int, Block] = {  # by the axes of an argument's leaf
+    inputs: dict[int, Block] = {  # by the number of axes of an argument's leaf
         1: ((grid.threads,), lambda t, i, s: (i,)),
         2: ((None, grid.threads), lambda t, i, s: (t, i)),
         4: ((None, grid.num_columns, 3, grid.threads), lambda t, i, s: (t, 0, 0, i)),
@@ -144,13 +133,9 @@ def call_on_grid(
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel of one of the functions in `along`.
+    """Make the kernel of one of the functions in `along`; `interpret` runs it without a GPU.
 
-    Args:
-        along: constants.
-        mode: one of `MODES`. "curvature" takes a point and a direction, of which the parameters'
-            part may be None.
-        interpret: run it without a GPU, for tests.
+    The mode "curvature" takes a point and a direction, whose parameters may be None.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
@@ -178,7 +163,7 @@ def along_kernel(
 def _call(
     along: Along, mode: str, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the kernel for a grid, of the leaves of its arguments."""
+    """Make the kernel for a grid, a function of the leaves of its arguments."""
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
     share = -(-num_samples // grid.shares)
@@ -235,7 +220,7 @@ def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
 
 
 def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
-    """Write the results, of which columns come number by number."""
+    """Write the results; columns are written number by number."""
     numbers = iter(values)
     for ref in refs:
         if len(ref.shape) == 3:
@@ -247,7 +232,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return position to jerk, in time over the duration; of the position the height alone."""
+    """Return position to jerk for h = 1; of the position the height only."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)
@@ -286,8 +271,8 @@ def _of_sample(
     """Evaluate one sample in a mode.
 
     Returns:
-        worst: the greatest excess of the sample; None for a curvature.
-        terms: of the sums over the samples, in the order of the results.
+        worst: greatest excess of the sample; None for a curvature.
+        terms: summands of the results, in their order.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
@@ -305,7 +290,7 @@ def _of_sample(
 
 
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
-    """Return the excess over each limit, of a motion in time over the duration."""
+    """Return the excess over each limit, for a unit motion and a duration h."""
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]
     vel, acc, jerk = (
@@ -317,10 +302,10 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    """Return the sum of hinges times the duration, and the greatest excess of all."""
+    """Return the sum of hinges times the duration, and the greatest excess."""
     excess = sample_excess(along, unit, duration, given)
     hinges = [
-        factor * smoothed_hinge(value + margin, along.hinge_width)
+        factor * smooth_hinge(value + margin, along.hinge_width)
         for value, margin, factor in zip(excess, along.margins, along.hinge_weights, strict=True)
     ]
     return duration * _total(hinges), functools.reduce(jnp.maximum, excess)
@@ -329,7 +314,7 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
     """Return the greatest excess, and the weighted penalty with its slopes by the free arguments.
 
-    The arguments of `_penalty` are first the free ones, then the fixed ones.
+    The arguments of `_penalty` are the free ones, followed by the fixed ones.
     """
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
@@ -339,10 +324,10 @@ def _curvature(
     along: Along, sample: _Sample, free: tuple, given: PyTree, direction: tuple
 ) -> tuple:
     """Return the derivative, along a direction, of the weighted penalty and all its slopes."""
-    columns, duration, moved_given = direction
+    columns, duration, given_change = direction
     moving, tangents, still = free, (unit_motion(sample.row, columns), duration), (given,)
-    if moved_given is not None:
-        moving, tangents, still = (*free, given), (*tangents, moved_given), ()
+    if given_change is not None:
+        moving, tangents, still = (*free, given), (*tangents, given_change), ()
 
     def slopes(*moving: PyTree) -> tuple:
         return _slopes(along, sample.weight, (*moving, *still), ())[1]

@@ -1,10 +1,10 @@
-"""Limits and cost terms of a user's own along a quadrotor's way: a part of the case.
+"""Limits and costs that a user defines along a quadrotor's trajectory: `extras` of a case.
 
-An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, pure and for
-one case. They are called on jax arrays, and `excess` on float64 NumPy arrays by the referee: use
-operators and the methods of both. Another value compiles nothing anew; another class does. The
-search looks at samples some centimetres apart, and a finished plan is looked at every few
-millimetres, peaks in between by tangents; what is smaller than that may be missed.
+An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, which are
+pure and for one case. The planner calls them with jax arrays, and the referee calls `excess` with
+float64 NumPy arrays: use operators and the methods of both. Another value compiles nothing anew;
+another class does. The search evaluates samples some centimetres apart, and the check of a finished
+plan every few millimetres, with tangents in between. Smaller obstacles may be missed.
 """
 
 from collections.abc import Sequence
@@ -26,26 +26,26 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Intervals a piece at which a finished plan is held against extra limits: a way past an edge, or
-# past a small sphere, peaks between two samples of the search.
+# Intervals a piece at which a finished plan is checked against extra limits. Near an edge or a
+# small sphere the excess peaks between samples of the search.
 _CLOSE_NODES = 64
 
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """A limit; the planner keeps it, the referee judges it."""
+    """A limit that the planner keeps and the referee checks."""
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Excess (...) relative to the limit, > 0 where it is broken; arguments (..., 3), SI."""
+        """Return the excess (...), > 0 if broken, of a motion (..., 3) in SI units."""
         ...
 
 
 @runtime_checkable
 class ExtraCost(Protocol):
-    """A term of the planner's cost; the referee does not look at it."""
+    """A term of the planner's cost; the referee ignores it."""
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Cost a second (...), >= 0, integrated along the trajectory; arguments (..., 3), SI."""
+        """Return the cost per second (...), >= 0, of a motion (..., 3) in SI units."""
         ...
 
 
@@ -53,13 +53,13 @@ Extra = ExtraLimit | ExtraCost
 
 
 def _size(vector: Numbers) -> Numbers:
-    """Length (...) of vectors (..., 3); its slope at zero is zero."""
+    """Return the length (...) of vectors (..., 3), with slope zero at zero."""
     return ((vector**2).sum(-1) + 1e-12) ** 0.5
 
 
 @struct.dataclass
 class KeepOut:
-    """A sphere that may not be entered."""
+    """A sphere that the quadrotor must not enter."""
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE),)
 
@@ -67,13 +67,13 @@ class KeepOut:
     radius: Numbers  # () [m], > 0
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Depth over radius."""
+        """Return the depth over the radius."""
         return 1.0 - _size(pos - self.centre) / self.radius
 
 
 @struct.dataclass
 class KeepOutBox:
-    """A box along the world's axes that may not be entered, its sides finite."""
+    """A box along the world's axes, with finite sides, that the quadrotor must not enter."""
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
 
@@ -81,14 +81,14 @@ class KeepOutBox:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Depth under the nearest face, over half of the shortest side."""
+        """Return the depth below the nearest face, over half of the shortest side."""
         half = 0.5 * (self.high - self.low)
         return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
 
 
 @struct.dataclass
 class Plane:
-    """A plane of which only the side that its normal points to may be used: a wall, a ceiling."""
+    """A wall or ceiling: the quadrotor must stay on the side to which the normal points."""
 
     rules: ClassVar[Table] = (Field("normal", None, NOT_ZERO),)
 
@@ -96,13 +96,13 @@ class Plane:
     normal: Numbers  # (3,), of any length
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Metres beyond the plane."""
+        """Return the distance [m] beyond the plane."""
         return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
 
 
 @struct.dataclass
 class Geofence:
-    """A box that may not be left, its sides finite."""
+    """A box, with finite sides, that the quadrotor must not leave."""
 
     rules: ClassVar[Table] = (Field("low", None, below("high")),)
 
@@ -110,16 +110,16 @@ class Geofence:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Metres outside, of the worst axis."""
+        """Return the distance [m] outside, along the worst axis."""
         half = 0.5 * (self.high - self.low)
         return (abs(pos - self.low - half) - half).max(-1)
 
 
 @struct.dataclass
 class SpeedZone:
-    """A speed limit within a sphere, which fades up to 1.25 radii.
+    """A speed limit within a sphere, which fades out up to 1.25 radii.
 
-    There it is speed / (u^2 (3 - 2 u)), u falling from one to zero: continuous with its slope.
+    The limit is speed / (u^2 (3 - 2 u)), where u falls from one to zero: continuous with its slope.
     """
 
     rules: ClassVar[Table] = (
@@ -132,14 +132,14 @@ class SpeedZone:
     speed: Numbers  # () [m/s], > 0
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Speed over the limit, less one."""
+        """Return speed / limit - 1."""
         u = (5.0 - 4.0 * _size(pos - self.centre) / self.radius).clip(0.0, 1.0)
         return u * u * (3.0 - 2.0 * u) * _size(vel) / self.speed - 1.0
 
 
 @struct.dataclass
 class Dislike:
-    """A sphere that is better avoided."""
+    """A sphere with a cost, which the quadrotor avoids if it can."""
 
     rules: ClassVar[Table] = (
         Field("radius", None, POSITIVE),
@@ -151,17 +151,16 @@ class Dislike:
     weight: Numbers  # () [1/s]; the planners' other costs are of the order of 1e-5 to 1
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Weight * (1 - distance^2 / radius^2)^2 inside, nothing outside."""
+        """Return weight * (1 - distance^2 / radius^2)^2 inside, zero outside."""
         inside = 1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
+    """Return extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
 
     Raises:
-        TypeError: they are no sequence, or one of them is no extra.
-        ValueError: an extra is not for one case, and not all of its leaves have these axes.
+        ArgumentError: the extras are no sequence, or one is no extra for one case or for the batch.
     """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
@@ -190,12 +189,12 @@ def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple
 
 
 def num_limits(extras: tuple[Extra, ...]) -> int:
-    """How many of them are limits."""
+    """Return the number of limits among extras."""
     return sum(isinstance(extra, ExtraLimit) for extra in extras)
 
 
 def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ...]:
-    """The excess (N,) over each that is a limit, along samples of a motion."""
+    """Return the excess (N,) over each extra limit, along samples of a motion."""
     samples = motion.pos, motion.vel, motion.acc
     return tuple(extra.excess(*samples) for extra in extras if isinstance(extra, ExtraLimit))
 
@@ -203,15 +202,10 @@ def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ..
 def greatest_extras(
     maps: ProportionalMinco, columns: Array, duration: Array, extras: tuple[Extra, ...]
 ) -> tuple[Array, ...]:
-    """Greatest excess over each that is a limit along a whole segment, () each.
+    """Return the greatest excess () over each extra limit along a whole segment.
 
-    Where it is concave between samples it is not missed: see `penalty.greatest_by_tangents`.
-
-    Args:
-        maps: constant maps of M pieces.
-        columns: (2s + M - 1, 3) boundary rows and whitened offsets.
-        duration: () [s], mean of the pieces.
-        extras: of a case.
+    The maximum is not missed if the excess is concave between samples: see
+    `penalty.greatest_by_tangents`. The other arguments are as for `cost.along`, for one segment.
     """
     if not num_limits(extras):
         return ()
@@ -233,7 +227,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """The cost a second (N,) of all extras, which are the last of what is given."""
+    """Return the cost per second (N,) of all extras, which are the last entry of `given`."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

@@ -1,7 +1,7 @@
 """`greatest_along` on many lanes as one kernel for CUDA.
 
-A thread carries a lane, as in `along_kernel`. It makes the samples one after another and keeps the
-excesses of the last two, so that it sees the parabola through every three neighbours.
+One thread computes one lane, as in `along_kernel`. It computes the samples one after another and
+keeps the excesses of the last two, to evaluate the parabola through each three neighbours.
 """
 
 import functools
@@ -30,12 +30,7 @@ from planner_jax.lanes.pallas import grid_index
 def peaks_kernel(
     along: Along, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel of `greatest_along`.
-
-    Args:
-        along: constants.
-        interpret: run it without a GPU, for tests.
-    """
+    """Make the kernel of `greatest_along`; `interpret` runs it without a GPU."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         columns, durations, *parameters = leaves
@@ -54,7 +49,7 @@ def peaks_kernel(
 def _call(
     along: Along, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the kernel for a grid, of the leaves of its arguments."""
+    """Make the kernel for a grid, a function of the leaves of its arguments."""
     matrices, steps = along.matrices(), np.diff(along.times())
     num_samples, num = len(matrices), len(along.margins)
     share = -(-num_samples // grid.shares)
@@ -64,7 +59,7 @@ def _call(
         matrices_ref, steps_ref, *out = refs[treedef.num_leaves :]
         columns, duration, given = jax.tree.unflatten(treedef, leaves)
         begin = grid_index(2) * share
-        # Of the neighbours' shares one sample on either side, for the parabolas at its ends.
+        # One more sample on either side, for the parabolas at the ends of the share.
         first = jnp.maximum(begin - 1, 0)
         last = jnp.minimum(begin + share + 1, num_samples)
 

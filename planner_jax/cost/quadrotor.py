@@ -1,9 +1,8 @@
-"""How far samples of a trajectory exceed the quadrotor's limits.
+"""Excess of samples of a trajectory over the quadrotor's limits.
 
-Each returns the squared quantity over its squared limit, less one: positive where the limit
-is exceeded, without a square root to differentiate. `relative` turns that into the ratio of
-the quantity to its limit, less one. Vectors may come as tuples of their components, as a
-kernel has them.
+Most functions return q^2 / limit^2 - 1 for a quantity q: positive where the limit is exceeded, and
+differentiable without a square root. `relative` converts it to q / limit - 1. Vectors may be tuples
+of their components, as in a kernel.
 """
 
 import dataclasses
@@ -22,7 +21,6 @@ from planner_jax.cost.along import Along, greatest_along
 from planner_jax.cost.extras import Extra, extra_excess, extra_rate, greatest_extras, num_limits
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
-    RotorLimits,
     body_rate_squared,
     rotor_thrusts,
 )
@@ -31,20 +29,20 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
 def _size_squared(vector: Components) -> Array:
-    """|v|^2 of (..., 3), written out: a CPU compiles a sum over an axis into its own loop."""
+    """Return |v|^2 of (..., 3), written out: XLA compiles a sum over an axis to its own loop."""
     x, y, z = components(vector)
     return x * x + y * y + z * z
 
 
 def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
-    """|v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] [Yu2023bat, eq. 18a]."""
+    """Return |v|^2 / v_max^2 - 1 for velocities (..., 3) [m/s] [Yu2023bat, eq. 18a]."""
     return _size_squared(vel) * reciprocal(limits.speed) ** 2 - 1.0
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """|a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] [Yu2023bat, eq. 18a].
+    """Return |a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] [Yu2023bat, eq. 18a].
 
-    Without such a limit it is -1.
+    Without an acceleration limit it is -1.
     """
     if limits.acceleration is None:
         return 0.0 * components(acc)[0] - 1.0
@@ -54,93 +52,46 @@ def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """|omega|^2 / omega_max^2 - 1 by flatness [Yu2023bat, eq. 18a]."""
+    """Return |omega|^2 / omega_max^2 - 1 by flatness [Yu2023bat, eq. 18a]."""
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
-    """z_min - z [m] for heights (...) [m] ([Yu2023catch, eq. 28], without its squares).
+    """Return z_min - z [m] for heights z (...) [m].
 
-    The squares of the print change sign below ground.
+    It is [Yu2023catch, eq. 28] without the printed squares, which change sign below ground.
     """
     return limits.min_height - height
-
-
-def motion_excess(
-    motion: Motion, gravity: Array, limits: QuadrotorLimits
-) -> tuple[Array, Array, Array, Array]:
-    """[Yu2023bat]'s limits, each (N,): speed, acceleration, body rate, ground (eq. 18a)."""
-    return (
-        speed_excess(motion.vel, limits),
-        acceleration_excess(motion.acc, limits),
-        body_rate_excess(motion.acc, motion.jerk, gravity, limits),
-        ground_excess(motion.height, limits),
-    )
 
 
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
 ) -> tuple[PyTree, ...]:
-    """Excess (N,) over the limits of flight and then over the extra ones, for `cost.along`.
-
-    Args:
-        motion: samples of a trajectory.
-        given: gravity, limits and extras of a case.
-    """
+    """Return the excess (N,) over each limit of flight, then over each extra limit."""
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
 
-def rotor_excess(motion: Motion, gravity: Array, rotors: RotorLimits) -> tuple[Array, ...]:
-    """Excess (N,) of each rotor's thrust over the greatest, then below the least, eight in all.
-
-    Relative to the greatest thrust of a rotor.
-    """
-    thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
-    unit = reciprocal(rotors.max_thrust)
-    above = tuple(thrust * unit - 1.0 for thrust in thrusts)
-    return (*above, *((rotors.min_thrust - thrust) * unit for thrust in thrusts))
-
-
 def relative(squared_excess: Array) -> Array:
-    """Ratio of a quantity to its limit, less one, from the same of the squares."""
+    """Return q / limit - 1 for a quantity q, given q^2 / limit^2 - 1."""
     return jnp.sqrt(jnp.maximum(squared_excess + 1.0, 1e-12)) - 1.0
 
 
 def thrust_excess(
     acc: Components, gravity: Array, least: Array, most: Array
 ) -> tuple[Array, Array]:
-    """How far the squared thrust f^2 leaves its bounds: 1 - f^2/least^2, f^2/most^2 - 1.
+    """Return 1 - f^2 / least^2 and f^2 / most^2 - 1 for the thrust f per unit mass [m/s^2].
 
-    Args:
-        acc: (..., 3) [m/s^2].
-        gravity: () [m/s^2].
-        least: () [m/s^2], per unit mass.
-        most: () [m/s^2], per unit mass.
+    The accelerations are (..., 3).
     """
     x, y, z = components(acc)
     squared = _size_squared((x, y, z + gravity))
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
 
 
-def thrust_band_excess(acc: Components, gravity: Array, least: Array, most: Array) -> Array:
-    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f, as the code of [Yu2023catch] does.
-
-    Args:
-        acc: (..., 3) [m/s^2].
-        gravity: () [m/s^2].
-        least: () [m/s^2], per unit mass.
-        most: () [m/s^2], per unit mass.
-    """
-    x, y, z = components(acc)
-    thrust = jnp.sqrt(jnp.maximum(_size_squared((x, y, z + gravity)), 1e-6))
-    middle, half = 0.5 * (most + least), 0.5 * (most - least)
-    return (thrust - middle) ** 2 - half**2
-
-
 class QuadrotorCase(Protocol):
-    """What the penalties of a flight take from a case, which is a dataclass."""
+    """The fields of a case, a dataclass, that the penalties of a flight use."""
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[PyTree]]]
 
@@ -166,12 +117,12 @@ class QuadrotorCase(Protocol):
 
     @property
     def extras(self) -> tuple[Extra, ...]:
-        """Limits and costs of the user's own."""
+        """Limits and costs that the user defines."""
         ...
 
 
 class Measure(enum.Enum):
-    """What an excess is in the terms of the quantity q and its limit, and what it is of."""
+    """The formula of an excess in terms of the quantity q and its limit."""
 
     ABOVE = "q^2 / most^2 - 1"
     BELOW = "1 - q^2 / least^2"
@@ -179,11 +130,11 @@ class Measure(enum.Enum):
 
     @property
     def factor(self) -> float:
-        """By which a small relative excess shows in it."""
+        """Ratio of the excess to a small relative excess of q."""
         return 1.0 if self is Measure.PLAIN else 2.0
 
     def relative(self, excess: Array) -> Array:
-        """The relative excess of the quantity."""
+        """Return the relative excess of q."""
         if self is Measure.ABOVE:
             return relative(excess)
         if self is Measure.BELOW:
@@ -191,88 +142,78 @@ class Measure(enum.Enum):
         return excess
 
 
-def _rotor_excess(motion: Motion, gravity: Array, own: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return `rotor_excess` by limits that have rotors."""
-    assert own.rotors is not None
-    return rotor_excess(motion, gravity, own.rotors)
+def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
+    """Return each rotor's thrust above its maximum, then below its minimum, over the maximum."""
+    rotors = limits.rotors
+    assert rotors is not None
+    thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
+    unit = reciprocal(rotors.max_thrust)
+    above = tuple(thrust * unit - 1.0 for thrust in thrusts)
+    return (*above, *((rotors.min_thrust - thrust) * unit for thrust in thrusts))
 
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """Limits that are there together, or not."""
+    """Limits that a quadrotor has together or not at all."""
 
-    field: str  # of `QuadrotorLimits`, None where they are not there
+    field: str  # of `QuadrotorLimits`; None there without these limits
     measures: tuple[Measure, ...]  # one for each excess
-    excess: Callable[
-        [Motion, Array, QuadrotorLimits], tuple[Array, ...]
-    ]  # of motion, gravity and limits
-    orders: tuple[int, ...]  # of the motion, that they look at
+    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # takes the gravity, too
+    orders: tuple[int, ...]  # derivatives of the motion in the excess
 
 
+_ABOVE, _BELOW, _PLAIN = Measure
 _KINDS = (
-    _Kind(
-        "speed",
-        (Measure.ABOVE,),
-        lambda motion, gravity, own: (speed_excess(motion.vel, own),),
-        (1,),
-    ),
+    _Kind("speed", (_ABOVE,), lambda motion, _, own: (speed_excess(motion.vel, own),), (1,)),
     _Kind(
         "acceleration",
-        (Measure.ABOVE,),
-        lambda motion, gravity, own: (acceleration_excess(motion.acc, own),),
+        (_ABOVE,),
+        lambda motion, _, own: (acceleration_excess(motion.acc, own),),
         (2,),
     ),
     _Kind(
         "body_rate",
-        (Measure.ABOVE,),
+        (_ABOVE,),
         lambda motion, gravity, own: (body_rate_excess(motion.acc, motion.jerk, gravity, own),),
         (2, 3),
     ),
     _Kind(
         "max_thrust",
-        (Measure.BELOW, Measure.ABOVE),
+        (_BELOW, _ABOVE),
         lambda motion, gravity, own: thrust_excess(motion.acc, gravity, *own.thrust_bounds),
         (2,),
     ),
     _Kind(
-        "min_height",
-        (Measure.PLAIN,),
-        lambda motion, gravity, own: (ground_excess(motion.height, own),),
-        (0,),
+        "min_height", (_PLAIN,), lambda motion, _, own: (ground_excess(motion.height, own),), (0,)
     ),
-    _Kind(
-        "rotors",
-        (Measure.PLAIN,) * 8,
-        _rotor_excess,
-        (2, 3, 4),
-    ),
+    _Kind("rotors", (_PLAIN,) * 8, _rotor_excess, (2, 3, 4)),
 )
 
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
-    """Those that there are."""
+    """Return the kinds of limits that a quadrotor has."""
     return [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
 
 
 def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Excess (N,) over each of the limits that there are, in the order of `flight_measures`."""
+    """Return the excess (N,) over each existing limit, in the order of `flight_measures`."""
     return tuple(
         excess for kind in _kinds(limits) for excess in kind.excess(motion, gravity, limits)
     )
 
 
 def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
-    """What the excesses of `flight_excess` are."""
+    """Return the measures of the excesses of `flight_excess`."""
     return tuple(measure for kind in _kinds(limits) for measure in kind.measures)
 
 
 def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
-    """Return the fields of the limits that the excesses of `flight_excess` belong to."""
+    """Return the field of the limits for each excess of `flight_excess`."""
     return tuple(kind.field for kind in _kinds(limits) for _ in kind.measures)
 
 
 def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
-    """Relative excesses, of those of `flight_excess`."""
+    """Return the relative excesses, given the results of `flight_excess`."""
     measures = flight_measures(limits)
     return [of.relative(each) for of, each in zip(measures, excess, strict=True)]
 
@@ -280,14 +221,9 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Penalties of all limits of a flight along its way; squares carry twice the relative margin.
+    """Return the penalties of all limits along a flight; squares get twice the relative margin.
 
-    Args:
-        maps: of the trajectory.
-        nodes: intervals a piece.
-        case: with `limits` and `extras`, whose arrays are not looked at.
-        margin: relative, at which penalties begin inside a limit.
-        hinge_width: of the smoothed hinges.
+    Of the case only the existence of its `limits` and `extras` matters, not their values.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
@@ -299,7 +235,7 @@ def flight_along(
 
 
 def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Places (order, axis) of the motion that limits look at together; of positions, the height."""
+    """Return the slots (order, axis) of the motion in common limits; of positions, the height."""
     together: list[set[int]] = []
     for kind in _kinds(limits):
         joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))
@@ -313,16 +249,10 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
 def greatest_excess(
     maps: ProportionalMinco, nodes: int, columns: Array, durations: Array, case: QuadrotorCase
 ) -> list[Array]:
-    """By how much a finished plan of N segments exceeds each limit, relative, (N,) each.
+    """Return the greatest relative excess over each limit in N segments of a plan, (N,) each.
 
-    Peaks between the samples count: those of flight by parabolas, those of extras by tangents.
-
-    Args:
-        maps: of a segment.
-        nodes: intervals a piece at which the limits of flight are looked at.
-        columns: (N, C, 3) boundary rows and whitened offsets of each segment.
-        durations: (N,) [s], mean of its pieces.
-        case: with `gravity`, `limits` and `extras`.
+    Peaks between the samples count, by parabolas for limits of flight and by tangents for extras.
+    The other arguments are as for `greatest_along`.
     """
     bare = dataclasses.replace(case, extras=())
     along = flight_along(maps, nodes, bare, 0.0, 1.0)

@@ -1,9 +1,9 @@
 """Functions of one lane that have a kernel for CUDA, and the switch for all kernels.
 
-A function with a kernel is compiled under a name of its own (`jax.jit`), the only mark that every
-transformation of a larger function preserves. `over_lanes` sees a call of that name and calls the
-kernel instead. A kernel's module is imported when a program for a GPU is traced, and never on a
-machine without one.
+A function with a kernel is compiled by `jax.jit` under a name of its own, the only mark that every
+transformation of an enclosing function preserves. `over_lanes` finds a call of that name and calls
+the kernel instead. A kernel's module is imported when a program for a GPU is traced, and never on a
+machine without a GPU.
 """
 
 import dataclasses
@@ -27,14 +27,14 @@ SWITCH = "PLANNER_JAX_KERNELS"
 
 Results = TypeVar("Results")
 Shape = tuple[int, ...]
-Treedef = Any  # a PyTreeDef, whose class JAX does not show to type checkers
+Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
 # Takes the leaves of a function's arguments, with the lanes last; returns the leaves of the
 # results, or None if the kernel does not support such shapes or types.
 Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
-    """Whether programs for CUDA have kernels, in words."""
+    """The state of kernels in programs for CUDA, in words."""
 
     ON = "on"
     OFF = f"off, by {SWITCH}"
@@ -53,7 +53,7 @@ def kernels() -> Kernels:
 
 
 def in_use() -> bool:
-    """Return whether a function that is traced at this time gets kernels. Raises as `kernels`."""
+    """Return whether a function that is traced at present gets kernels. Raises as `kernels`."""
     return is_switched_on() and has_gpu() and _has_triton()
 
 
@@ -85,7 +85,7 @@ class _Entry:
     path: str
     constants: tuple[Hashable, ...]
     treedef: Treedef  # of the arguments
-    shapes: list[Shape]  # of the leaves of one lane's arguments, then of the results
+    shapes: list[Shape]  # of the leaves of one lane's arguments and results
 
 
 _ENTRIES: dict[str, _Entry] = {}  # by the names of compiled functions
@@ -100,44 +100,44 @@ def with_kernel(
     """Attach a kernel to a function; `over_lanes` calls it in programs for CUDA.
 
     Args:
-        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
-        path: "module:name" of a factory of kernels. Of the constants it makes a function of the
-            tree of the arguments and of their leaves with the lanes last, to the leaves of the
-            results, or None. `jax.vmap` within a lane adds axes in front of some leaves; where it
-            has added one elsewhere, as after a matrix product, the kernel is not called.
-        constants: of the factory. Functions of one path with different constants must differ in
-            the `repr` of these, by which programs in the compile cache are found again.
-        jvp: derivative as `jax.custom_jvp` takes it, with zeros as `SymbolicZero`; by default the
+        function: takes pytrees of arrays of ONE lane, and returns a pytree of arrays.
+        path: "module:name" of a factory of kernels, which takes the constants. A kernel takes the
+            tree of the arguments and their leaves with the lanes last, and returns the leaves of
+            the results, or None. `jax.vmap` within a lane adds axes in front of some leaves. If it
+            adds an axis elsewhere, such as after a matrix product, the kernel is not called.
+        constants: arguments of the factory. Functions of one path with different constants must
+            have a different `repr` of them, which identifies programs in the compile cache.
+        jvp: derivative as for `jax.custom_jvp`, with zeros as `SymbolicZero`; by default the
             function's own.
     """
 
     @functools.cache
-    def compiled(treedef: Treedef, shapes: tuple[Shape, ...]) -> Callable[..., Results]:
+    def compile_named(treedef: Treedef, shapes: tuple[Shape, ...]) -> Callable[..., Results]:
         text = repr((path, constants, treedef, shapes))
         name = f"kernel_{zlib.crc32(text.encode()):08x}"
         while name in _ENTRIES:
             name += "_"
         entry = _ENTRIES[name] = _Entry(path, constants, treedef, [])
 
-        def named(*leaves: Array) -> Results:
+        def call(*leaves: Array) -> Results:
             results = function(*jax.tree.unflatten(treedef, leaves))
             entry.shapes = [*shapes, *(leaf.shape for leaf in jax.tree.leaves(results))]
             return results
 
-        named.__name__ = named.__qualname__ = name
-        return jax.jit(named)
+        call.__name__ = call.__qualname__ = name
+        return jax.jit(call)
 
-    # JAX's own derivative of the named function would bear its name, and get its kernel.
+    # JAX's own derivative of the named function would have its name, and get its kernel.
     @jax.custom_jvp
-    def guarded(*args: object) -> Results:
+    def call_named(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
-        return compiled(treedef, tuple(map(jnp.shape, leaves)))(*leaves)
+        return compile_named(treedef, tuple(map(jnp.shape, leaves)))(*leaves)
 
     if jvp is None:
-        guarded.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
+        call_named.defjvp(lambda primals, tangents: jax.jvp(function, primals, tangents))
     else:
-        guarded.defjvp(jvp, symbolic_zeros=True)
-    return guarded
+        call_named.defjvp(jvp, symbolic_zeros=True)
+    return call_named
 
 
 def shape_of(atom: Any) -> Shape:
@@ -150,7 +150,7 @@ def kernel_of(eqn: JaxprEqn) -> Kernel | None:
     entry = _ENTRIES.get(eqn.params.get("name", ""))
     if entry is None:
         return None
-    # The halves into which reverse mode splits a function keep its name, but not all its shapes.
+    # Reverse mode splits a function in two that keep its name, but not all of its shapes.
     shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(entry.shapes) and all(
         of_call[len(of_call) - len(of_lane) :] == of_lane

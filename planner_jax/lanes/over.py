@@ -1,9 +1,9 @@
 """`over_lanes`: `jax.vmap` that keeps the lanes on the last axis of every array.
 
-`vmap` puts the lanes first, so that the few numbers of one lane lie next to each other. In a
-loop that is bound by memory the neighbours should be the same number of other lanes: every
-read is then one whole line of memory, a sum over samples needs no exchange between threads,
-and the product with a constant matrix is one large product. Same numbers, another layout.
+`vmap` puts the lanes first, so that the few numbers of one lane are neighbours in memory. In a loop
+that is bound by memory, the neighbours should be the same number of other lanes: then every read is
+one whole line of memory, a sum over samples needs no exchange between threads, and the product with
+a constant matrix is one large product. The numbers are the same in another layout.
 """
 
 import functools
@@ -23,8 +23,8 @@ Results = TypeVar("Results")
 _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
-# Operations that return their operands. In a program for several devices `jnp.where` and others
-# state by `reshard` that an array is a device's own, which in one lane all are.
+# Operations that return their operands. In a program for several devices `jnp.where` and others use
+# `reshard` to mark an array as local to a device; within one lane every array is.
 _UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "
@@ -32,7 +32,7 @@ _ELEMENTWISE = frozenset(
     "lt max min mul ne neg not or pow reduce_precision rem round rsqrt select_n sign sin sinh "
     "sqrt square sub tan tanh xor".split()
 )
-# Their parameters name axes by number from the front, which the lanes do not move.
+# Operations whose parameters count axes from the front, which the lanes do not change.
 _BY_AXIS = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
     "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
@@ -53,17 +53,17 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
     """Map a function of one lane over many lanes at once.
 
     Args:
-        function: of pytrees of arrays of ONE lane, to a pytree of arrays.
+        function: takes pytrees of arrays of ONE lane, and returns a pytree of arrays.
 
     Returns:
-        A function of the same pytrees with one more, last, axis on every leaf: the lanes.
-        Its results have the lanes last, too. To rounding it is `jax.vmap` with all axes -1; it
-        is meant for the inside of a compiled function, and cannot be differentiated where
-        `function` has custom derivatives (differentiate within `function`).
+        A function of the same pytrees with the lanes as one more, last, axis on every leaf. Its
+        results have the lanes last, too. Up to rounding it is `jax.vmap` with all axes -1. It is
+        meant for use inside a compiled function. It cannot be differentiated if `function` has
+        custom derivatives; differentiate within `function` instead.
     """
 
     @functools.wraps(function)
-    def mapped(*args: object) -> Results:
+    def map_lanes(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
         lanes = leaves[0].shape[-1]
         single = [jax.ShapeDtypeStruct(leaf.shape[:-1], leaf.dtype) for leaf in leaves]
@@ -73,7 +73,7 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
         results = _full_results(closed, leaves, lanes)
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
-    return mapped
+    return map_lanes
 
 
 def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
@@ -108,7 +108,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
-    """Evaluate one operation, by a kernel or a rule if there is one for it."""
+    """Evaluate one operation, by a kernel or a rule if it has one."""
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
@@ -138,8 +138,9 @@ def _by_kernel(
 ) -> list[_Value]:
     """Evaluate a call of a function that has a kernel.
 
-    The program holds both: the kernel, which is compiled for CUDA, and the function's operations,
-    which are compiled for every other device, or where the kernel does not support the shapes.
+    The program contains both: the kernel, which is compiled for CUDA, and the function's
+    operations, which are compiled for other devices, and for shapes that the kernel does not
+    support.
     """
     pairs = zip(inputs, eqn.invars, strict=True)
     arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]
@@ -152,7 +153,7 @@ def _by_kernel(
         results = kernel(leaves)
         if results is None:
             return by_operations(*leaves)
-        # A result that does not vary along an axis of `vmap` does not have it.
+        # A result that does not vary along an axis of `vmap` lacks this axis.
         pairs = zip(results, shapes, strict=True)
         results = [result[(0,) * (result.ndim - len(shape))] for result, shape in pairs]
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))
@@ -171,7 +172,7 @@ def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Ar
 def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
     """Return an operand of an elementwise operation, of (*shape, lanes)."""
     array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
-    if array.ndim == 1 and shape:  # one number a lane, such as the bound of a clamp
+    if array.ndim == 1 and shape:  # one number for each lane, such as the bound of a clamp
         array = array.reshape((1,) * len(shape) + array.shape)
     return jnp.broadcast_to(array, (*shape, lanes))
 

@@ -1,7 +1,7 @@
 """The only module that imports Pallas, JAX's language for kernels.
 
-Kernels are written for Pallas' Triton backend. When JAX removes it, what has to be rewritten is
-this file (docs/lanes_and_kernels.md).
+Kernels use Pallas' Triton backend. When JAX removes it, this is the only module to rewrite
+(docs/lanes_and_kernels.md).
 """
 
 import importlib.util
@@ -17,19 +17,17 @@ from jax.experimental import pallas
 from jax.experimental.pallas.triton import CompilerParams, load, store
 from jax.typing import DTypeLike
 
-# Shape of a block, None for an axis that it does not have; and its index, counted in blocks, as
-# a function of the index in the grid.
+# Shape of a block, None for an axis that it lacks; and its index, counted in blocks, as a function
+# of the index in the grid.
 Block = tuple[tuple[int | None, ...], Callable[..., tuple]]
 
-_FEWEST = 16  # lanes that are worth a block of a kernel
+_FEWEST = 16  # least lanes of a block of a kernel
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the lanes of a kernel's block; None where they would be too few to be worth one.
+    """Return the width of a kernel's block in lanes, or None if it would be too small.
 
-    Args:
-        lanes: of all blocks together, which the width divides evenly.
-        most: largest width, a power of two.
+    The width divides the number of lanes, and is at most `most`, a power of two.
     """
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
@@ -49,13 +47,13 @@ def kernel_call(
     """Make a kernel: a function of arrays that runs a body once for every index of a grid.
 
     Args:
-        body: of references to a block of each input, then of each output, which it writes.
-        grid: its size along each axis.
-        inputs: the block of every input.
+        body: takes references to a block of each input, then of each output, which it writes.
+        grid: size along each axis.
+        inputs: block of every input.
         outputs: shape, type and block of every output.
-        name: of the kernel, in profiles and compiled programs.
-        threads: that carry out the body.
-        in_place: so many of the first inputs are overwritten by the outputs of the same index.
+        name: name of the kernel in profiles and compiled programs.
+        threads: threads that run the body.
+        in_place: number of first inputs that the outputs of the same index overwrite.
         interpret: run it without a GPU, for tests.
     """
     _spare_searches()
@@ -84,18 +82,10 @@ def kernel_by_lanes(
     in_place: int = 0,
     interpret: bool = False,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a `kernel_call` in float32, each block of which has all numbers of `width` lanes.
+    """Make a `kernel_call` in float32 whose blocks hold all numbers of `width` lanes.
 
-    Args:
-        body: as for `kernel_call`.
-        inputs: shapes of the inputs without the lanes, which are their last axis.
-        outputs: shapes of the outputs without the lanes.
-        lanes: of all blocks together.
-        width: lanes of a block.
-        name: as for `kernel_call`.
-        threads: that carry out the body; by default one a lane.
-        in_place: as for `kernel_call`.
-        interpret: as for `kernel_call`.
+    `inputs` and `outputs` are shapes without the lanes, which are the last axis. There is one
+    thread for each lane by default. The other arguments are as for `kernel_call`.
     """
 
     def block(shape: tuple[int, ...]) -> Block:
@@ -129,10 +119,10 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Lower a kernel in two thirds of the time.
+    """Reduce the time to lower a kernel by a third.
 
-    For every value that MLIR passes to Python, it imports a module of Triton's dialect, which
-    jaxlib does not ship: thousands of searches of the path, unless an empty module is there.
+    For every value that MLIR passes to Python, it imports a module of Triton's dialect that jaxlib
+    does not contain. An empty module saves thousands of searches of the path.
     """
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:

@@ -1,7 +1,7 @@
 """The planner of quadrotor trajectories of N minimum-snap segments with free ends.
 
-Hits have one segment that ends at the racket's contact, catches one segment to each target, and
-recovery trajectories one segment that ends at standstill. A task adds what its end variables mean.
+Hits have one segment that ends at the impact on the racket, catches one segment to each target, and
+recovery trajectories one segment to standstill. A task defines the meaning of the end variables.
 """
 
 import abc
@@ -20,11 +20,11 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import CaseT, PlanT
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import BETWEEN_NODES, Along, integrate_along
-from planner_jax.cost.penalty import smoothed_hinge
+from planner_jax.cost.penalty import smooth_hinge
 from planner_jax.cost.quadrotor import QuadrotorCase, flight_along, greatest_excess
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Curvature, Evaluation
-from planner_jax.optimise.shipped import StartNetwork, cheaper_start, shipped_scale
+from planner_jax.optimise.shipped import StartNetwork, load_scale, select_start
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 from planner_jax.trajectory.proportional_minco import (
     Chain,
@@ -41,13 +41,13 @@ _ORDER = 4  # minimum snap
 
 @struct.dataclass
 class ChainEnds:
-    """The ends of N segments, which the end variables describe."""
+    """The ends of N segments, as functions of the end variables."""
 
     durations: Float[Array, " N"]  # [s], of the segments
     tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor
-    total_time: Float[Array, ""]  # [s], of the segments that are there
-    excess: Float[Array, "..."]  # at the ends over what is allowed there; <= 0 is good
-    contact: PyTree = None  # what the plan says of the ends
+    total_time: Float[Array, ""]  # [s], of the active segments
+    excess: Float[Array, "..."]  # over the limits at the ends; feasible if <= 0
+    contact: PyTree = None  # task-specific data of the ends for the plan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     """A planner of N minimum-snap segments of M pieces each.
 
     Decision variables, for each segment in units of `scale`: whitened waypoint offsets, and K end
-    variables, the first of which is the logarithm of the segment's duration.
+    variables. The first end variable is the logarithm of the segment's duration.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * total time + integral of the smoothed
     hinges of the limits and of the case's extras + end_weight * smoothed hinges of the excess at
@@ -63,18 +63,18 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     """
 
     subspace = 0
-    package: ClassVar[str]  # whose folder holds the measured scales and the networks
-    shipped_name: ClassVar[str] = "exact"  # of the scales there
+    package: ClassVar[str]  # package with the measured scales and the networks
+    shipped_name: ClassVar[str] = "exact"  # of the scales in the package
     num_end_variables: ClassVar[int]  # K
-    guess_table: ClassVar[np.ndarray]  # a row for each starting point, best first
+    guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
     # Intervals a piece at which finished plans of one and of several segments are checked. Body
-    # rates peak sharply where the thrust is small, as it is between catches.
+    # rates peak sharply where the thrust is small, which happens between catches.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of the pieces
     nodes: int = 8  # penalty intervals a piece
     time_weight: float = 0.005
     energy_weight: float = 3e-8
-    margin: float = 0.03  # penalties begin this far inside a limit, relative
+    margin: float = 0.03  # relative distance from a limit at which penalties start
     hinge_width: float = 0.1
     scale: tuple[float, ...] = ()  # of one segment
 
@@ -89,11 +89,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return the ends that the end variables, in SI units, describe."""
+        """Return the ends for end variables in SI units."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return the end variables, in SI units, of the first starting points."""
+        """Return the end variables of the first starting points, in SI units."""
 
     @abc.abstractmethod
     def make_plan(
@@ -103,15 +103,15 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         violation: Float[Array, ""],
         context: PyTree,
     ) -> PlanT:
-        """Return the plan of a trajectory; its cost and status are `pending`."""
+        """Return the plan of a trajectory, with `pending` cost and status."""
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the hinges at the ends beside the integrals."""
+        """Weight [s] of the hinges at the ends, relative to the integrals."""
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which segments are there."""
+        """Return which segments exist."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
@@ -119,7 +119,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
-        """Return the network for the first starting point of such cases, None without one."""
+        """Return the network for the first starting point of such cases, or None."""
         return None
 
     def start_features(self, context: PyTree) -> Float[Array, " F"]:
@@ -131,13 +131,13 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return a scale for the planner's variables, made of one for fewer of them."""
+        """Return a scale for the planner's variables, made from a scale for fewer variables."""
         return scale
 
     @property
     def _usual_scale(self) -> tuple[float, ...]:
-        """The measured scale for so many pieces."""
-        return shipped_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
+        """Measured scale for this number of pieces."""
+        return load_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
 
     @property
     def num_pieces(self) -> int:
@@ -151,7 +151,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary and offsets to a segment."""
+        """Constant maps from boundary rows and offsets to a segment."""
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
@@ -166,10 +166,10 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             return points
         learned = self.limit_learned(points[0] + network(self.start_features(context)))
         cost = lambda point: self.objective(point, context).cost  # noqa: E731
-        return points.at[0].set(cheaper_start(cost, points[0], learned))
+        return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Return the whitened offsets (N, O, 3) and the end variables (N, K) in SI units."""
+        """Return the whitened offsets (N, O, 3), and the end variables (N, K) in SI units."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
@@ -187,7 +187,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Return what the end variables contribute to the objective.
+        """Return the contribution of the end variables to the objective.
 
         Returns:
             Boundary rows (N, 8, 3) and mean durations of a piece (N,) [s] of the segments, the cost
@@ -200,16 +200,16 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         spent = self.energy_weight * self._count(energies, context)
         if self.time_weight:
             spent = spent + self.time_weight * ends.total_time
-        hinges = smoothed_hinge(ends.excess + self.margin, self.hinge_width)
+        hinges = smooth_hinge(ends.excess + self.margin, self.hinge_width)
         core = self.end_weight * jnp.sum(hinges) + spent
         return rows, durations, core, jnp.max(ends.excess)
 
     def _count(self, values: Float[Array, " N"], context: PyTree) -> Array:
-        """Return the sum over the segments that are there."""
+        """Return the sum over the active segments."""
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return the cost, and the largest excess at the penalty nodes (squares over squares)."""
+        """Return cost and largest excess at the penalty nodes, as a ratio of squares."""
         case = context.case
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
@@ -227,10 +227,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             violation=jnp.maximum(worst, at_ends) + BETWEEN_NODES,
         )
 
-    def curved(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
+    def curvature_at(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
         """Return evaluation, gradient, and second derivatives; see `chain_curvature`."""
-        # Only Newton's method needs them.
-        from planner_jax.optimise.chain_curvature import chain_curvature
+        from planner_jax.optimise.chain_curvature import (
+            chain_curvature,
+        )  # only Newton's method needs it
 
         case = context.case
         offsets, natural = self.split(point)
@@ -248,7 +249,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point, its violation that of `decode_nodes` and between them."""
+        """Return the plan at a point; its violation covers `decode_nodes` and the peaks between."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

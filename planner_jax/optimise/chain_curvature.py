@@ -1,8 +1,8 @@
-"""Second derivatives of a minimum-snap trajectory of segments, by its ends and its offsets.
+"""Second derivatives of a minimum-snap trajectory by its end variables and its offsets.
 
-Hits have one segment and catches one for each target. The penalties along the way are known by the
-columns of a segment and its duration (`cost.along_curvature`), and the ends make columns and
-durations from a few variables each: what is known of the one is pulled back to the other.
+`cost.along_curvature` differentiates the penalties along the trajectory by the columns and the
+duration of a segment. The end variables determine columns and durations, and the chain rule pulls
+those derivatives back to them.
 """
 
 import functools
@@ -24,8 +24,8 @@ from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
-# Of the variables of the ends (N, k): boundary rows (N, 2s, 3), mean durations of a piece (N,) [s],
-# the cost of the ends (), and the greatest excess there ().
+# Takes the end variables (N, k). Returns boundary rows (N, 2s, 3), mean durations of a piece (N,)
+# [s], the cost of the ends (), and the greatest excess at the ends ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 
@@ -41,68 +41,65 @@ def chain_curvature(
     energy_weight: float,
     active: Array,
 ) -> Curvature:
-    """Evaluation, gradient and second derivatives of a trajectory's objective at a point.
+    """Return evaluation, gradient and second derivatives of a trajectory's objective at a point.
 
-    All second derivatives are made for products alone; the preconditioner takes those among the
-    variables of the ends, and of each offset by itself.
-
-    The objective is the cost of the ends, and of each segment that counts the energy of its offsets
-    and the integral of its penalties. A point is, segment by segment, the offsets and then the
-    variables of the ends, in units of `scale`.
+    The objective is the cost of the ends, plus for each active segment the energy of its offsets
+    and the integral of its penalties. A point lists, segment by segment, the offsets and the end
+    variables, in units of `scale`. All second derivatives enter products with directions. The
+    preconditioner uses those among the end variables, and the diagonal for the offsets.
 
     Args:
         maps: constants of a segment; M pieces, s = order.
-        along: penalties along the way.
-        ends: what the variables of the ends make. The first of each segment's is the logarithm of
-            its duration and of nothing else; the head state of the first segment is given.
-        found: what `ends` comes to at `natural`.
-        natural: (N, k) variables of the ends.
+        along: penalties along the trajectory.
+        ends: function of the end variables. The first variable of each segment is the logarithm of
+            its duration and affects nothing else. The first segment's initial state is fixed.
+        found: result of `ends` at `natural`.
+        natural: (N, k) end variables.
         offsets: (N, M - 1, 3) whitened waypoint offsets.
         scale: (3 (M - 1) + k,) units of one segment's variables.
-        parameters: that the excess takes.
-        energy_weight: of the energy, in the cost.
-        active: (N,) bool, the segments that count.
+        parameters: second argument of the excess.
+        energy_weight: weight of the energy in the cost.
+        active: (N,) bool, the segments that exist.
 
     Returns:
-        With the greatest excess, of the ends or of the nodes along the way, as `violation`, and
-        `BETWEEN_NODES` added.
+        The `violation` is the greatest excess, of the ends or of the nodes, plus `BETWEEN_NODES`.
     """
     rows, durations, core, excess = found
     num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
-    given = order if num == 1 else 0  # rows of a head state that moves by the duration alone
+    given = order if num == 1 else 0  # rows of a head state, which depend on the duration alone
     columns = jnp.concatenate([rows, offsets], axis=1)
     one = functools.partial(curvature_along, along, parameters=parameters, given=given)
     of = jax.vmap(lambda columns, duration: one(columns, duration))(columns, durations)
     worst = jnp.max(jnp.where(active, of.worst, -jnp.inf))
 
-    def counting(values: Array) -> Array:
+    def keep_active(values: Array) -> Array:
         return jnp.where(active.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
 
-    of = jax.tree.map(counting, of)
-    num_rows = rows.shape[1] - given  # that move
+    of = jax.tree.map(keep_active, of)
+    num_rows = rows.shape[1] - given  # variable rows
     energies = jax.vmap(functools.partial(offset_energy, maps))(offsets, durations)
-    energies = energy_weight * counting(energies)
-    bend = counting(2.0 * energy_weight * maps.offset_energy / durations**power)[:, None, None]
+    energies = energy_weight * keep_active(energies)
+    bend = keep_active(2.0 * energy_weight * maps.offset_energy / durations**power)[:, None, None]
     by_rows = of.by_columns[:, :num_rows]
 
-    def pulled(natural: Array) -> tuple[Array, Array]:
+    def pull_back(natural: Array) -> tuple[Array, Array]:
         rows, _, core, _ = ends(natural.reshape(num, -1))
         moving = rows[:, given:]
         return jnp.sum(by_rows * moving) + core, moving
 
     def slope(natural: Array) -> tuple[Array, Array]:
-        return jax.grad(pulled, has_aux=True)(natural)
+        return jax.grad(pull_back, has_aux=True)(natural)
 
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # Of what is pulled back: the Hessian (N k, N k), and how rows move, (N k, N, rows, 3).
+    # `within`: Hessian (N k, N k) of `pull_back`; `turned`: Jacobian of rows (N k, N, rows, 3).
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies
     own_units, offset_units = scale[3 * offsets.shape[1] :], scale[: 3 * offsets.shape[1]]
 
-    def joined(offsets: Array, natural: Array) -> Array:
+    def join(offsets: Array, natural: Array) -> Array:
         parts = [offsets.reshape(num, -1) * offset_units, natural.reshape(num, -1) * own_units]
         return jnp.concatenate(parts, axis=1).ravel()
 
@@ -123,13 +120,13 @@ def chain_curvature(
             own = dot(turned, image[:, :num_rows], 3) + dot(within, move.ravel(), 1)
             own = own.reshape(num, -1).at[:, 0].add(theta)
             outer = image[:, num_rows:] + bend * step - power * bend * offsets * longer
-            return joined(outer, own)
+            return join(outer, own)
 
         return product
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # The second derivatives among all variables of the ends, and of each offset by itself.
+    # Second derivatives among all end variables, and the diagonal for the offsets.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)
@@ -145,11 +142,11 @@ def chain_curvature(
             cost=jnp.sum(of.penalty + energies) + core,
             violation=jnp.maximum(worst, excess) + BETWEEN_NODES,
         ),
-        gradient=joined(by_offsets, by_natural),
+        gradient=join(by_offsets, by_natural),
         products=products,
         preconditioner=block_preconditioner(
             places.reshape(1, -1),
             (block * units * units[:, None])[None],
-            joined(own_bend * offset_units.reshape(offsets.shape[1:]), jnp.zeros_like(natural)),
+            join(own_bend * offset_units.reshape(offsets.shape[1:]), jnp.zeros_like(natural)),
         ),
     )

@@ -1,8 +1,8 @@
 """Gradients of an optimal plan by the implicit function theorem.
 
-At an optimum u*(theta) the gradient of the objective vanishes, so
+At an optimum u*(theta) the gradient of the objective J vanishes, so
 du*/dtheta = -J_uu^-1 J_utheta: one linear solve with the Hessian, whatever the number of
-iterations that led there, and nothing is unrolled.
+iterations that found u*; nothing is unrolled.
 """
 
 import functools
@@ -26,7 +26,7 @@ from planner_jax.optimise.settings import LbfgsConfig, Objective
 
 @struct.dataclass
 class _Newton:
-    """One lane of the refinement: where it is, and where it will look next."""
+    """The state of the refinement: the best point so far, and the next point to evaluate."""
 
     point: Array  # (n,)
     cost: Array  # ()
@@ -41,21 +41,12 @@ class _Newton:
 def newton_refine(
     objective: Objective, point: Array, *, max_steps: int, stationarity: Array | float
 ) -> tuple[Array, Array]:
-    """Bring a nearly stationary point to the optimum of its basin.
+    """Move a nearly stationary point (n,) to the optimum of its basin.
 
-    Damped Newton steps, the eigenvalues of the Hessian made positive. A step is taken where it
-    lowers the cost, or the gradient at a cost that is the same to rounding; otherwise the
-    next is damped more.
-
-    Args:
-        objective: of one problem.
-        point: (n,).
-        max_steps: Hessians at most.
-        stationarity: stops where the gradient's norm is below this.
-
-    Returns:
-        point: (n,).
-        slope: () norm of the gradient there.
+    Damped Newton steps, with the eigenvalues of the Hessian made positive. A step is accepted if it
+    lowers the cost, or lowers the gradient at a cost that is equal up to rounding; otherwise the
+    damping grows. The refinement ends after `max_steps` Hessians, or where the norm of the gradient
+    is at most `stationarity`. This norm () is the second result.
     """
 
     def gradient(x: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -82,7 +73,7 @@ def newton_refine(
             point, cost, slope, slope_vector, hessian, damping, point - newton, state.iteration + 1
         )
 
-    def unfinished(state: _Newton) -> Array:
+    def is_open(state: _Newton) -> Array:
         return (state.iteration < max_steps) & (state.slope > stationarity)
 
     n = point.shape[0]
@@ -96,7 +87,7 @@ def newton_refine(
         trial=point,
         iteration=jnp.zeros((), jnp.int32),
     )
-    state = lax.while_loop(unfinished, step, state)
+    state = lax.while_loop(is_open, step, state)
     return state.point, state.slope
 
 
@@ -107,23 +98,23 @@ def optimal_plan(
     solver: LbfgsConfig | None = None,
     newton_steps: int = 100,
 ) -> PyTree:
-    """The plan at the optimum of the first guess's basin, differentiable by the case.
+    """Return the plan at the optimum of the first guess's basin, differentiable by the case.
 
-    `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, go
-    through the implicit function theorem. Use float64 (`jax.enable_x64`) where gradients
-    matter to more than two digits.
+    `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, use the
+    implicit function theorem. Use float64 (`jax.enable_x64`) where gradients must have more than
+    two correct digits.
 
     Args:
-        planner: one that minimises. Of one that decides first it is the first choice that is
-            planned, and of one that searches for a way first the first search's; both are
-            constant to derivatives.
-        case: one case; the leaves to differentiate by.
-        solver: of the search before the refinement; 200 iterations by default.
-        newton_steps: of the refinement, at most.
+        planner: a planner that minimises. If it decides first, its first choice is planned, and if
+            it searches for a path first, the result of its first search; both are constant to
+            derivatives.
+        case: one case; derivatives are by its leaves.
+        solver: settings of the search before the refinement; 200 iterations by default.
+        newton_steps: greatest number of iterations of the refinement.
 
     Returns:
-        The planner's plan. Where its status is not CONVERGED the point is not stationary or
-        breaks a limit, and its gradients mean nothing.
+        The planner's plan. If its status is not CONVERGED, the point is not stationary or breaks a
+        limit, and its gradients are meaningless.
 
     Raises:
         TypeError: the planner does not minimise, or the case is of another task.
@@ -134,13 +125,13 @@ def optimal_plan(
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig)
     if case.batch_shape != ():
-        shown = f"batch shape {case.batch_shape}; for batches there is pj.gradient, or jax.vmap "
-        raise ArgumentError("case", "one case", shown=f"{shown}of this")
+        shown = f"batch shape {case.batch_shape}; for batches use pj.gradient or jax.vmap"
+        raise ArgumentError("case", "one case", shown=shown)
     planner, case = planner.settle(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = planner.prepare(case)
     start = lax.stop_gradient(planner.guesses(context, 1)[0])
-    # A gradient that rounding alone can make: relative to the size of the cost at the start.
+    # Gradients of this size, relative to the cost, can be due to rounding alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:

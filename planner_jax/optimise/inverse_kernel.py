@@ -1,7 +1,7 @@
 """The inverse of a small matrix on many lanes as one kernel for CUDA.
 
-A thread keeps its lane's matrix in registers. As operations of their own
-the pivots wait for one another, and all entries cross the memory at each.
+A thread keeps its lane's matrix in registers. As separate operations the pivots would depend on
+each other, and all entries would pass through memory at each pivot.
 """
 
 import functools
@@ -14,15 +14,11 @@ from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
-_LARGEST = 12  # rows, all of whose entries a thread can keep
+_LARGEST = 12  # most rows for which a thread can keep all entries
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """Make the kernel of `preconditioner.positive_inverse`.
-
-    Args:
-        interpret: run it without a GPU, for tests.
-    """
+    """Make the kernel of `preconditioner.positive_inverse`; `interpret` runs it without a GPU."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         (matrix,) = leaves

@@ -1,9 +1,9 @@
 """L-BFGS for small smooth problems, many at once.
 
-Written for ONE problem; `jax.vmap` makes a batch, in which finished lanes stand still. Each
+The functions solve ONE problem; `jax.vmap` makes a batch, in which finished lanes stand still. Each
 iteration tries several step lengths at once, because under `vmap` a backtracking search would
-run to the slowest lane. Feasibility is watched beside the cost, and the best feasible iterate
-is what comes back.
+continue until the slowest lane is done. The solver also tracks feasibility, and returns the best
+feasible iterate.
 
 Direction: [Liu1989], two-loop recursion, with gamma = s.y / y.y of the newest pair.
 """
@@ -32,28 +32,28 @@ class Memory:
 
 @struct.dataclass
 class LbfgsNumbers:
-    """What one lane carries from iteration to iteration beside its points."""
+    """The scalars in the state of one lane."""
 
     best: Evaluation  # at the best point; not finite before the first iteration
-    reach: Array  # (), multiplies the trial steps: shrinks while none lowers the cost
+    reach: Array  # (), factor on the trial steps; shrinks while none lowers the cost
     iteration: Array  # () int32
     stalled: Array  # () int32, iterations in a row without a decrease
 
 
 @struct.dataclass
 class LbfgsState:
-    """What one lane carries from iteration to iteration."""
+    """The state of one lane between iterations."""
 
     point: Array  # (n,)
-    step: Array  # (n,), that led to the point; 0 if it did not move
-    grad: Array  # (n,), where that step began
+    step: Array  # (n,), last step, which led to the point; 0 if there was none
+    grad: Array  # (n,), at the start of the last step
     memory: Memory
     best_point: Array  # (n,)
     numbers: LbfgsNumbers
 
 
 def init(point: Array, config: LbfgsConfig) -> LbfgsState:
-    """State before the first iteration; nothing is evaluated."""
+    """Return the state before the first iteration; nothing is evaluated."""
     zero = jnp.zeros_like(point)
     empty = jnp.zeros((config.memory, point.shape[0]), point.dtype)
     unknown = jnp.full((), jnp.inf, point.dtype)
@@ -75,10 +75,8 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
 def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Array, Array]:
     """Return the weight of a new pair, given s.y, y.y and s.s.
 
-    Returns:
-        keep: whether its curvature is positive.
-        moved: whether there was a step, that is, one whose squared length is not zero.
-        inverse: 1 / s.y if it is kept, otherwise 0.
+    The results are whether its curvature is positive, so that the pair is kept; whether the squared
+    length of the step is not zero; and 1 / s.y if the pair is kept, otherwise 0.
     """
     keep = curvature > 1e-8 * change
     return keep, step > 0.0, jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
@@ -92,15 +90,15 @@ def start_scale(newest: Array, change: Array, grad: Array) -> Array:
 
 
 def shortening(squared_length: Array, step_cap: float) -> Array:
-    """Return the factor that makes a direction no longer than the cap."""
+    """Return the factor that limits a direction to the length `step_cap`."""
     return jnp.minimum(1.0, step_cap / jnp.sqrt(jnp.maximum(squared_length, 1e-30)))
 
 
 def remember(memory: Memory, step: Array, change: Array) -> Memory:
-    """The memory with one pair (n,), (n,) more.
+    """Return the memory with another pair (n,), (n,).
 
-    A pair without positive curvature is left out. After no step, or one too short for its squared
-    length to be a number above zero, the memory is emptied: the next direction is steepest descent.
+    A pair without positive curvature is left out. If the squared length of the step is zero, the
+    memory is emptied, so that the next direction is steepest descent.
     """
     keep, moved, inverse = weigh_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
 
@@ -116,10 +114,10 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
 
 
 def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
-    """Quasi-Newton direction -H g, no longer than the step cap, (n,).
+    """Return the quasi-Newton direction -H g (n,), at most as long as the step cap.
 
-    Without a pair in memory it is the steepest descent of unit length: in scaled variables
-    one is the size of a sensible step, whatever the size of the gradient.
+    Without a pair in memory it is steepest descent of unit length: in scaled variables one is a
+    sensible length of a step, for any size of the gradient.
     """
     q = grad
     alphas = []
@@ -138,7 +136,7 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
 
 @functools.cache
 def _turn(num_pairs: int, step_cap: float) -> Callable:
-    """Memory and direction after one more pair, with a kernel for many lanes."""
+    """Return the function that updates memory and direction, with a kernel for many lanes."""
 
     def turn(memory: Memory, step: Array, change: Array, grad: Array) -> tuple[Memory, Array]:
         memory = remember(memory, step, change)
@@ -149,10 +147,10 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
-    """One iteration: gradient, memory, direction, all trial steps at once, the lowest kept.
+    """Return the state after one iteration: gradient, memory, direction, and the best trial step.
 
-    The gradient comes first, so that k iterations take k gradients and no more. A finished lane
-    stands still: of its state only memory and gradient change, which it has no use for any more.
+    The gradient is evaluated first, so that k iterations take exactly k gradients. A finished lane
+    stands still: of its state only memory and gradient change, which it does not use again.
     """
 
     def value(point: Array) -> tuple[Array, Array]:
@@ -166,7 +164,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     lengths = state.numbers.reach * jnp.asarray(config.trial_steps, grad.dtype)
     trials = jax.vmap(lambda length: objective(state.point + length * direction))(lengths)
     here = Evaluation(cost, violation)
-    choice = _chosen(config, state.numbers, here, lengths, trials)
+    choice = _choose(config, state.numbers, here, lengths, trials)
     step = jnp.where(choice.going, choice.length * direction, state.step)
     point = jnp.where(choice.going, state.point + step, state.point)
     return LbfgsState(
@@ -180,33 +178,33 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
 
 
 def is_unfinished(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
-    """Whether a lane has iterations left and is not stationary, () bool."""
+    """Return whether a lane has iterations left and is not stationary, () bool."""
     return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
 
 
 def is_stationary(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
-    """Whether so many iterations brought no decrease that none is hoped for, () bool."""
+    """Return whether `patience` iterations in a row brought no decrease, () bool."""
     return numbers.stalled >= config.patience
 
 
 @struct.dataclass
 class _Choice:
-    """What an iteration comes to."""
+    """The result of an iteration."""
 
-    numbers: LbfgsNumbers  # afterwards
-    length: Array  # () of the step, times the direction; 0 without a decrease
+    numbers: LbfgsNumbers  # after the iteration
+    length: Array  # (), factor on the direction; 0 without a decrease
     better: Array  # () bool, whether the new point is the best one
     going: Array  # () bool, False for a finished lane, which stands still
 
 
-def _chosen(
+def _choose(
     config: LbfgsConfig, numbers: LbfgsNumbers, here: Evaluation, lengths: Array, trials: Evaluation
 ) -> _Choice:
-    """The lowest of the trials (k,), if it is lower than where the iteration began."""
+    """Select the lowest of the trials (k,), if it is lower than the cost at the current point."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
 
-    def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
+    def of_chosen(values: Array) -> Array:  # a gather would need a loop of its own
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
     decreased = of_chosen(costs) < here.cost
@@ -216,7 +214,7 @@ def _chosen(
     progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
-        # Without a decrease the lane next looks nearer.
+        # Without a decrease the next trial steps are shorter.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
         stalled=jnp.where(progress, 0, numbers.stalled + 1),

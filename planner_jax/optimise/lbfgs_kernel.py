@@ -1,8 +1,8 @@
 """The next direction of L-BFGS on many lanes as one kernel for CUDA.
 
-As operations of their own it is a chain of some thirty sums that each wait for the last. Here a
-block of threads keeps its lanes' gradient and pairs in registers; it reads every pair once and
-writes it where the memory has been, so that nothing is copied between iterations.
+As separate operations it is a chain of about thirty dependent sums. Here a block of threads keeps
+the gradient and the pairs of its lanes in registers. It reads every pair once and overwrites the
+memory in place, so that nothing is copied between iterations.
 """
 
 import functools
@@ -20,13 +20,7 @@ _LANES, _THREADS = 32, 128  # of a block
 
 
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
-    """Make the kernel of `lbfgs.remember` and then `lbfgs.search_direction`.
-
-    Args:
-        num_pairs: m.
-        step_cap: largest length of the direction.
-        interpret: run it without a GPU, for tests.
-    """
+    """Make the kernel of `lbfgs.remember` followed by `lbfgs.search_direction`, for m pairs."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]
@@ -42,7 +36,7 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
 def _call(
     num_pairs: int, step_cap: float, n: int, lanes: int, width: int, interpret: bool
 ) -> Callable:
-    """Make the kernel for vectors of n on `lanes` lanes."""
+    """Make the kernel for vectors of n numbers on `lanes` lanes."""
     height = 1 << (n - 1).bit_length()  # a block's rows are a power of two
 
     def body(steps, changes, inverses, step, change, grad, *out):
@@ -64,7 +58,7 @@ def _call(
         keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
-        # Newest first. A slot's pair is the one behind it if there is a new one.
+        # Newest first. If the new pair is kept, each slot takes the pair of the next newer slot.
         alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
             old, earlier = [read(steps, k), read(changes, k)], inverses[k]

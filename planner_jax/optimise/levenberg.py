@@ -1,9 +1,9 @@
-"""Levenberg-Marquardt: least squares of few unknowns, a Cholesky factorisation a step.
+"""Levenberg-Marquardt: least squares of few unknowns, one Cholesky factorisation a step.
 
-For problems whose terms are squares of residuals with Jacobians that are known, such as hinges on
-limits: the curvature J'J is then good enough to take a dozen steps where a quasi-Newton method
-takes many more. Each step tries one point; it is kept if it costs less, with less damping for the
-next one, and dropped with more if not.
+For problems whose terms are squares of residuals with known Jacobians, such as hinges on limits.
+The curvature J'J is then accurate enough for a dozen steps where a quasi-Newton method takes many
+more. Each step tries one point. It is accepted with less damping for the next step if it costs
+less, and rejected with more damping otherwise.
 """
 
 import dataclasses
@@ -22,7 +22,7 @@ class Model:
 
     cost: Array  # ()
     gradient: Array  # (n,)
-    curvature: Array  # (n, n), J'J with what else is positive
+    curvature: Array  # (n, n), J'J plus other positive terms
     violation: Array  # (), largest relative excess over a limit; <= 0 is good
 
 
@@ -31,13 +31,15 @@ class LevenbergConfig:
     """Sizes and switches; static."""
 
     max_steps: int = 20
-    damping: float = 1e-2  # at first, times the curvature's mean diagonal
-    ease: float = 0.2  # of the damping, after a step that is kept
-    tighten: float = 6.0  # of the damping, after one that is dropped
-    longest: float = 1.5  # change of an unknown in one step
-    settled: int = 2  # steps without a share `tolerance` less cost end the search of a good point
+    damping: float = 1e-2  # initial, times the mean diagonal of the curvature
+    ease: float = 0.2  # factor on the damping after an accepted step
+    tighten: float = 6.0  # factor on the damping after a rejected step
+    longest: float = 1.5  # greatest change of an unknown in one step
+    # A search ends after `settled` steps at feasible points that each lower the cost by less than
+    # the share `tolerance`.
+    settled: int = 2
     tolerance: float = 1e-2
-    # A search is given up once its cost is above `hope` x `fade`^k, k steps after the step `trial`.
+    # A search is aborted once its cost is above `hope` * `fade`^k, k steps after the step `trial`.
     trial: int = 0
     hope: float | None = None
     fade: float = 1.0
@@ -51,29 +53,24 @@ class LevenbergState:
     model: Model  # at the point
     damping: Array  # ()
     steps: Array  # () int32
-    stalled: Array  # () int32, steps in a row that brought little, while every limit holds
+    stalled: Array  # () int32, steps in a row at feasible points with little decrease
 
 
 def least_squares(
     evaluate: Callable[[Array], Model], start: Array, config: LevenbergConfig
 ) -> LevenbergState:
-    """Minimise a sum of squares from one start; pure, so jit and vmap it.
+    """Minimise a sum of squares from one start (n,); pure, so jit and vmap it.
 
-    Args:
-        evaluate: the model at a point (n,).
-        start: (n,).
-        config: sizes and switches, static.
-
-    Returns:
-        The last state. It is settled if `stalled` has reached `config.settled`.
+    `evaluate` returns the model at a point. In the last state, which is returned, the search has
+    settled if `stalled` has reached `config.settled`.
     """
-    return go_on(evaluate, begun(start, config), config)
+    return continue_search(evaluate, start_search(start, config), config)
 
 
-def begun(start: Array, config: LevenbergConfig) -> LevenbergState:
-    """The state of a search that has not looked at its start (n,) yet."""
-    # The first step, of no length, looks at the start: to evaluate it here would compile the
-    # model twice.
+def start_search(start: Array, config: LevenbergConfig) -> LevenbergState:
+    """Return the state of a search before the evaluation of its start (n,)."""
+    # The first step, of length zero, evaluates the start: to do so here would compile the model
+    # twice.
     zero = jnp.zeros((), start.dtype)
     nothing = Model(
         cost=zero + jnp.inf,
@@ -90,23 +87,16 @@ def begun(start: Array, config: LevenbergConfig) -> LevenbergState:
     )
 
 
-def go_on(
+def continue_search(
     evaluate: Callable[[Array], Model],
     state: LevenbergState,
     config: LevenbergConfig,
     most: Array | int | None = None,
 ) -> LevenbergState:
-    """The last state of a search that goes on from one.
-
-    Args:
-        evaluate: the model at a point (n,).
-        state: to go on from.
-        config: sizes and switches, static.
-        most: () int32, steps in all; None for `config.max_steps`.
-    """
+    """Continue a search from a state to `most` steps in all, and return its last state."""
     most = config.max_steps if most is None else most
 
-    def goes_on(state: LevenbergState) -> Array:
+    def is_unfinished(state: LevenbergState) -> Array:
         is_open = (state.steps < most) & (state.stalled < config.settled)
         if config.hope is None:
             return is_open
@@ -114,14 +104,14 @@ def go_on(
         bound = config.hope * config.fade ** jnp.maximum(behind, 0)
         return is_open & ((behind < 0) | (state.model.cost <= bound))
 
-    return lax.while_loop(goes_on, lambda state: _step(evaluate, state, config), state)
+    return lax.while_loop(is_unfinished, lambda state: _step(evaluate, state, config), state)
 
 
 def _step(
     evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
 ) -> LevenbergState:
     model = state.model
-    # Damped by one number for all, so that what no residual sees stays where it is.
+    # One damping for all unknowns, so that unknowns without effect on the residuals do not move.
     scale = jnp.mean(jnp.diagonal(model.curvature)) * state.damping
     damped = model.curvature + scale * jnp.eye(state.point.size, dtype=state.point.dtype)
     change = -cho_solve(cho_factor(damped), model.gradient)

@@ -1,4 +1,4 @@
-"""The loop around the solver, for one case and several starts."""
+"""The iteration of the solver, for one case and several starts, or for a batch of cases."""
 
 import dataclasses
 import functools
@@ -31,15 +31,15 @@ from planner_jax.optimise.settings import (
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import OptimisedPlanner
 
-# So few iterations are counted, so that a GPU need not tell the host whether to go on.
+# Up to this number iterations are counted, which spares a GPU the test for the end.
 _COUNTED = 16
 
 
 @struct.dataclass
 class Optimum:
-    """Where one lane ended."""
+    """The result of the search of one lane."""
 
-    point: Array  # (n,), the best feasible iterate, or the least infeasible one
+    point: Array  # (n,), the best feasible iterate, or the iterate of least violation
     evaluation: Evaluation
     iterations: Array  # () int32
     stationary: Array  # () bool
@@ -48,13 +48,9 @@ class Optimum:
 def minimise(
     objective: Objective, start: Array, config: Solver, curved: Curved | None = None
 ) -> Optimum:
-    """Minimise from one start until stationary or out of iterations.
+    """Minimise from one start (n,) until stationary or out of iterations.
 
-    Args:
-        objective: of a point (n,).
-        start: (n,).
-        config: the method's sizes and switches, static.
-        curved: what `NewtonConfig` takes, where there is a quicker one than products of its own.
+    `curved` returns derivatives for Newton's method, if there is a faster function than products.
     """
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
@@ -62,7 +58,7 @@ def minimise(
         config = _with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
     state = _method(config).init(start, config)
-    if config.max_steps == 1:  # without a loop, around which nothing would be joined
+    if config.max_steps == 1:  # without a loop, so that XLA can fuse across the iteration
         return _optimum_of(step(state), config)
     state = lax.while_loop(lambda s: _method(config).is_unfinished(s.numbers, config), step, state)
     return _optimum_of(state, config)
@@ -77,25 +73,18 @@ def minimise_lanes(
 ) -> Optimum:
     """Minimise on many lanes, each with its own start and context.
 
-    Args:
-        objective: of one point (n,) and one context.
-        starts: (n, B).
-        contexts: a pytree, the lanes last on every leaf.
-        config: the method's sizes and switches, static.
-        curved: as for `minimise`, of one point and one context.
-
-    Returns:
-        The optima, with the lanes last on every leaf.
+    The starts are (n, B), and the contexts and the optima have the lanes last on every leaf.
+    `objective` and `curved` take one point and one context.
     """
     if config.max_steps == 0:
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
-    def searched(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
+    def search(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
         @over_lanes
         def step(state: PyTree, context: PyTree) -> PyTree:
-            of_point = curved and functools.partial(_given, curved, context)
-            return _step(lambda x: objective(x, context), of_point, state, config)
+            by_point = curved and (lambda x: curved(x, context))
+            return _step(lambda x: objective(x, context), by_point, state, config)
 
         if steps <= _COUNTED:
             return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
@@ -106,38 +95,32 @@ def minimise_lanes(
         )
 
     state = over_lanes(lambda start: _method(config).init(start, config))(starts)
-    state = searched(state, contexts, config, config.max_steps)
+    state = search(state, contexts, config, config.max_steps)
     if isinstance(config, NewtonConfig) and config.stragglers is not None:
         newton, (share, steps, groups) = _method(config), config.stragglers
         longer, num = _with_stragglers(config), math.ceil(share * starts.shape[-1])
 
-        def next_group(made: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
-            number, state = made
+        def next_group(progress: tuple[Array, PyTree]) -> tuple[Array, PyTree]:
+            number, state = progress
             lanes = newton.most_to_gain(state.numbers, longer, num)
-            some, given = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
-            later = searched(some, given, longer, steps)
+            some, own = jax.tree.map(lambda leaf: leaf[..., lanes], (state, contexts))
+            later = search(some, own, longer, steps)
             place = lambda old, new: old.at[..., lanes].set(new)  # noqa: E731
             return number + 1, jax.tree.map(place, state, later)
 
-        def is_open(made: tuple[Array, PyTree]) -> Array:
-            number, state = made
+        def is_open(progress: tuple[Array, PyTree]) -> Array:
+            number, state = progress
             return (number < groups) & jnp.any(newton.is_unfinished(state.numbers, longer))
 
         _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return _optimum_of(state, config)
 
 
-def _given(
-    curved: Callable[[Array, PyTree], Curvature], context: PyTree, point: Array
-) -> Curvature:
-    return curved(point, context)
-
-
 def _method(config: Solver) -> ModuleType:
     """Return the module of a method."""
     if isinstance(config, LbfgsConfig):
         return lbfgs
-    from planner_jax.optimise import newton  # only planners that search for low costs take it
+    from planner_jax.optimise import newton  # only planners that search for low costs need it
 
     return newton
 
@@ -150,7 +133,7 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Return the settings with the iterations of a straggler."""
+    """Return the settings with the number of iterations that a straggler may take."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -175,17 +158,10 @@ def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
     """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
 
-    For a batch `solve_batch` is quicker.
-
-    Args:
-        planner: the problem; what it has of arrays is shared by all lanes.
-        attempt: how many starts and iterations.
-        case: one case.
-
-    Returns:
-        The planner's plan of the best start, its `status` and `iterations` set.
+    The plan of the best start has its `status` and `iterations` set. For a batch `solve_batch` is
+    faster.
     """
-    last = planner.changed(attempt.settings)
+    last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
 
     def search(problem: "OptimisedPlanner", solver: Solver, start: Array) -> Optimum:
@@ -193,15 +169,15 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
             lambda x: problem.objective(x, context),
             start,
             solver,
-            lambda x: problem.curved(x, context),
+            lambda x: problem.curvature_at(x, context),
         )
 
-    before = planner.changed(_stages(attempt)[0].settings)
+    before = planner.with_settings(_stages(attempt)[0].settings)
     points = before.guesses(context, attempt.starts)
     spent = jnp.zeros(len(points), jnp.int32)
     optimum = None
     for stage in _stages(attempt):
-        problem = planner.changed(stage.settings)
+        problem = planner.with_settings(stage.settings)
         points = _of_each(functools.partial(problem.convert_point, before=before), points)
         optimum = _of_each(functools.partial(search, problem, stage.solver), points)
         before = problem
@@ -216,38 +192,31 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases with one round's starts and iterations; pure.
-
-    Args:
-        planner: the problem; what it has of arrays is shared by all lanes.
-        attempt: how many starts and iterations.
-        cases: B of them, a leading axis on every leaf.
-
-    Returns:
-        The plans, with a leading axis on every leaf.
-    """
-    last, num = planner.changed(attempt.settings), attempt.starts
+    """Plan a batch of cases with one round's starts and iterations; pure."""
+    last, num = planner.with_settings(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
     contexts = over_lanes(last.prepare)(lanes)
-    before = planner.changed(_stages(attempt)[0].settings)
+    before = planner.with_settings(_stages(attempt)[0].settings)
     starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
     # A lane of the solver is one start of one case; the starts of a case are neighbours.
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
-    of_starts = _repeated(contexts, num)
+    of_starts = _repeat(contexts, num)
     spent = jnp.zeros(points.shape[1:], jnp.int32)
     optimum = None
     for stage in _stages(attempt):
-        problem = planner.changed(stage.settings)
+        problem = planner.with_settings(stage.settings)
         points = over_lanes(functools.partial(problem.convert_point, before=before))(points)
         before = problem
-        optimum = minimise_lanes(problem.objective, points, of_starts, stage.solver, problem.curved)
+        optimum = minimise_lanes(
+            problem.objective, points, of_starts, stage.solver, problem.curvature_at
+        )
         points, spent = optimum.point, spent + optimum.iterations
         if stage.keep is not None:
             costs = optimum.evaluation.cost.reshape(-1, num)
             kept = jax.vmap(functools.partial(_cheapest, num=stage.keep))(costs)
             kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
             points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
-            of_starts = _repeated(contexts, num)
+            of_starts = _repeat(contexts, num)
     assert optimum is not None  # a round has a stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
@@ -259,7 +228,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches in their order; the last is the search of the round itself."""
+    """Return the searches in order; the last one is the search of the round itself."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
@@ -270,7 +239,7 @@ def _of_each(function: Callable, starts: PyTree) -> PyTree:
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
 
 
-def _repeated(contexts: PyTree, num: int) -> PyTree:
+def _repeat(contexts: PyTree, num: int) -> PyTree:
     """Return the context of every start: the context of each case `num` times."""
     if num == 1:
         return contexts
@@ -278,7 +247,7 @@ def _repeated(contexts: PyTree, num: int) -> PyTree:
 
 
 def _cheapest(costs: Array, num: int) -> Array:
-    """Return the indices (num,) of the least of costs (S,); costs that are not finite come last."""
+    """Return the indices (num,) of the least of costs (S,); non-finite costs come last."""
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 

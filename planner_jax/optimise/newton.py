@@ -1,20 +1,23 @@
 """Newton's method for small smooth problems, many at once.
 
 Each iteration builds a subspace of a few vectors from the gradient by products with the damped
-Hessian [Lanczos1950], in which that is tridiagonal. Where it bends downward there, it is shifted
-until it does not, as in trust-region methods ([More1983]; in such a subspace [Gould1999]). As in
-`optimise.lbfgs` feasibility is watched beside the cost, and the best feasible iterate comes back.
+Hessian [Lanczos1950]. In this subspace the Hessian is tridiagonal. If it has negative eigenvalues
+there, it is shifted until it has none, as in trust-region methods ([More1983]; in such
+a subspace [Gould1999]). As in `optimise.lbfgs`, the solver also tracks
+feasibility and returns the best feasible iterate.
 
-Few vectors are enough where the planner has a preconditioner, the inverse of what in the Hessian is
-strong. Damping has two metrics. A lane's own is added to the Hessian as it is: far from the optimum
-it leads down the gradient, in variables that are scaled. Beside it several multiples of the
-preconditioner's curvature are tried at once, at a few operations each, because under `vmap` a
-search for the right one would run to the slowest lane. The multiple that did best says how the
-lane's own damping goes on; it fades, and the last steps are Newton's, along flat valleys too.
+Few vectors are enough if the planner has a preconditioner, the inverse of the strong part of the
+Hessian. There are two kinds of damping. Each lane has its own damping, a multiple of the identity
+that is added to the Hessian: far from the optimum it leads down the gradient, in scaled variables.
+In addition several multiples of the preconditioner's curvature are tried at once, for a few
+operations each, because under `vmap` a search for the right multiple would continue until the
+slowest lane is done. The best multiple determines the lane's next damping. The damping fades, and
+the last steps are undamped Newton steps, also along flat valleys.
 
-Near an optimum two costs differ by less than their rounding, while slopes still say where it is.
-With a slack the least damped step that costs no more than rounding goes on from there, as in the
-approximate conditions of Wolfe [Hager2005], until steps lead no nearer.
+Near an optimum two costs differ by less than their rounding, while slopes still show where the
+optimum is. With a `slack` the search continues from the least damped step that costs no more up to
+rounding, as in the approximate Wolfe conditions [Hager2005], until steps make no
+progress.
 """
 
 import functools
@@ -36,25 +39,25 @@ from planner_jax.optimise.settings import (
 )
 
 _HIGHEST = lax.Precision.HIGHEST
-_HALVINGS = 14  # of the interval in which the least eigenvalue is looked for
-_LEAST_DAMPING = 1e-10  # of a lane's own
-_LEAST = 1e-7  # of a pivot, beside the greatest number of its matrix
+_HALVINGS = 14  # of the interval that contains the least eigenvalue
+_LEAST_DAMPING = 1e-10  # least damping of a lane
+_LEAST = 1e-7  # least pivot, relative to the greatest entry of its matrix
 
 
 @struct.dataclass
 class NewtonNumbers:
-    """What one lane carries from iteration to iteration beside its points."""
+    """The scalars in the state of one lane."""
 
     best: Evaluation  # at the best point; not finite before the first iteration
     damping: Array  # ()
-    expected: Array  # (), decrease that the last iteration expected, relative to the cost
+    expected: Array  # (), decrease that the last iteration predicted, relative to the cost
     iteration: Array  # () int32
-    stalled: Array  # () int32, iterations in a row that led no nearer
+    stalled: Array  # () int32, iterations in a row without progress
 
 
 @struct.dataclass
 class NewtonState:
-    """What one lane carries from iteration to iteration."""
+    """The state of one lane between iterations."""
 
     point: Array  # (n,)
     best_point: Array  # (n,)
@@ -62,12 +65,12 @@ class NewtonState:
 
 
 def by_products(objective: Objective) -> Curved:
-    """The second derivatives of any objective, a tangent of its gradient for each product."""
+    """Return the derivatives of any objective; each product is a tangent of its gradient."""
 
     def preconditioner(damping: Array) -> Callable[[Array], Array]:
-        return lambda right: right / damping  # nothing but the damping is known of the Hessian
+        return lambda right: right / damping  # only the damping is known
 
-    def curved(point: Array) -> Curvature:
+    def expand(point: Array) -> Curvature:
         def slope(at: Array) -> tuple[Array, Evaluation]:
             def cost(x: Array) -> tuple[Array, Evaluation]:
                 evaluation = objective(x)
@@ -79,11 +82,11 @@ def by_products(objective: Objective) -> Curved:
         gradient, product, evaluation = jax.linearize(slope, point, has_aux=True)
         return Curvature(evaluation, gradient, lambda: product, preconditioner)
 
-    return curved
+    return expand
 
 
 def init(point: Array, config: NewtonConfig) -> NewtonState:
-    """State before the first iteration; nothing is evaluated."""
+    """Return the state before the first iteration; nothing is evaluated."""
     unknown = jnp.full((), jnp.inf, point.dtype)
     return NewtonState(
         point=point,
@@ -99,19 +102,19 @@ def init(point: Array, config: NewtonConfig) -> NewtonState:
 
 
 def is_unfinished(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
-    """Whether a lane has iterations left and is not stationary, () bool."""
+    """Return whether a lane has iterations left and is not stationary, () bool."""
     return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
 
 
 def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
-    """Whether nothing more is to be gained, () bool."""
+    """Return whether little decrease is expected or progress has stalled, () bool."""
     return (numbers.expected <= config.tolerance) | (numbers.stalled >= config.patience)
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """The lanes (num,) of a batch whose last iterations expected the greatest decreases.
+    """Return the lanes (num,) of a batch with the greatest predicted decreases.
 
-    Unfinished ones come before those that are finished.
+    Unfinished lanes come before finished lanes.
     """
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
@@ -120,14 +123,14 @@ def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Arra
 def step(
     objective: Objective, curved: Curved, state: NewtonState, config: NewtonConfig
 ) -> NewtonState:
-    """One iteration: gradient, subspace, steps of all dampings at once, the lowest kept.
+    """Return the state after one iteration: gradient, subspace, and the best of all damped steps.
 
     A finished lane stands still.
     """
     here = curved(state.point)
-    steps, decrease = damped_steps(here, state.numbers.damping, config)
+    steps, decrease = solve_damped(here, state.numbers.damping, config)
     trials = jax.vmap(lambda step: objective(state.point + step))(steps)
-    numbers, chosen, is_best, going = _chosen(
+    numbers, chosen, is_best, going = _choose(
         config, state.numbers, here.evaluation, trials, decrease
     )
     move = jnp.matmul(chosen, steps, precision=_HIGHEST)
@@ -139,17 +142,12 @@ def step(
     )
 
 
-def damped_steps(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
-    """Newton steps within the subspace, a step for each trial damping.
+def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
+    """Return Newton steps (k, n) within the subspace, one for each of k trial dampings.
 
-    Args:
-        here: gradient, products and preconditioner; n unknowns.
-        damping: (), the lane's own, > 0: added to the Hessian's diagonal.
-        config: sizes and switches, static; k trial dampings.
-
-    Returns:
-        steps: (k, n), none longer than the step cap.
-        decrease: (), of the cost that the step without trial damping promises.
+    `damping`, the lane's own, is > 0 and added to the Hessian's diagonal. No step is longer than
+    the step cap. The second result is the decrease of the cost () that the step without trial
+    damping predicts.
     """
     gradient = here.gradient
     solve_about = here.preconditioner(damping)
@@ -158,11 +156,11 @@ def damped_steps(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
     if config.subspace:
         product = here.products()
 
-        def image(direction: Array) -> tuple[Array, Array]:
+        def multiply(direction: Array) -> tuple[Array, Array]:
             found = product(direction) + damping * direction
             return found, solve_about(found)
 
-        directions, diagonal, beside = _lanczos(gradient, turned, size, image, config.subspace)
+        directions, diagonal, beside = _lanczos(gradient, turned, size, multiply, config.subspace)
     else:  # as if the preconditioner were the whole inverse
         directions = turned[None] / jnp.maximum(size, 1e-30)
         diagonal, beside = [jnp.ones_like(size)], []
@@ -173,28 +171,23 @@ def damped_steps(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
     steps = -jnp.matmul(inside, directions, precision=_HIGHEST)
     lengths = jnp.sqrt(jnp.sum(steps**2, axis=1, keepdims=True))
     steps = steps * jnp.minimum(1.0, config.step_cap / jnp.maximum(lengths, 1e-20))
-    promised = 0.5 * size**2 * solve(jnp.zeros_like(size))[0]
-    return jnp.where(jnp.isfinite(steps), steps, 0.0), promised
+    decrease = 0.5 * size**2 * solve(jnp.zeros_like(size))[0]
+    return jnp.where(jnp.isfinite(steps), steps, 0.0), decrease
 
 
 def _lanczos(
     gradient: Array, turned: Array, size: Array, image: Callable, num: int
 ) -> tuple[Array, list[Array], list[Array]]:
-    """Directions (m, n) of the subspace, and the damped Hessian there.
+    """Return directions (m, n) of the subspace, and the damped Hessian in it.
 
-    They are orthonormal by the preconditioner's curvature M. Returns the Hessian's diagonal, m
-    numbers, and what stands beside it, m - 1 numbers.
-
-    Args:
-        gradient: (n,).
-        turned: (n,), M^-1 gradient.
-        size: (), sqrt(gradient . turned).
-        image: Hessian's product with a direction (n,), and M^-1 of that.
-        num: m.
+    The directions are orthonormal with respect to the preconditioner's curvature M. The Hessian is
+    returned as its diagonal, m numbers, and its subdiagonal, m - 1 numbers. `turned` is
+    M^-1 gradient, and `size` is sqrt(gradient . turned). `image` returns the Hessian's product with
+    a direction, and M^-1 of this product.
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # Rows M d beside rows d, of each direction d.
+    # Rows M d and rows d, for each direction d.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []
@@ -203,12 +196,12 @@ def _lanczos(
         diagonal.append(jnp.sum(directions[k] * product))
         if k + 1 == num:
             break
-        # Against all that went before, since rounding would bring them back.
+        # Orthogonal to all previous directions, which rounding would bring back.
         shares = jnp.matmul(directions, product, precision=_HIGHEST)
         product = product - jnp.matmul(shares, images, precision=_HIGHEST)
         turned = turned - jnp.matmul(shares, directions, precision=_HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(product * turned), 0.0))
-        # An invariant subspace ends here: what follows is a vector of zeros.
+        # At the end of an invariant subspace the next direction is zero.
         is_new = length > 1e-5 * jnp.abs(diagonal[-1])
         scale = jnp.where(is_new, 1.0 / jnp.where(is_new, length, 1.0), 0.0)
         beside.append(jnp.where(is_new, length, 0.0))
@@ -218,7 +211,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Of the tridiagonal matrix with a number added to its diagonal; none is zero."""
+    """Return the pivots of the shifted tridiagonal matrix; none is zero."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -231,11 +224,11 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
 
 
 def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
-    """Least eigenvalue of the tridiagonal matrix, from below; 0 if none is negative.
+    """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if none is negative.
 
-    By halving an interval, by the signs of pivots (Sturm).
+    By bisection, with the signs of pivots (Sturm).
     """
-    around = [*(jnp.abs(each) for each in beside)]
+    around = [jnp.abs(each) for each in beside]
     zero = jnp.zeros_like(diagonal[0])
     reach = [
         (around[k - 1] if k else zero) + (around[k] if k < len(around) else zero)
@@ -259,7 +252,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solution (m,) of the shifted tridiagonal system, the first unit vector on its right."""
+    """Return the solution (m,) of the shifted tridiagonal system for the first unit vector."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):
@@ -270,21 +263,21 @@ def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array)
     return jnp.stack(found[::-1])
 
 
-def _chosen(
+def _choose(
     config: NewtonConfig,
     numbers: NewtonNumbers,
     here: Evaluation,
     trials: Evaluation,
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
-    """What an iteration comes to: numbers, shares of the trials, if it is best, if it counts."""
+    """Return new numbers, shares of the trials in the step, and bools: best point, unfinished."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)
     places = jnp.arange(costs.size)
-    # Of trials that rounding does not tell apart the one with the least damping.
+    # Among trials with equal costs up to rounding, the one with the least damping.
     is_chosen = places == jnp.argmin(jnp.where(costs <= jnp.min(costs) + slack, places, costs.size))
 
-    def of_chosen(values: Array) -> Array:  # without a gather, which would need a loop of its own
+    def of_chosen(values: Array) -> Array:  # a gather would need a loop of its own
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
     moved = of_chosen(costs) < here.cost + slack
@@ -295,10 +288,10 @@ def _chosen(
     is_best &= moved
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
-    promised = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
-    # A step that is much damped promises less than there is to be gained.
+    predicted = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
+    # The prediction of a strongly damped step is too small.
     is_short = numbers.damping > config.trusted
-    expected = jnp.where(is_short, jnp.maximum(promised, numbers.expected), promised)
+    expected = jnp.where(is_short, jnp.maximum(predicted, numbers.expected), predicted)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))
     after = NewtonNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),

@@ -1,4 +1,4 @@
-"""Planners that minimise: the functions that a subclass defines, and those that it inherits."""
+"""Planners that minimise: the methods that a subclass defines, and the methods that it inherits."""
 
 import abc
 import dataclasses
@@ -24,7 +24,7 @@ from planner_jax.optimise.settings import (
     Stage,
 )
 
-# From where the first search ends.
+# Newton's method from the end of the first search.
 _POLISH = NewtonConfig(
     max_steps=8,
     damping=1e-6,
@@ -36,7 +36,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Of the first round, by effort.
+# Newton's method after the first round, by effort.
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(
@@ -59,19 +59,20 @@ def pending(violation: Array) -> dict[str, PyTree]:
 class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     """A planner by batched L-BFGS: a problem of one case and rounds of attempts at it.
 
-    A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` where it holds
-    no arrays) with a field `rounds`. The four functions are pure and written for one case, in
-    scaled decision variables in which the objective has curvature of order one.
+    A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` if it holds no
+    arrays) with a field `rounds`. Its functions `prepare`, `guesses`, `objective` and `decode` are
+    pure and for one case. They use scaled decision variables, in which the objective has curvature
+    of order one.
     """
 
-    rounds: tuple[Round, ...]  # what to try, in order
-    # Vectors of Newton's method; 0 where the preconditioner of `curved` is nearly the inverse.
+    rounds: tuple[Round, ...]  # attempts, in order
+    # Vectors of Newton's method; 0 if the preconditioner is nearly the inverse of the Hessian.
     subspace: ClassVar[int] = 4
     adjoint: ClassVar[str] = "products"  # the `curvature` of `pj.gradient` by default
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
-        """Return what every evaluation reads, such as the table of the ball's path."""
+        """Return data that every evaluation reads, such as a table of the ball's path."""
 
     @abc.abstractmethod
     def guesses(self, context: PyTree, num: int) -> Array:
@@ -81,11 +82,11 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def objective(self, point: Array, context: PyTree) -> Evaluation:
         """Return cost and largest violation at a point (n,)."""
 
-    def curved(self, point: Array, context: PyTree) -> Curvature:
-        """Return what Newton's method takes at a point (n,).
+    def curvature_at(self, point: Array, context: PyTree) -> Curvature:
+        """Return the derivatives for Newton's method at a point (n,).
 
-        By default each product with the Hessian is a derivative of the gradient, and nothing is
-        known for a preconditioner.
+        By default each product with the Hessian is a derivative of the gradient, and there is no
+        preconditioner.
         """
         from planner_jax.optimise.newton import by_products  # only planners that polish need it
 
@@ -95,20 +96,20 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def decode(self, point: Array, context: PyTree) -> PyTree:
         """Return the plan at a point (n,), with its violation computed more exactly.
 
-        The solver fills in `cost`, `iterations` and `status`; until then they are `pending`.
+        `cost`, `iterations` and `status` are `pending` until the solver sets them.
         """
 
     def rules_out(self, context: PyTree) -> Array:
-        """Return whether a bound proves that no plan exists, () bool; never by default.
+        """Return whether a bound proves that no plan exists, () bool; false by default.
 
         Such a case has the status `TOO_FAR` unless it is solved, and no further attempt is made.
         """
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Return a point (n,) of `before`, this planner with other settings, in own variables.
+        """Return a point (n,) of the same planner with other settings in this planner's variables.
 
-        The point is the same unless the settings change the variables of the planner.
+        The point is the same unless the settings change the variables.
         """
         return point
 
@@ -132,10 +133,9 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self, cases
 
     def plan_shapes(self, cases: PyTree) -> PyTree:
-        """Return the shapes of plans (B, ...) of cases (B, ...); leaves are `jax.ShapeDtypeStruct`.
+        """Return the shapes of plans (B, ...) of cases (B, ...), as leaves `jax.ShapeDtypeStruct`.
 
-        Args:
-            cases: leaves may be `jax.ShapeDtypeStruct`, too.
+        Leaves of the cases may be `jax.ShapeDtypeStruct`, too.
         """
 
         def plan(case: PyTree) -> PyTree:
@@ -144,26 +144,25 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
         return jax.eval_shape(jax.vmap(plan), cases)
 
-    def changed(self, settings: Settings) -> Self:
-        """Return the planner with other values of some fields; its plans keep their shape."""
+    def with_settings(self, settings: Settings) -> Self:
+        """Return the planner with other values of some fields; its plans keep their shapes."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
     def with_solver(self, solver: Solver = _LONG) -> Self:
         """Return the planner with one long search from the first guess in place of its rounds."""
-        return self.changed((("rounds", (Round(solver=solver),)),))
+        return self.with_settings((("rounds", (Round(solver=solver),)),))
 
-    def polished(self, solver: NewtonConfig | None = None) -> Self:
+    def with_polish(self, solver: NewtonConfig | None = None) -> Self:
         """Return the planner whose first round continues by Newton's method.
 
-        Args:
-            solver: settings of the method; by default it continues to the optimum.
+        `solver` are settings of the method; by default it continues to the optimum.
         """
-        if solver is None:
-            solver = self._suited(_POLISH)
         first, *others = self.rounds
         stages = (*first.stages, Stage(first.solver, first.settings))
-        first = dataclasses.replace(first, solver=solver, stages=stages)
-        return self.changed((("rounds", (first, *others)),))
+        first = dataclasses.replace(
+            first, solver=solver or self._fit_subspace(_POLISH), stages=stages
+        )
+        return self.with_settings((("rounds", (first, *others)),))
 
     def with_effort(self, effort: str) -> Self:
         """Return the planner with a first round that continues after every limit holds.
@@ -176,8 +175,10 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
                 1e-7 ("best"). "feasible" returns the planner itself.
         """
         require_one_of(EFFORTS, "effort", effort)
-        return self.polished(self._suited(_EFFORTS[effort])) if effort in _EFFORTS else self
+        return (
+            self.with_polish(self._fit_subspace(_EFFORTS[effort])) if effort in _EFFORTS else self
+        )
 
-    def _suited(self, solver: NewtonConfig) -> NewtonConfig:
+    def _fit_subspace(self, solver: NewtonConfig) -> NewtonConfig:
         """Return the settings with the number of vectors that the preconditioner needs."""
         return dataclasses.replace(solver, subspace=self.subspace)

@@ -1,4 +1,4 @@
-"""Approximate inverses of Hessians that are strong in a few blocks and on their diagonal."""
+"""Approximate inverses of Hessians with strong blocks and a strong diagonal."""
 
 from collections.abc import Callable
 
@@ -12,17 +12,13 @@ from planner_jax.optimise.settings import Preconditioner
 
 
 def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Preconditioner:
-    """One of dense blocks, and a number for each of the other variables.
+    """Return the preconditioner of dense blocks and of a diagonal for the other variables.
 
-    Args:
-        blocks: places (K, k) of the variables that couple.
-        within: second derivatives (K, k, k) among them.
-        others: those of each variable by itself, (n,); in the places of the blocks they do not
-            matter.
-
-    Returns:
-        Of a damping (), which is added to the diagonal, the solver. Its matrix is symmetric; where
-        the blocks, damped, are not positive definite, their pivots are made positive.
+    `blocks` are indices (K, k) of the variables that couple, and `within` the second derivatives
+    (K, k, k) among them. `others` is the diagonal (n,) of the Hessian; its entries for the blocks
+    are ignored. The result takes a damping (), which is added to the diagonal, and returns the
+    solver. Its matrix is symmetric; pivots of blocks that are not positive definite are made
+    positive.
     """
     size, num = others.shape[0], blocks.shape[1]
     inside = np.zeros(size, bool)
@@ -30,7 +26,7 @@ def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Pr
     sizes = jnp.abs(others)
     largest = jnp.max(jnp.where(inside, 0.0, sizes))
 
-    def damped(damping: Array) -> Callable[[Array], Array]:
+    def factorise(damping: Array) -> Callable[[Array], Array]:
         of_others = jnp.maximum(sizes, 1e-6 * largest + 1e-20) + damping
         unit = jnp.asarray(np.eye(num), others.dtype)
         inverses = [positive_inverse(block + damping * unit) for block in within]
@@ -45,14 +41,14 @@ def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Pr
 
         return solve
 
-    return damped
+    return factorise
 
 
 def _gauss_jordan(matrix: Array) -> Array:
-    """Inverse of a symmetric matrix (k, k), its pivots made positive.
+    """Return the inverse of a symmetric matrix (k, k), with pivots made positive.
 
-    Gauss-Jordan in k steps, in place; pivots are not exchanged. Where all of them are positive
-    without help, so is the matrix, and this is its inverse.
+    Gauss-Jordan elimination in k steps, in place, without exchange of pivots. If the matrix is
+    positive definite, no pivot is changed, and the result is its inverse.
     """
     size = matrix.shape[0]
     least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20

@@ -1,13 +1,13 @@
-"""Gradients of many plans at once: one adjoint solve a lane, without a Hessian.
+"""Gradients of many plans at once: one adjoint solve for each lane.
 
 For a number q(u, theta) of a plan, where u minimises cost(u, theta),
 
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
-the adjoint form of the implicit function theorem. lambda comes from a few steps of conjugate
-gradients [Hestenes1952] with the planner's own products with the Hessian
-(`OptimisedPlanner.curved`), or with the whole Hessian. The derivative of all slopes of the cost
-along lambda then holds lambda^T cost_utheta.
+the adjoint form of the implicit function theorem. Conjugate gradients [Hestenes1952]
+solve for lambda in a few steps, with the planner's products with the Hessian
+(`OptimisedPlanner.curvature_at`) or with the whole Hessian. The derivative of all slopes of the
+cost along lambda contains lambda^T cost_utheta.
 """
 
 import dataclasses
@@ -31,23 +31,23 @@ from planner_jax.optimise.preconditioner import positive_inverse
 from planner_jax.optimise.settings import Curvature, Evaluation, Round, Settings
 
 Quantity = str | Callable[[PyTree], Array]
-Product = Callable[[Array], Array]  # of a vector (n,), a vector (n,)
+Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
 _CURVATURES = ("products", "whole")
-# Of the conjugate gradients by default: unknowns are some 40, and scaled.
+# Default iterations of conjugate gradients, for about 40 scaled unknowns.
 _STEPS = {"products": 40, "whole": 1}
-_DAMPING = 1e-9  # of the preconditioner for products: about none
-_SMALL = 1e-11  # square of the residual that is none, beside that of the right side
+_DAMPING = 1e-9  # damping of the preconditioner for products: negligible
+_SMALL = 1e-11  # squared residual at convergence, relative to the right side's square
 
 
 @struct.dataclass
 class Gradient:
-    """A number of a plan, and its gradient by some of the case."""
+    """A number of a plan, and its gradient by parts of the case."""
 
     value: Array  # ()
-    by: dict[str, PyTree]  # name -> what the case has there, of d value / d leaf
-    # () what is left of q_u, relative, in the preconditioner's norm: 0 if lambda is exact. It
-    # says nothing about how far the point is from the optimum. NaN, and so is `by`, where the
-    # cost does not curve upward in the first direction: there is no minimum to follow.
+    by: dict[str, PyTree]  # name -> part of the case with d value / d leaf as leaves
+    # () relative residual of the equation for lambda in the preconditioner's norm: 0 if lambda is
+    # exact. It does not measure the distance to the optimum. It and `by` are NaN if the Hessian is
+    # not positive along the first direction: then the point is no minimum.
     residual: Array
 
 
@@ -59,7 +59,7 @@ class DifferentiatedPlan(Plan):
     gradient: Gradient
 
     def whole_plan(self) -> PyTree:
-        """The plan with what the solver filled in."""
+        """Return the plan with the fields that the solver set."""
         return self.plan.replace(cost=self.cost, iterations=self.iterations, status=self.status)
 
 
@@ -71,16 +71,16 @@ class _Context:
 
 @struct.dataclass
 class Differentiated(OptimisedPlanner):
-    """A planner whose plans carry the gradient of one of their numbers.
+    """A planner whose plans contain the gradient of one of their numbers.
 
-    It is solved like the planner itself; the gradient is taken where the solver ends.
+    It solves the same problem; the gradient is computed at the result of the solver.
     """
 
     planner: OptimisedPlanner
-    # Place in the plan such as "stroke.time", or a function of the plan.
+    # Dotted name in the plan such as "stroke.time", or a function of the plan.
     quantity: Quantity = struct.field(pytree_node=False)
-    by: tuple[str, ...] = struct.field(pytree_node=False)  # places in the case such as "net.radius"
-    # Of the conjugate gradients; as many as suit the curvature if None.
+    by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
+    # Iterations of conjugate gradients; None for the default of the curvature.
     steps: int | None = struct.field(pytree_node=False, default=None)
     curvature: str = struct.field(pytree_node=False, default="products")  # see `gradient_at`
 
@@ -97,39 +97,39 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds of the planner."""
+        """The rounds of the inner planner."""
         return self.planner.rounds
 
-    def changed(self, settings: Settings) -> "Differentiated":
-        """With settings of the planner inside."""
-        return dataclasses.replace(self, planner=self.planner.changed(settings))
+    def with_settings(self, settings: Settings) -> "Differentiated":
+        """Return the planner with other settings of the inner planner."""
+        return dataclasses.replace(self, planner=self.planner.with_settings(settings))
 
     def prepare(self, case: PyTree) -> _Context:
-        """As the planner does."""
+        """Return the context of the inner planner, with the case."""
         return _Context(case=case, inner=self.planner.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Those of the planner."""
+        """Return the starting points of the inner planner."""
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """As the planner does."""
+        """Return the point that the inner planner converts."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """That of the planner."""
+        """Return the objective of the inner planner."""
         return self.planner.objective(point, context.inner)
 
-    def curved(self, point: Array, context: _Context) -> Curvature:
-        """That of the planner."""
-        return self.planner.curved(point, context.inner)
+    def curvature_at(self, point: Array, context: _Context) -> Curvature:
+        """Return the derivatives of the inner planner's objective."""
+        return self.planner.curvature_at(point, context.inner)
 
     def rules_out(self, context: _Context) -> Array:
-        """As the planner does."""
+        """Return whether the inner planner proves that no plan exists."""
         return self.planner.rules_out(context.inner)
 
     def decode(self, point: Array, context: _Context) -> DifferentiatedPlan:
-        """The planner's plan, and the gradient there."""
+        """Return the inner planner's plan, and the gradient at the point."""
         plan = self.planner.decode(point, context.inner)
         return DifferentiatedPlan(
             plan=plan,
@@ -139,8 +139,8 @@ class Differentiated(OptimisedPlanner):
                 point,
                 self.quantity,
                 self.by,
-                steps=self.steps,
-                curvature=self.curvature,
+                self.steps,
+                self.curvature,
             ),
             **pending(plan.violation),
         )
@@ -152,36 +152,35 @@ def gradient_at(
     point: Array,
     quantity: Quantity,
     by: tuple[str, ...],
-    *,
     steps: int | None = None,
     curvature: str = "products",
 ) -> Gradient:
-    """Gradient of a number of the plan at a point by parts of the case. One lane; pure.
+    """Return the gradient of a number of one lane's plan at a point by parts of the case; pure.
 
     Args:
         planner: sizes and switches, static.
         case: one case.
         point: (n,) minimiser of the planner's objective. At another point the result is the
-            derivative of the points of equal cost gradient, not of the optimum.
-        quantity: place of a number in the plan, names joined by dots, or a function of the plan.
-        by: places in the case.
-        steps: of the conjugate gradients; each takes a product with the Hessian. A lane stops
-            early where the Hessian is not positive. 0 leaves the adjoint out, which is right
-            for "cost": its gradient at an optimum is that at a fixed point (envelope theorem).
-            None for as many as suit the curvature.
-        curvature: "products" takes products and preconditioner of the planner's `curved`; "whole"
-            preconditions by the Hessian itself, which takes n products more.
+            derivative of the points of equal gradient of the cost, not of the optimum.
+        quantity: dotted name of a number in the plan, or a function of the plan.
+        by: dotted names in the case.
+        steps: iterations of conjugate gradients, each with one product with the Hessian. A lane
+            stops early if the Hessian is not positive. 0 leaves the adjoint out, which is
+            correct for "cost": its gradient at an optimum is the gradient at a fixed point
+            (envelope theorem). None for the default of the curvature.
+        curvature: "products" uses products and preconditioner of the planner's `curvature_at`;
+            "whole" preconditions by the Hessian itself, which takes n more products.
 
     Raises:
-        ValueError: a place does not exist, or holds something else than floating numbers.
+        ValueError: a name does not exist, or is not of floating-point numbers.
     """
     number = _quantity(quantity)
     parts = {name: part_of(case, name) for name in by}
 
-    def moved(parts: dict) -> PyTree:
+    def change_case(parts: dict) -> PyTree:
         return functools.reduce(lambda s, name: _with_part(s, name, parts[name]), parts, case)
 
-    context, pull = jax.vjp(lambda parts: planner.prepare(moved(parts)), parts)
+    context, pull = jax.vjp(lambda parts: planner.prepare(change_case(parts)), parts)
     leaves, treedef = jax.tree.flatten(context)
     is_smooth = [jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves]
     smooth = [leaf for leaf, flag in zip(leaves, is_smooth, strict=True) if flag]
@@ -206,7 +205,7 @@ def gradient_at(
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
     def products(direction: Array) -> tuple[Array, list]:
-        """(p^T cost_uu, p^T cost_uc) as the derivative of the slopes along p."""
+        """Return (p^T cost_uu, p^T cost_uc), the derivative of the slopes along p."""
         slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
         return jax.jvp(slopes, (point,), (direction,))[1]
 
@@ -215,7 +214,7 @@ def gradient_at(
         residual = jnp.where(jnp.any(along_point != 0.0), jnp.ones_like(value), 0.0)
     else:
         if curvature == "products":
-            here = planner.curved(point, context)
+            here = planner.curvature_at(point, context)
             solve = here.preconditioner(jnp.asarray(_DAMPING, point.dtype))
             product = here.products()
         else:
@@ -235,7 +234,7 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    """Return the inverse of the Hessian, its pivots made positive, and the product itself."""
+    """Return the inverse of the Hessian, its pivots made positive, and the Hessian, as products."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
     return lambda right: jnp.sum(inverse * right, axis=1), product
@@ -244,7 +243,7 @@ def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]
 def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[Array, Array]:
     """Solve cost_uu lambda = rhs by conjugate gradients; return lambda and the relative residual.
 
-    The residual is not finite where the cost does not curve upward to begin with.
+    The residual is NaN if the Hessian is not positive along the first direction.
     """
 
     def going(state: tuple) -> Array:
@@ -273,19 +272,19 @@ def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[
 
 
 def part_of(tree: PyTree, name: str) -> PyTree:
-    """What stands at a place, names and places in tuples joined by dots, in a case.
+    """Return the part of a case with a dotted name; entries of tuples are named by index.
 
     Raises:
-        ValueError: there is no such place, or it holds something else than floating numbers.
+        ValueError: there is no such part, or it is not of floating-point numbers.
     """
-    part = _found(tree, name, "by")
+    part = _find_part(tree, name, "by")
     for leaf in jax.tree.leaves(part):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
             raise ArgumentError("by", "floating numbers", name, verb="name")
     return jax.tree.map(jnp.asarray, part)
 
 
-def _found(tree: PyTree, name: str, argument: str) -> PyTree:
+def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
     if not isinstance(name, str):
         raise ArgumentTypeError(argument, "a name or some", name)
     part = tree
@@ -303,14 +302,14 @@ def _found(tree: PyTree, name: str, argument: str) -> PyTree:
 
 
 def _members(tree: PyTree) -> dict[str, PyTree]:
-    """What a tuple or a dataclass holds, by place or name."""
+    """Return the members of a tuple by index, or of a dataclass by name."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return vars(tree) if dataclasses.is_dataclass(tree) else {}
 
 
 def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
-    """The tree with something else at a place."""
+    """Return the tree with another part at a dotted name."""
     first, _, rest = name.partition(".")
     inner = _with_part(_members(tree)[first], rest, part) if rest else part
     if isinstance(tree, tuple):
@@ -321,4 +320,4 @@ def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
 def _quantity(quantity: Quantity) -> Callable[[PyTree], Array]:
     if callable(quantity):
         return quantity
-    return lambda plan: _found(plan, quantity, "of")
+    return lambda plan: _find_part(plan, quantity, "of")

@@ -14,33 +14,30 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
-MOST_DAMPING = 1e4  # of a lane of Newton's method
+MOST_DAMPING = 1e4  # greatest damping of a lane in Newton's method
 
 
 @struct.dataclass
 class Evaluation:
     """An objective at one point."""
 
-    cost: Array  # (), what is minimised
-    violation: Array  # (), largest relative excess over a limit; <= 0 is feasible
+    cost: Array  # (), to be minimised
+    violation: Array  # (), largest relative excess over a limit; feasible if <= 0
 
 
 Objective = Callable[[Array], Evaluation]
-
-
-# Of a damping, the solver of about the damped Hessian's system: (n,) of a right side (n,).
+# Takes a positive damping (). Returns an approximate solver of the damped Hessian's system, which
+# multiplies a right side (n,) by a symmetric positive definite matrix.
 Preconditioner = Callable[[Array], Callable[[Array], Array]]
 
 
 class Curvature(NamedTuple):
-    """What Newton's method takes of an objective at a point (n,)."""
+    """An objective's value and derivatives at a point (n,), for Newton's method."""
 
     evaluation: Evaluation
     gradient: Array  # (n,)
-    # What makes products of the Hessian with a direction (n,); called where they are needed.
+    # Returns a function that multiplies the Hessian by a direction (n,); called only if needed.
     products: Callable[[], Callable[[Array], Array]]
-    # Of a positive damping (), what solves about the damped Hessian's system, (n,) of a right side
-    # (n,), by a matrix that is symmetric and positive definite.
     preconditioner: Preconditioner
 
 
@@ -51,12 +48,12 @@ Curved = Callable[[Array], Curvature]
 class LbfgsConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
-    max_steps: int = 10  # 0 for the start itself
+    max_steps: int = 10  # 0 returns the start itself
     memory: int = 6
     trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
     step_cap: float = 2.0  # largest Euclidean length of a unit step
-    tolerance: float = 1e-4  # relative decrease of the cost that counts as none
-    patience: int = 2  # iterations without a decrease before a lane is stationary
+    tolerance: float = 1e-4  # relative decrease of the cost below which progress stalls
+    patience: int = 2  # stalled iterations after which a lane is stationary
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
@@ -77,22 +74,22 @@ class NewtonConfig:
     """Sizes and switches of the solver: hashable, so static under jit."""
 
     max_steps: int = 6
-    subspace: int = 4  # vectors; 0 for the preconditioner's step alone, without products
-    damping: float = 1e-4  # at first
-    # Tried at once, as multiples of the preconditioner's curvature. The damping is multiplied by
-    # the one that does best, or by `ease` if that is greater, or by `tighten` if none does better.
+    subspace: int = 4  # number of vectors; 0 uses the preconditioner alone, without products
+    damping: float = 1e-4  # initial damping
+    # Multiples of the preconditioner's curvature that are tried at once. The damping is multiplied
+    # by the best one or by `ease`, whichever is greater, or by `tighten` if none lowers the cost.
     trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
     ease: float = 0.03
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
-    tolerance: float = 1e-4  # decrease that is expected, relative to the cost, that counts as none
-    trusted: float = MOST_DAMPING  # up to which the decrease that is expected counts
-    patience: int = 3  # iterations that lead no nearer before a lane is stationary
-    # Relative difference of two costs, in roundings of their type, that says nothing. Steps that
-    # cost no more are made, and lead nearer where what is expected falls by half.
+    tolerance: float = 1e-4  # predicted relative decrease below which a lane is stationary
+    trusted: float = MOST_DAMPING  # greatest damping at which the predicted decrease is reliable
+    patience: int = 3  # iterations without progress after which a lane is stationary
+    # Relative difference between costs, in roundings of their type, that is insignificant. Steps
+    # that cost no more are accepted, and count as progress if the predicted decrease halves.
     slack: float = 0.0
-    # Lanes that go on while any has something to gain, those with most first: their share in a
-    # batch, iterations of each such group, and how many groups there are at most.
+    # Groups of lanes that continue while any is unfinished, greatest predicted decrease first: a
+    # group's share of the batch, its iterations, and the greatest number of groups.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -116,16 +113,16 @@ class NewtonConfig:
 
 
 Solver = LbfgsConfig | NewtonConfig
-Settings = tuple[tuple[str, object], ...]  # fields of a planner, and the values they take
+Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their values
 
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """An easier problem, the end of which is where the next one begins."""
+    """An easier problem; the next one starts at its result."""
 
     solver: Solver
     settings: Settings = ()
-    keep: int | None = None  # starts of a case that go on, those that cost least; None: all
+    keep: int | None = None  # number of cheapest starts of a case that continue; None for all
 
     def __post_init__(self) -> None:
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
@@ -135,11 +132,11 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Round(Attempt):
-    """An attempt of a planner that minimises: so many starts and iterations."""
+    """An attempt of a planner that minimises: its starts, iterations and settings."""
 
     solver: Solver = LbfgsConfig()
-    settings: Settings = ()  # of the planner, that differ in this round
-    stages: tuple[Stage, ...] = ()  # before it, from easy to hard
+    settings: Settings = ()  # of the planner, for this round
+    stages: tuple[Stage, ...] = ()  # searches before it, from easy to hard
 
     def __post_init__(self) -> None:
         super().__post_init__()

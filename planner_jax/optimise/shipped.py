@@ -1,10 +1,10 @@
 """Measured scales and trained starting points that are shipped beside a task's modules.
 
-A quasi-Newton step is only as good as its coordinates, so that each planner solves in units that
-`python -m benchmarks.measure_scales` measures. The networks for starting points are trained on the
-planner's own objective (amortised optimisation), without solved examples, by
-`python -m benchmarks.learn_starts --train MINUTES`. A search starts at the network's point only
-where that costs less than the guess without it, so that nothing is lost far from the training data.
+A quasi-Newton step is only as good as its coordinates, so each planner solves in units that
+`python -m benchmarks.measure_scales` measures. The networks for starting points are trained by
+`python -m benchmarks.learn_starts --train MINUTES` on the planner's own objective (amortised
+optimisation), without solved examples. A search starts at the network's point only if that costs
+less than the guess without it, so a poor output far from the training data does no harm.
 """
 
 import functools
@@ -19,12 +19,12 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-REACH = 4.0  # standard deviations beyond which features are taken as that far
+REACH = 4.0  # standard deviations at which features are clipped
 
 
 @struct.dataclass
 class StartNetwork:
-    """A network: weights and biases of its layers, mean and deviation of its features."""
+    """A network: weights and biases of its layers, mean and standard deviation of its features."""
 
     mean: Array | np.ndarray  # (F,), of the features
     deviation: Array | np.ndarray  # (F,)
@@ -32,7 +32,7 @@ class StartNetwork:
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 
     def __call__(self, features: Array) -> Array:
-        """Return what is added to a guess, (n,), from features (F,)."""
+        """Return the correction (n,) of a guess, from features (F,)."""
         cast = functools.partial(jnp.asarray, dtype=features.dtype)
         values = (features - cast(self.mean)) / cast(self.deviation)
         values = jnp.clip(values, -REACH, REACH)
@@ -43,30 +43,26 @@ class StartNetwork:
         return values
 
 
-def cheaper_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
-    """Return a learned starting point (n,), or a guess where that costs less."""
+def select_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
+    """Return the cheaper of a learned starting point (n,) and a guess."""
     costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # at once, in one program
     return jnp.where(costs[1] < costs[0], learned, guess)
 
 
 @functools.cache
-def shipped_scale(package: str, name: str) -> tuple[float, ...]:
-    """Return a measured scale from the `measured_scales.json` of a task's package.
-
-    Raises:
-        ValueError: there is none of that name.
-    """
+def load_scale(package: str, name: str) -> tuple[float, ...]:
+    """Return a measured scale from the `measured_scales.json` of a task's package."""
     path = importlib.resources.files(package) / "measured_scales.json"
     scales = json.loads(path.read_text("utf-8"))
     if name not in scales:
         raise ValueError(
-            f"no measured scale for {name!r}: give `scale`, or one of {', '.join(scales)}"
+            f"no measured scale for {name!r}: pass `scale`, or use one of {', '.join(scales)}"
         )
     return tuple(scales[name])
 
 
 @functools.cache
-def shipped_network(package: str, name: str) -> StartNetwork:
+def load_network(package: str, name: str) -> StartNetwork:
     """Return the network `name` of a task's package."""
     path = importlib.resources.files(package) / f"start_{name}.npz"
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:

@@ -1,8 +1,8 @@
 """Batches of plans: chunks of a few fixed sizes, spread over the devices, attempt after attempt.
 
-After each attempt the lanes that are still unsolved are packed together for the next one. Every
-device solves its lanes in a loop of its own and waits for no other. A `Watch` reports the progress
-to the caller, and ends the attempts when the time is over.
+A lane is one case of a batch. After each attempt the lanes that are still unsolved are packed
+together for the next attempt. Every device solves its lanes in a loop of its own and waits for no
+other. A `Watch` reports progress to the caller, and ends the attempts at the time limit.
 """
 
 import dataclasses
@@ -35,30 +35,31 @@ from planner_jax.planning.programs import (
     LANES,
     Sizes,
     apart,
-    compilation_of,
+    compiled,
     is_one_cpu,
     length,
     number,
     on_devices,
-    placed,
+    place_lanes,
+    program_key,
     sharding,
     sizes_of,
     solve_on_devices,
     with_unsolved,
 )
 
-_QUIET = 1.0  # [s], at least, between two reports of one round
+_QUIET = 1.0  # [s], least time between two reports of one round
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """How far a round has come; as text it is one line."""
+    """Progress of one round of `plan`; as text it is one line."""
 
-    round: int  # from 1 on
-    rounds: int  # that there are at most
-    tried: int  # cases that this round is done with
-    cases: int  # that this round is for: those that earlier ones left unsolved
-    seconds: float  # since planning began
+    round: int  # counted from 1
+    rounds: int  # greatest number of rounds
+    tried: int  # of this round, tried so far
+    cases: int  # of this round: all that earlier rounds left unsolved
+    seconds: float  # since the start of planning
 
     def __str__(self) -> str:
         return (
@@ -71,12 +72,12 @@ class Watch:
     """The clock of one call of `plan`.
 
     Args:
-        time_limit: [s] from now, after which no more is begun; None for no end.
-        progress: told where planning has come; None for nobody.
+        time_limit: [s] from the construction, after which no further attempt starts; None for none.
+        progress: receives a `Progress` for each report; None for no reports.
 
     Raises:
-        TypeError: they are no number, and nothing that can be called.
-        ValueError: the time is negative or NaN.
+        TypeError: an argument is no number, or not callable.
+        ValueError: the time limit is negative or NaN.
     """
 
     def __init__(
@@ -91,33 +92,35 @@ class Watch:
                 raise ArgumentError("time_limit", ">= 0 s", time_limit)
         if progress is not None and not callable(progress):
             raise ArgumentTypeError("progress", "callable, such as print", progress)
-        self._began, self._limit, self._progress = time.monotonic(), time_limit, progress
-        self._told = (0, 0.0)  # round and time of the last report
+        self._start, self._limit, self._progress = time.monotonic(), time_limit, progress
+        self._reported = (0, 0.0)  # round and time of the last report
 
     @property
     def waits(self) -> bool:
-        """Whether each step has to be waited for, as its end is of interest."""
+        """Whether the planner must wait for each step, because its end time matters."""
         return self._limit is not None or self._progress is not None
 
     @property
     def is_over(self) -> bool:
-        """Whether the time has passed."""
-        return self._limit is not None and time.monotonic() - self._began >= self._limit
+        """Whether the time limit has passed."""
+        return self._limit is not None and time.monotonic() - self._start >= self._limit
 
     def tell(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
-        """Report of a round: its beginning and its end always, its middle once a second."""
+        """Report on a round: always at its start and end, in between once a second."""
         if self._progress is None:
             return
-        seconds, rounds = time.monotonic() - self._began, tuple(planner.attempts)
+        seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
         place = rounds.index(attempt) + 1 if attempt in rounds else 1
-        last_place, last = self._told
+        last_place, last = self._reported
         if 0 < tried < cases and place == last_place and seconds - last < _QUIET:
             return
-        self._told = place, seconds
+        self._reported = place, seconds
         self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
-_Call = tuple[np.ndarray, int]  # lanes of one call, filled up with its first one; how many count
+_Call = tuple[
+    np.ndarray, int
+]  # lanes of one call, padded with its first one; number before padding
 
 
 def plan_batch(
@@ -134,30 +137,30 @@ def plan_batch(
         planner: makes the attempts.
         attempts: in order, one or more.
         cases: a leading axis of B on every leaf.
-        chunk: lanes that a device solves in one call; None for what suits it.
+        chunk: lanes that a device solves in one call; None for a number that suits the device.
         devices: share the work; None for all local ones.
-        watch: after its end no attempt but the first is started.
+        watch: ends the attempts; the first one always starts.
 
     Returns:
-        plans: with NumPy leaves; or, where all leaves of the cases are jax arrays, with jax
-            arrays, so that nothing leaves the devices.
-        unsolved: numbers that are all zero if no lane is unsolved.
+        The plans, with NumPy leaves, or with jax arrays if all leaves of the cases are jax arrays;
+        and numbers that are all zero if no lane is unsolved.
     """
     planner, mesh = on_devices(planner, devices)
     batch = _Batch(planner, chunk, mesh, watch)
     resident, num = is_resident(cases), length(cases)
-    # The memory of one CPU is the host's: there a thread for each core plans chunks, and they are
-    # cut and joined without programs, which would be compiled for every new size.
+    # One CPU shares its memory with the host: there a thread for each core plans chunks, and NumPy
+    # cuts and joins them, because programs for that would be compiled for every new size.
     if resident and (num == batch.sizes(attempts[0]).next(num) or not is_one_cpu(mesh)):
         return batch.plan_resident(attempts, cases)
-    plans, unsolved = batch.plan_from_host(attempts, cases)
+    cases = jax.tree.map(np.asarray, cases)
+    plans, unsolved = _try_in_turn(attempts, num, watch, functools.partial(batch.try_lanes, cases))
     return (jax.device_put(plans, sharding(mesh)) if resident else plans), unsolved
 
 
 def plan_on_host(
     planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: Watch
 ) -> tuple[PyTree, int]:
-    """Return what `plan_batch` does, by a planner on the host, of NumPy leaves or of one case."""
+    """Do the work of `plan_batch` for a planner on the host, with NumPy leaves or one case."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
@@ -178,10 +181,10 @@ def _try_in_turn(
     watch: Watch,
     try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
-    """Return plans (num, ...) by one attempt after another, and how many are unsolved.
+    """Return plans (num, ...) by one attempt after another, and the number that is unsolved.
 
-    `try_lanes` makes an attempt at some lanes, and returns the plans so far, None at first, with
-    those that are better.
+    `try_lanes` makes an attempt at some lanes. It takes the plans so far, None at first, and
+    returns them with better plans at these lanes.
     """
     first, *others = attempts
     plans = try_lanes(first, np.arange(num), None)
@@ -210,16 +213,10 @@ class _Batch:
         """Return the sizes of the calls of an attempt."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
-    def plan_from_host(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, int]:
-        """Return plans of cases in NumPy arrays: chunks go to the devices, and plans come back."""
-        cases = jax.tree.map(np.asarray, cases)
-        try_lanes = functools.partial(self._try_from_host, cases)
-        return _try_in_turn(attempts, length(cases), self.watch, try_lanes)
-
-    def _try_from_host(
+    def try_lanes(
         self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
-        """Return the plans after one attempt at some lanes."""
+        """Return the plans after one attempt at some lanes of cases in NumPy arrays."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.tell(self.planner, attempt, 0, lanes.size)
@@ -245,7 +242,7 @@ class _Batch:
         return out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
-        """Return the calls that lanes take."""
+        """Return the calls for some lanes."""
         calls, devices = [], self.mesh.size
         for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
             part = lanes[first * devices :][: size * devices]
@@ -258,8 +255,8 @@ class _Batch:
     ) -> Iterator[PyTree]:
         """Yield the plans of every call; on one CPU device with a thread for each core.
 
-        One more thread prepares the next call while the others compute. Where the attempt may end
-        early, there is None for the calls that were not started in time.
+        One more thread prepares the next call while the others compute. If `may_end`, calls that
+        did not start before the time limit yield None.
         """
         watch, spec = self.watch, sharding(self.mesh)
         threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
@@ -271,27 +268,27 @@ class _Batch:
             found, _ = solve_on_devices(self.planner, attempt, self.mesh, part)
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
-        if threads == 1:  # calls return before they are done, so that the next is under way
+        if threads == 1:  # JAX returns before a call is done, so that the next one is prepared
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
-        # A first call compiles, once for all threads; they all find what is compiled.
-        compilation = compilation_of(self.planner, attempt, calls[0][0].size, cases)
-        alone = [] if compilation.is_done else [solve(calls[0])]
-        compilation.is_done = True
+        # The first call compiles, once for all threads.
+        key = program_key(self.planner, attempt, calls[0][0].size, cases)
+        alone = [] if key in compiled else [solve(calls[0])]
+        compiled.add(key)
         with ThreadPoolExecutor(threads) as pool:
             later = pool.map(as_here(solve), calls[len(alone) :])
             yield from alone
             yield from later
 
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays; only how many are unsolved comes to the host.
+        """Return plans of cases in jax arrays; only the number of unsolved ones reaches the host.
 
-        Every device plans its own share, without asking the others for a lane.
+        Every device plans its own share, and takes no lanes of other shares.
         """
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, length(cases)
-        if num % mesh.size:  # the last lane is there again until all shares are equal
+        if num % mesh.size:  # the last lane is repeated until all shares are equal
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
-        cases = placed(cases, mesh)
+        cases = place_lanes(cases, mesh)
         first, *others = attempts
         watch.tell(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
@@ -299,8 +296,8 @@ class _Batch:
             before, due = plans.status, unsolved
             if attempt.within is not None:
                 before, due = _due(mesh, attempt.within, plans)
-            due.copy_to_host_async()  # on its way as soon as it is known
-            most = np.asarray(due).max()  # of the devices
+            due.copy_to_host_async()  # starts as soon as it is known
+            most = np.asarray(due).max()  # among the devices
             if most == 0:
                 continue
             if watch.is_over:
@@ -311,12 +308,12 @@ class _Batch:
                 part, lanes = _cut_unsolved(mesh, size, cases, before, number(mesh, begin))
                 later, _ = solve_on_devices(planner, attempt, mesh, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
-        if num % mesh.size:  # arrays have equal shares or none
+        if num % mesh.size:  # JAX has no arrays of unequal shares
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Return what `solve_on_devices` does of all lanes of every device, chunk by chunk."""
+        """Return the results of `solve_on_devices` for all lanes of each device, chunk by chunk."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), length(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)
@@ -327,27 +324,26 @@ class _Batch:
             return solve_on_devices(self.planner, attempt, mesh, part)[0]
 
         firsts = {size: begin for begin, size in reversed(cuts)}
-        programs = [compilation_of(self.planner, attempt, size, cases) for size in firsts]
+        keys = {program_key(self.planner, attempt, size, cases) for size in firsts}
         found: dict[int, PyTree] = {}
-        if sum(not each.is_done for each in programs) > 1:  # compiled at the same time
+        if len(keys - compiled) > 1:  # compile at the same time
             with ThreadPoolExecutor(len(firsts)) as pool:
-                made = pool.map(as_here(solve), firsts.values(), firsts)
-                found = dict(zip(firsts.values(), made, strict=True))
-            for each in programs:
-                each.is_done = True
+                plans = pool.map(as_here(solve), firsts.values(), firsts)
+                found = dict(zip(firsts.values(), plans, strict=True))
+            compiled.update(keys)
         parts = [found[begin] if begin in found else solve(begin, size) for begin, size in cuts]
         return _join_locally(mesh, parts, share)
 
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return some lanes; the last one for those behind it."""
+    """Return some lanes; the last one instead of indices beyond it."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
 def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
-    """Return the next lanes of every device's share, filled up with its last one."""
+    """Return the next lanes of every device's share, padded with its last one."""
 
     def cut(tree: PyTree, begin: Array) -> PyTree:
         return _take(tree, begin + jnp.arange(size))
@@ -361,7 +357,7 @@ def _cut_unsolved(
 ) -> tuple[PyTree, Array]:
     """Return the next unsolved lanes of every device's share, and their indices.
 
-    They are filled up with the last lane, whose index is then behind the share.
+    They are padded with the last lane, whose index in the padding is beyond the share.
     """
 
     def cut(tree: PyTree, status: Array, begin: Array) -> tuple[PyTree, Array]:
@@ -375,7 +371,10 @@ def _cut_unsolved(
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
 def _due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
-    """Return statuses, and how many are unsolved, (devices,), as if plans farther off were not."""
+    """Return statuses, and the number of unsolved ones, (devices,).
+
+    Plans with a violation above `within` count as solved.
+    """
 
     def due(plans: PyTree) -> tuple[Array, Array]:
         near = plans.violation <= within
@@ -387,7 +386,7 @@ def _due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
 def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, Array]:
-    """Return the parts of every device joined to its share, and how many it leaves unsolved."""
+    """Return each device's parts joined to its share, and the number that it leaves unsolved."""
 
     def join(*parts: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
@@ -397,7 +396,7 @@ def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, 
 
 @functools.partial(jax.jit, static_argnames="mesh")
 def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Return what `select_into` does of every device's share, and how many it leaves unsolved."""
+    """Return the results of `select_into` for each device, and its number of unsolved plans."""
 
     def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
         kept = select(later, _take(plans, lanes))

@@ -1,4 +1,4 @@
-"""A planner behind a decision: in what order, when, which of several."""
+"""A planner behind a decision on what cases leave open, such as an order."""
 
 from collections.abc import Callable
 
@@ -10,43 +10,28 @@ from jax import Array, lax
 from jax.core import Tracer
 from jaxtyping import PyTree
 
-from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
 from planner_jax.core.protocol import Decision, index_of_best, is_resident, is_solved, is_unsolved
 from planner_jax.planning.programs import call_packed
 
 
 @struct.dataclass
-class DecidedPlanner(Planner[CaseT, PlanT]):
-    """A composite planner: a decision proposes choices, a planner plans every one of them.
+class DecidedPlanner(PlannerAround[CaseT, PlanT]):
+    """A composite planner: a decision proposes choices, and a planner plans every choice.
 
-    Of several choices the solved one of least `decision.rank` is selected, or the one of least
-    violation if none is solved. The last attempt of the planner, its longest, is made at cases of
-    which no choice is solved by then; if the planner `starts_long`, so are all but the first.
+    Of several choices the solved one with the least `decision.rank` is selected, or the one with
+    the least violation if none is solved. The planner's last and longest attempt is made only for
+    cases without a solved choice. If the planner `starts_long`, so are all attempts but the first.
     """
 
-    planner: Planner[CaseT, PlanT]
     decision: PyTree  # a `Decision`
-
-    @property
-    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The class of the planner's cases."""
-        return self.planner.case_type
-
-    @property
-    def inner(self) -> Planner:
-        """The planner of decided cases."""
-        return self.planner
-
-    def replanner(self) -> Planner:
-        """Return the re-planner of the planner: it keeps the order of the plan."""
-        return self.planner.replanner()
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
         """Return the planner that minimises, and the cases with the choice of their plans.
 
-        Without `plan_of` it is the first choice of the decision.
+        Without `plan_of` that is the first choice of the decision.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))
@@ -57,7 +42,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the plans of one case or of a batch, with the choices made in them."""
+        """Return the plans of one case or of a batch, which hold their choices."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)
@@ -82,7 +67,7 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
         return plans.replace(status=status if on_devices else np.asarray(status))
 
     def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan all choices together, and return the decided cases (B,) with the best plans."""
+        """Plan all choices together; return the decided cases (B,) and their best plans."""
         xp = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
@@ -105,12 +90,11 @@ class DecidedPlanner(Planner[CaseT, PlanT]):
 
 
 def _propose(_: None, decision: Decision, case: PyTree) -> PyTree:
-    """Return the choices (F, ...) of one case."""
     return decision.propose(case)
 
 
 def _split(choices: PyTree, axis: int) -> list[PyTree]:
-    """Return choices one by one that lie along an axis."""
+    """Return choices, stacked along an axis, one by one."""
     num = jax.tree.leaves(choices)[0].shape[axis]
     before = (slice(None),) * axis
     return [jax.tree.map(lambda leaf: leaf[*before, k], choices) for k in range(num)]  # noqa: B023
@@ -118,7 +102,7 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 @jax.jit
 def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return the first choice of one case or of each case of a batch, the second, ..."""
+    """Return a list of choices, first to last, each of one case or of each case of a batch."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
     return _split(jax.vmap(decision.propose)(cases), 1)
@@ -126,7 +110,7 @@ def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
 
 @jax.jit
 def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
-    """Return statuses of one case or of a batch; of unsolved cases, what the decision knows."""
+    """Return statuses of one case or of a batch, with the explanations of the decision."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 

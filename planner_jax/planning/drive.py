@@ -1,4 +1,4 @@
-"""The driver of attempts: it has planners of every kind plan, on the host or inside a program."""
+"""The driver of attempts: it runs planners of every kind, on the host or inside a program."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -24,16 +24,16 @@ from planner_jax.planning.programs import solve_cases, solve_one
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """The `Drive` of `plan`; or that of `solve`, which is pure."""
+    """The `Drive` of `plan`, and the pure `Drive` of `solve`."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch = dataclasses.field(default_factory=Watch)
-    is_pure: bool = False  # inside a compiled program
+    is_pure: bool = False  # for use inside a compiled program
 
     @property
     def is_over(self) -> bool:
-        """Whether the caller's time has passed."""
+        """Whether the caller's time limit has passed."""
         return self.watch.is_over
 
     def __call__(
@@ -57,7 +57,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after one more try at the cases that are left; see `Drive`."""
+        """Return plans (B,) after another try at some of the cases; see `Drive`."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
@@ -82,13 +82,13 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         watch.tell(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan
-        if not is_unsolved(int(best.status)):  # of a number quicker to find out than of an array
+        if not is_unsolved(int(best.status)):  # an int is checked faster than an array
             break
     return best
 
 
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
-    """Return plans as jax arrays: every further attempt is made if it is due at some case."""
+    """Return plans as jax arrays; each further attempt is made if it is due for some case."""
     require_pure(planner)
     first, *others = attempts
     plans = solve_cases(planner, cases, first)
@@ -105,5 +105,5 @@ def require_pure(planner: Planner) -> None:
     """Raise `TypeError` for a planner that works on the host."""
     if planner.kind is Kind.HOST:
         raise TypeError(
-            f"{type(planner).__name__} works on the host: call pj.plan outside of what is compiled"
+            f"{type(planner).__name__} works on the host: call pj.plan outside compiled functions"
         )

@@ -29,44 +29,45 @@ def plan(
 ) -> PlanT:
     """Plan one case, or a batch of them with a leading axis on every leaf.
 
+    Inside a compiled function of the caller this is `solve`. The same call gives the same bits.
+    With other cases in the batch, other chunks or other devices, a case's arithmetic is rounded
+    differently; a search that ends short of the optimum may then end elsewhere, rarely with another
+    status.
+
     Args:
         planner: such as `pj.hit.planner("exact")`; its attempts are made in order, each at the
             cases that are still unsolved.
         cases: a pytree; a batch has one more axis than a single case.
         chunk: cases that a device solves in one compiled call. The default suits the device.
-        devices: that share a batch. By default all local ones, `jax.local_devices()`.
-        time_limit: [s], compiling included, after which nothing more is begun but the first
-            attempt; what is under way is finished. A case that is unsolved and has not been through
-            all attempts by then has the status `OUT_OF_TIME`, others the bits that they would have.
-        progress: told of every attempt as it begins, as chunks of it are done, and as it ends; as
-            `print`, which writes a line of a `Progress`.
+        devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
+        time_limit: [s], compilation included, after which no attempt starts except the first;
+            running computations are finished. Unsolved cases that have not been through all
+            attempts have the status `OUT_OF_TIME`; other cases keep their bits.
+        progress: receives a `Progress` at the start and end of every attempt and after its chunks;
+            `print` writes one line for each.
 
     Returns:
-        The planner's plans with the batch shape of the cases. The leaves are NumPy arrays;
-        of a batch in jax arrays they are jax arrays too, and nothing leaves the devices but
-        how many cases are unsolved: each device holds its share, or the first one all if the
-        batch cannot be shared evenly. Look at `status`: a case that could not be solved says so
-        and holds the best that was found. The same call gives the same bits. In other company,
-        chunks or devices a case's arithmetic is rounded differently, and where few iterations
-        end short of the optimum it may end elsewhere, rarely with another status.
-        Inside a compiled function of the caller's own it is `solve`.
+        The planner's plans with the batch shape of the cases; see their `status`. An unsolved case
+        holds the best plan that was found. The leaves are NumPy arrays, or jax arrays for a batch
+        in jax arrays. Then nothing leaves the devices except the number of unsolved cases, and each
+        device holds its share, or the first one all if the batch cannot be shared evenly.
 
     Raises:
-        CaseError: a number of a case in NumPy arrays is absurd, such as NaN or a negative limit;
-            one line with the field, the rule, the value and the first lane. In jax arrays such a
-            lane has the status `BAD_INPUT` instead, and inside of compiled functions, too.
-        ValueError: the leaves have not one batch axis or none, or of different lengths or other
-            shapes, the batch is empty, `chunk` < 1, the `devices` are none or not different, or
-            the `time_limit` is negative.
+        CaseError: a number of a case in NumPy arrays breaks its rule, such as NaN or a negative
+            limit; one line with the field, the rule, the value and the first such case. In jax
+            arrays, and inside compiled functions, such a case has the status `BAD_INPUT` instead.
+        ValueError: the leaves do not all have one batch axis of the same length, or none; a leaf
+            has another shape; the batch is empty; `chunk` < 1; the `devices` are none or not
+            distinct; or the `time_limit` is negative.
         TypeError: the cases are of another task than the planner, or their numbers of another
-            kind; or within a transformation of JAX that the planner does not allow, see `solve`.
+            kind; or `solve` cannot be used inside this transformation of JAX.
     """
     watch, leaves = Watch(time_limit, progress), jax.tree.leaves(cases)
     kinds = {type(leaf) for leaf in (*leaves, *jax.tree.leaves(planner))}
     if any(issubclass(kind, Tracer) for kind in kinds):
         if watch.waits:
             raise ArgumentTypeError(
-                "time_limit and progress", "left out inside of compiled functions", shown=""
+                "time_limit and progress", "left out inside compiled functions", shown=""
             )
         return solve(planner, cases)
     require_fit(planner, cases)
@@ -79,7 +80,7 @@ def plan(
         if not resident:
             require_sound(cases)
     plans, _ = Driver(chunk, devices, watch)(planner, cases)
-    # One case is looked at afterwards, as that costs nothing where all is well.
+    # One case is checked after planning, which costs nothing if its status is good.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):
@@ -88,7 +89,7 @@ def plan(
 
 
 def _require_layout(chunk: object, devices: object) -> None:
-    """Raise unless a chunk is a number of cases, and devices are some that differ."""
+    """Raise unless a chunk is a number of cases, and devices are distinct."""
     if chunk is not None:
         require_size("chunk", chunk)
     if devices is not None:
@@ -105,7 +106,7 @@ def _require_layout(chunk: object, devices: object) -> None:
 def _require_own_precision(leaves: list[PyTree]) -> None:
     """Raise `TypeError` for cases in float64 while JAX computes in float32.
 
-    Cases of which only some arrays are in float64, as NumPy makes them, are accepted.
+    Cases with some arrays in float64, as NumPy makes them, are accepted.
     """
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         return
@@ -122,7 +123,7 @@ def require_batch(cases: Case) -> int:
     for path, leaf in jax.tree_util.tree_leaves_with_path(cases):
         if np.shape(leaf)[:1] != batch:
             if has_rules(cases):
-                require_shapes(cases)  # which names the one array that is of another batch
+                require_shapes(cases)  # its error names the array of another batch
             name = jax.tree_util.keystr(path)
             raise ArgumentError(
                 f"cases{name}", f"{batch[0]} lanes", verb="have", shown=f"shape {np.shape(leaf)}"
@@ -131,10 +132,10 @@ def require_batch(cases: Case) -> int:
 
 
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
-    """Do what `plan` does as a pure function, for compiled functions, `vmap` and `scan`.
+    """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Every attempt after the first is made only if some case is unsolved by then, but then at all
-    cases of the batch; `plan`, which takes out the solved ones, is quicker where few are left.
+    Each attempt after the first is made if some case is unsolved by then, but at all cases of the
+    batch. `plan`, which removes solved cases, is faster where few are left.
 
     Args:
         planner: as for `plan`.
@@ -144,8 +145,8 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
         The plans, jax arrays.
 
     Raises:
-        TypeError: the planner works on the host, or the result is differentiated: the iterations
-            of a solver have no derivative that is that of the optimum.
+        TypeError: the planner works on the host, or the result is differentiated: the derivative of
+            a solver's iterations is not the derivative of the optimum.
     """
     require_fit(planner, cases)
     require_pure(planner)
@@ -164,7 +165,7 @@ def _solve(planner: PyTree, cases: PyTree) -> PyTree:
 
 @_solve.defjvp
 def _raise(primals: tuple, tangents: tuple) -> tuple:
-    """Raise `TypeError` for whoever differentiates plans."""
+    """Raise `TypeError` on differentiation."""
     raise TypeError(
         "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
         "and pj.optimal_plan inside a loss"

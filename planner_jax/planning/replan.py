@@ -1,6 +1,6 @@
-"""`replan`: a plan made anew from the one that is being carried out, for what is known now."""
+"""`replan`: a new plan from the plan that is being executed, for changed circumstances."""
 
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic
 
 import jax
 import numpy as np
@@ -10,21 +10,17 @@ from jaxtyping import PyTree
 
 from planner_jax.core.checks import numbers_of, require_kind
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.planner import require_planner
-from planner_jax.core.protocol import Plan
+from planner_jax.core.planner import CaseT, PlanT, require_planner
 from planner_jax.core.rules import Case
 from planner_jax.planning.plan import plan
-
-CaseT = TypeVar("CaseT", bound=Case)
-PlanT = TypeVar("PlanT", bound=Plan)
 
 
 @struct.dataclass
 class Replanning(Generic[CaseT, PlanT]):
-    """One case for a re-planner, or a batch of them. Times of `case` count from now."""
+    """One case for a re-planner, or a batch. Times of `case` count from the present."""
 
-    case: CaseT  # as it is known now
-    previous: PlanT  # that is being carried out; its times began `elapsed` ago
+    case: CaseT  # as known at present
+    previous: PlanT  # being executed; its time 0 is `elapsed` ago
     elapsed: Array | np.ndarray  # () [s]
 
     @property
@@ -34,20 +30,16 @@ class Replanning(Generic[CaseT, PlanT]):
 
 
 def moment_of(cases: Case, elapsed: PyTree) -> np.ndarray:
-    """When plans that are being carried out are left, in the cases' shape and type of numbers.
-
-    Args:
-        cases: one case, or a batch.
-        elapsed: () or (B,) [s], since the plans began, >= 0.
+    """Return the time since plans started, () or (B,) [s], in the cases' floating type.
 
     Raises:
-        TypeError: it is no time.
-        ValueError: it is negative or not finite, or of another shape.
+        TypeError: `elapsed` is no number.
+        ValueError: `elapsed` is negative, not finite, or of another shape.
     """
     dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
     dtype = next(dtype for dtype in dtypes if dtype.kind == "f")
     elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
-    # As reductions of their own these take a third of what `all` does for one number.
+    # For one number these reductions take a third of the time of `all`.
     least = np.minimum.reduce(elapsed, axis=None, initial=np.inf)
     most = np.maximum.reduce(elapsed, axis=None, initial=0.0)
     if not least >= 0.0:
@@ -57,18 +49,14 @@ def moment_of(cases: Case, elapsed: PyTree) -> np.ndarray:
     return elapsed
 
 
-def given_or_own(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
-    """What is known of a state, in the shape of a plan's own.
+def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
+    """Return the numbers that the caller passed for an argument, or else a plan's own.
 
-    Args:
-        name: of the argument, for messages.
-        given: one state, or one a case; the plan's own counts where it is None.
-        own: one a case, or one state of one case.
-        elapsed: as of `moment_of`, in whose type of numbers it is.
+    Both are for each case or for one case. The result has the batch shape and type of `elapsed`.
 
     Raises:
-        TypeError: no numbers.
-        ValueError: another shape, or not finite.
+        TypeError: the argument does not hold numbers.
+        ValueError: the argument has another shape, or is not finite.
     """
     if given is None:
         return np.asarray(own, elapsed.dtype)
@@ -80,21 +68,20 @@ def given_or_own(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> 
 
 
 def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
-    """Plan again some time into a plan; a few iterations from what is left of it.
+    """Plan again some time into a plan; a few iterations from the remainder of the plan.
 
     Args:
-        planner: one that has a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
-            with settings of its own, such as `ReplanCatch(shortest=0.2)`.
-        cases: what `previous` was planned for, one case or a batch; its times count from where
-            the plan began.
-        previous: the plan that is being carried out.
-        elapsed: () or (B,) [s], since it began, >= 0.
-        **news: what has changed, with times that count from now. Catches take `targets` and
-            `head_state`, hits `ball`, `drag` and `head_state`. A robot whose `head_state` is not
-            given is where the plan has it.
+        planner: a planner with a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
+            with its own settings, such as `ReplanCatch(shortest=0.2)`.
+        cases: the cases of `previous`, one or a batch; their times count from the plan's start.
+        previous: the plan that is being executed.
+        elapsed: () or (B,) [s], time since the plan's start, >= 0.
+        **news: changed quantities, with times that count from the present. Catches take `targets`
+            and `head_state`, hits `ball`, `drag` and `head_state`. Without a `head_state` the
+            robot is where the plan has it.
 
     Returns:
-        The plans; their times count from now.
+        The plans; their times count from the present.
 
     Raises:
         TypeError: the planner has no re-planner, or cases, plans or news are of another task.

@@ -11,7 +11,7 @@ from flax import struct
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import RECOVERIES, require_one_of
-from planner_jax.core.planner import CaseT, Drive, Planner, PlanT
+from planner_jax.core.planner import CaseT, Drive, Planner, PlannerAround, PlanT
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.recovery.planner import RecoveryPlanner
@@ -22,28 +22,13 @@ _SLOWER = (0.8, 0.65, 0.5)
 
 
 @struct.dataclass
-class RecoveringPlanner(Planner[CaseT, PlanT]):
+class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     """A composite planner: a quadrotor's planner, and one that goes on from its plans to rest.
 
     A plan whose recovery breaks a limit is not solved. It is then made again with less speed.
     """
 
-    planner: Planner[CaseT, PlanT]
     rest: RecoveryPlanner
-
-    @property
-    def case_type(self) -> type:  # pyright: ignore[reportIncompatibleVariableOverride]
-        """The class of the planner's cases."""
-        return self.planner.case_type
-
-    @property
-    def inner(self) -> Planner:
-        """The planner of plans without a recovery."""
-        return self.planner
-
-    def replanner(self) -> Planner:
-        """Return the planner's: what is planned anew has no recovery."""
-        return self.planner.replanner()
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None

@@ -128,10 +128,10 @@ class BlockFlight(FlightTask):
         if settings.perception:
             arms = SeeingArms(
                 planner,
-                sense=settings.until_known,
+                observe=settings.until_known,
                 overhead=settings.until_set,
-                refit=settings.rate,
-                wait=0.0,
+                replan=settings.rate,
+                observe_longer=0.0,
                 noise=settings.noise,
                 frame_rate=settings.frame_rate,
                 seed=settings.seed,
@@ -143,7 +143,7 @@ class BlockFlight(FlightTask):
             settings.seed,
             drives=settings.drives,
             planner=planner,
-            allowed=settings.until_set,
+            planning_budget=settings.until_set,
             decided=decided,
         )
         return dataclasses.replace(flights, planning_seconds=flights.planning_seconds + seconds)

@@ -141,7 +141,7 @@ def fly_blocks(
     *,
     drives: Drives = IDEAL,
     planner: Any = None,
-    allowed: float | None = None,
+    planning_budget: float | None = None,
     plan: BlockPlan | None = None,
     seconds: np.ndarray | None = None,
     decided: Decided | None = None,
@@ -154,7 +154,7 @@ def fly_blocks(
         seed: of the noise of encoders, >= 0.
         drives: of the arm.
         planner: of all plans, by default `online`.
-        allowed: [s], the end of the delay, that plans may take; a plan that takes longer is
+        planning_budget: [s], the end of the delay, that plans may take; a plan that takes longer is
             carried out as much later. None: planning takes no time.
         plan: of each case, instead of one made here.
         seconds: (B,) [s], that these took.
@@ -167,15 +167,17 @@ def fly_blocks(
     case = cases.cases
     require_arm(world, case)
     delay = np.asarray(case.delay, float)
-    if allowed is not None and not 0.0 <= allowed <= delay.min() + 1e-6:
-        raise ArgumentError("allowed", f">= 0 and <= the delay {delay.min():g}", allowed)
+    if planning_budget is not None and not 0.0 <= planning_budget <= delay.min() + 1e-6:
+        raise ArgumentError(
+            "planning_budget", f">= 0 and <= the delay {delay.min():g}", planning_budget
+        )
     if decided is not None:
         plan = decided.plans
     if plan is None:
         made: tuple[BlockPlan, np.ndarray] = timed_plans(planner or block_planner(), case)
         plan, seconds = made
-    seconds = np.zeros(len(cases)) if seconds is None or allowed is None else seconds
-    allowed = allowed or 0.0
+    seconds = np.zeros(len(cases)) if seconds is None or planning_budget is None else seconds
+    budget = planning_budget or 0.0
     solved = np.asarray(is_solved(plan.status))
     entry = entry_times(case)
     last = np.where(np.isfinite(entry), entry, delay)
@@ -187,16 +189,16 @@ def fly_blocks(
         since=delay,
         until=contact,
         end=float(np.max(np.maximum(contact, last))) + _AFTER,
-        late=np.maximum(seconds - allowed, 0.0),
+        late=np.maximum(seconds - budget, 0.0),
         drives=drives,
     )
     move = np.where(solved, np.sum(np.asarray(plan.motion.durations, float), axis=1), 0.0)
     budget = Budget(
-        sense=delay - allowed,
+        sense=delay - budget,
         plan=seconds,
-        wait=np.maximum(allowed - seconds, 0.0),
+        wait=np.maximum(budget - seconds, 0.0),
         move=move,
-        stand=contact - (delay - allowed) - np.maximum(allowed, seconds) - move,
+        stand=contact - (delay - budget) - np.maximum(budget, seconds) - move,
         rest=entry - contact,
     )
     flights = scored(case, plan, flown, budget)

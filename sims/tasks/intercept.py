@@ -68,7 +68,7 @@ jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fi
 
 
 def meetings(
-    suite: str, num: int, seed: int = 0, *, noise: float = 0.1, looks: float = 1.0
+    suite: str, num: int, seed: int = 0, *, noise: float = 0.1, observation_rate: float = 1.0
 ) -> Meetings:
     """Interceptions of a suite, with looks before the start and on the way.
 
@@ -77,12 +77,16 @@ def meetings(
         num: B >= 1.
         seed: >= 0, of cases and noise.
         noise: [m], standard deviation of a coordinate that is seen.
-        looks: [Hz], on the way; 0 for none.
+        observation_rate: [Hz], during the drive; 0 for none.
     """
     cases = jax.tree.map(np.asarray, draw(num, suite, seed))
     before, seen = observe(cases, seed, noise)
     end = float(np.max(cases.time))
-    later = np.arange(1, int(end * looks + 1e-6) + 1) / looks if looks > 0.0 else np.zeros(0)
+    later = (
+        np.arange(1, int(end * observation_rate + 1e-6) + 1) / observation_rate
+        if observation_rate > 0.0
+        else np.zeros(0)
+    )
     times = np.concatenate([before, later])
     of_path = jax.jit(jax.vmap(lambda path: jax.vmap(lambda at: path.at(at).pos)(later)))
     ahead = np.asarray(of_path(cases.target)) if later.size else np.zeros((num, 0, 2))
@@ -104,9 +108,9 @@ def meetings(
     )
 
 
-@functools.partial(jax.jit, static_argnames=("loop", "known", "see_movers"))
+@functools.partial(jax.jit, static_argnames=("loop", "known_target", "predict_movers"))
 def expected(
-    loop: DriveLoop, meetings: Meetings, now: Array, *, known: bool, see_movers: bool
+    loop: DriveLoop, meetings: Meetings, now: Array, *, known_target: bool, predict_movers: bool
 ) -> tuple[TurningPath, Obstacles]:
     """Where targets and movers are believed to go; both count from now.
 
@@ -116,8 +120,8 @@ def expected(
         loop: with the sensing.
         meetings: leaves (B, ...).
         now: () [s].
-        known: whether the targets' ways are known (static).
-        see_movers: whether the movers' are not (static).
+        known_target: whether the targets' ways are known (static).
+        predict_movers: whether the movers' are not (static).
     """
     sensing = loop.sensing
     noise = max(sensing.target_std, _LEAST_STD)
@@ -127,14 +131,14 @@ def expected(
         # The car sets out once it has been shown what it has seen up to then.
         shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
         times, weights = meeting.times - now, shown.astype(now.dtype)
-        if known:
+        if known_target:
             there: PointState = case.target.at(now)
             rate = getattr(case.target, "turn_rate", jnp.zeros_like(now))
             target = TurningPath(pos=there.pos, vel=there.vel, turn_rate=rate)
         else:
             target = select(times, meeting.target, noise, weights).path
         movers = case.movers
-        if not see_movers:
+        if not predict_movers:
             centre = movers.centre + movers.velocity * now
             return target, dataclasses.replace(movers, centre=centre)
         fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
@@ -229,8 +233,8 @@ def fly_intercepts(
     replan: float = 1.0,
     planner: Any = None,
     plan: InterceptPlan | None = None,
-    known: bool = False,
-    see_movers: bool = False,
+    known_target: bool = False,
+    predict_movers: bool = False,
 ) -> InterceptFlights:
     """Plan and drive a batch of interceptions.
 
@@ -244,8 +248,8 @@ def fly_intercepts(
         replan: [Hz]; 0 drives the first plan.
         planner: of all plans, by default `spacetime`.
         plan: first plan of each drive, instead of one made here.
-        known: whether the targets' ways are known instead of predicted.
-        see_movers: whether movers are predicted from looks instead of known.
+        known_target: whether the targets' ways are known instead of predicted.
+        predict_movers: whether movers are predicted from looks instead of known.
 
     Raises:
         ValueError: `replan` does not divide the rate of the frames, or the cases' car is not
@@ -254,7 +258,9 @@ def fly_intercepts(
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
     planner = planner or intercept_planner()
-    ways = functools.partial(expected, loop, cases, known=known, see_movers=see_movers)
+    ways = functools.partial(
+        expected, loop, cases, known_target=known_target, predict_movers=predict_movers
+    )
     truth = jax.tree.map(jnp.asarray, cases.cases)
     until, zero = truth.time, jnp.zeros((), truth.time.dtype)
     target, movers = ways(zero)

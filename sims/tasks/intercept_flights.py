@@ -87,7 +87,7 @@ class InterceptFlight(FlightTask):
             settings.num,
             settings.seed,
             noise=sensing.target_std,
-            looks=sensing.looks,
+            observation_rate=sensing.observation_rate,
         )
 
     def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
@@ -99,8 +99,8 @@ class InterceptFlight(FlightTask):
             settings.seed,
             replan=settings.rate,
             planner=intercept_planner(settings.planner),
-            known=settings.known,
-            see_movers=settings.see_movers,
+            known_target=settings.known_target,
+            predict_movers=settings.predict_movers,
         )
 
     def recording(
@@ -135,8 +135,12 @@ class InterceptFlight(FlightTask):
     def conditions(self) -> str:
         """Noise, latency, prediction and tyres."""
         settings = self.settings
-        of = "known" if settings.known else f"predicted from looks at {settings.looks:g} Hz"
-        movers = "seen" if settings.see_movers else "known"
+        of = (
+            "known"
+            if settings.known_target
+            else f"predicted from observations at {settings.observation_rate:g} Hz"
+        )
+        movers = "seen" if settings.predict_movers else "known"
         tyres = "slipping tyres" if settings.slip else "tyres without slip"
         return (
             f"Noise {settings.noise}, latency {1e3 * settings.latency:g} ms, the target {of}, "

@@ -111,7 +111,7 @@ WHOLE = (
     ),
     *(("serve hit", "--port"), ("serve catch", "--horizon"), ("view folder", "--port")),
     *(("library check junk", "--num"), ("library check junk", "--seed")),
-    *(("bench throughput", "--devices"), ("bench throughput", "--repeat"), ("train", "--lanes")),
+    *(("bench throughput", "--devices"), ("bench throughput", "--repeat"), ("train", "--num-envs")),
 )
 NUMBERS = (
     *(("sweep hit", "--delay"), ("sweep hit", "--limit-scale"), ("sweep catch", "--tolerance")),

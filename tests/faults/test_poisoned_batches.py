@@ -1,4 +1,4 @@
-"""Absurd cases in a batch: each is mark_bad_input, and no other case loses a bit."""
+"""Absurd cases in a batch: each is marked, and no other case loses a bit."""
 
 import dataclasses
 
@@ -90,6 +90,6 @@ def test_groups_of_too_many_targets_are_refused():
 @pytest.mark.parametrize(("name", "num"), [("hit", 20_000), ("catch", 2_000)])
 def test_poisoned_lanes_are_marked_and_all_others_keep_their_bits(name, num):
     found = compare(pj.task_named(name), num, 100, 1)
-    assert found["mark_bad_input"] == found["poisoned"] == num // 100
+    assert found["marked"] == found["poisoned"] == num // 100
     assert found["marked_others"] == 0
     assert found["unchanged"] == found["others"]

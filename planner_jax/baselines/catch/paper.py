@@ -9,11 +9,11 @@ from flax import struct
 from jax import Array
 
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
+from planner_jax.core.arithmetic import components
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
-from planner_jax.cost.penalty import steep_hinge
-from planner_jax.cost.quadrotor import ground_excess, speed_excess, thrust_band_excess
+from planner_jax.cost.quadrotor import ground_excess, speed_excess
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, body_z
@@ -66,6 +66,37 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
         thrust_band_excess(motion.acc, gravity, *limits.thrust_bounds),
         ground_excess(motion.height, limits),
     )
+
+
+def steep_hinge(x: Array, width: float | Array) -> Array:
+    """Return L_eps(x): cubic up to eps, then a far steeper cubic [Yu2023catch, eq. 23].
+
+    Above eps it is eps^3 + (x - eps)^2 x / eps^4, as printed. The value is continuous at eps, but
+    the slope drops from 3 eps^2 to 0.
+
+    Args:
+        x: (...) violation.
+        width: eps > 0.
+    """
+    inside = jnp.clip(x, 0.0, width)
+    beyond = jnp.maximum(x - width, 0.0)
+    return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width)
+
+
+def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
+    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f, as the code of [Yu2023catch] does.
+
+    Args:
+        acc: (..., 3) [m/s^2].
+        gravity: () [m/s^2].
+        least: () [m/s^2], per unit mass.
+        most: () [m/s^2], per unit mass.
+    """
+    x, y, z = components(acc)
+    z = z + gravity
+    thrust = jnp.sqrt(jnp.maximum(x * x + y * y + z * z, 1e-6))
+    middle, half = 0.5 * (most + least), 0.5 * (most - least)
+    return (thrust - middle) ** 2 - half**2
 
 
 @struct.dataclass

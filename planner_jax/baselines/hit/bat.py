@@ -11,13 +11,12 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, required_impact
 from planner_jax.ball.prediction import target_at
-from planner_jax.baselines.hit.common import largest_violation, make_impact
+from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
-from planner_jax.cost.penalty import joined_trapezoid_weights, smoothed_hinge
-from planner_jax.cost.quadrotor import motion_excess
+from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.task.hit.case import HitCase
@@ -266,7 +265,7 @@ class BatHit(OptimisedPlanner):
                 jnp.abs(impact.tail_state[1]) - limits.hitting_speed,
             ]
         )
-        return self.terminal_weight * (jnp.sum(smoothed_hinge(excess, self.hinge_width)) + defect)
+        return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
         """The limits along the way (eq. 18a), the squares of their own units."""
@@ -275,8 +274,8 @@ class BatHit(OptimisedPlanner):
         one = jnp.ones_like(limits.speed)
         acceleration = one if limits.acceleration is None else limits.acceleration
         unit = jnp.stack([limits.speed**2, acceleration**2, limits.body_rate**2, one])
-        hinges = smoothed_hinge(along * unit[:, None], self.hinge_width)
-        weights = joined_trapezoid_weights(self.nodes, self.maps.proportions)
+        hinges = smooth_hinge(along * unit[:, None], self.hinge_width)
+        weights = join_trapezoid_weights(self.nodes, self.maps.proportions)
         weights = jnp.asarray(weights, along.dtype)
         return self.limit_weight * duration * jnp.sum(hinges * weights)
 

@@ -4,10 +4,18 @@ import jax.numpy as jnp
 from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector
-from planner_jax.cost.quadrotor import relative
+from planner_jax.cost.quadrotor import (
+    acceleration_excess,
+    body_rate_excess,
+    ground_excess,
+    relative,
+    speed_excess,
+)
+from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import Impact, apex_excess, hitting_speed_excess
 from planner_jax.task.hit.plan import Stroke
+from planner_jax.trajectory.polynomial import Motion
 
 
 def make_impact(
@@ -58,7 +66,7 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
     """Largest excess over any limit, that of the ground in metres and all others relative, ().
 
     Args:
-        along: (4, N) from `planner_jax.cost.quadrotor.motion_excess`.
+        along: (4, N) from `motion_excess`.
         impact: with the apex and the hitting speeds.
         case: for the limits.
     """
@@ -68,3 +76,13 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
     squared = jnp.concatenate([jnp.max(along[:3], axis=1), speed])
     plain = jnp.concatenate([jnp.max(along[3:], axis=1), apex])
     return jnp.maximum(jnp.max(relative(squared)), jnp.max(plain))
+
+
+def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
+    """Return the excess (N,) over speed, acceleration, body rate, ground [Yu2023bat, eq. 18a]."""
+    return (
+        speed_excess(motion.vel, limits),
+        acceleration_excess(motion.acc, limits),
+        body_rate_excess(motion.acc, motion.jerk, gravity, limits),
+        ground_excess(motion.height, limits),
+    )

@@ -9,11 +9,10 @@ from jax import Array, lax
 
 from planner_jax.ball.flight import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
-from planner_jax.baselines.hit.common import largest_violation, make_impact
+from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
-from planner_jax.cost.quadrotor import motion_excess
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan

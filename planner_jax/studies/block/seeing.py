@@ -38,10 +38,10 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
 
     case_type: ClassVar[type] = BlockCase
     planner: Planner
-    sense: float  # [s], until the first fit
+    observe: float  # [s], until the first fit
     overhead: float  # [s]
-    refit: float  # [Hz], rate of later fits; 0 for none
-    wait: float  # [s], that an arm may watch longer before it begins
+    replan: float  # [Hz], rate of later fits; 0 for none
+    observe_longer: float  # [s], that an arm may watch longer before it begins
     noise: float  # [m], round; 0 for that of a stereo camera
     frame_rate: float  # [Hz]
     seed: int
@@ -74,20 +74,20 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
             self.moments(cases),
             overhead=self.overhead,
             seed=self._seeds(cases),
-            patient=self.wait > 0.0,
-            again=self.refit > 0.0,
+            patient=self.observe_longer > 0.0,
+            again=self.replan > 0.0,
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
         """Return when flights are fitted [s]; again until the last ball of a batch is there."""
-        moments = [self.sense]
-        if self.wait:
-            num = int(self.wait * self.frame_rate + 1e-6)
-            moments += [self.sense + k / self.frame_rate for k in range(1, num + 1)]
-        if self.refit:
+        moments = [self.observe]
+        if self.observe_longer:
+            num = int(self.observe_longer * self.frame_rate + 1e-6)
+            moments += [self.observe + k / self.frame_rate for k in range(1, num + 1)]
+        if self.replan:
             latest = float(np.max(jax.jit(jax.vmap(flight_of))(cases).latest))
-            step = 1.0 / self.refit
-            moments += list(np.arange(self.sense + step, latest - self.overhead, step))
+            step = 1.0 / self.replan
+            moments += list(np.arange(self.observe + step, latest - self.overhead, step))
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:

@@ -52,7 +52,7 @@ COLUMNS = [
     *known.OUTCOME,
 ]
 
-# What runs with --perception have besides, and what those with --count have.
+# What runs with --perception have besides, and what those with --planning-budget have.
 SEEN_COLUMNS = [
     Column(
         "sight", "", "what became of looking for the ball", known.TEXT, lambda batch: _sights(batch)

@@ -43,27 +43,25 @@ class BlockSettings(SweepSettings):
     )
     anywhere: bool = option(False, "", "any place on the shield will do, at any angle")
     delay: float = option(0.0, "S", "seconds until the arm may start")
-    count: float | None = option(
+    planning_budget: float | None = option(
         None,
         "S",
-        "plan one after another by the clock: motions start so many seconds after the delay, and "
-        "as much later as planning took longer",
+        "seconds after the delay at which motions start; planning runs by the clock, one case "
+        "after another, and a motion starts later by what planning took beyond the budget",
     )
     perception: bool = option(
         False, "", "plan with what a camera has seen of the ball; the referee has the true one"
     )
-    sense: float = option(0.25, "S", "with --perception: seconds until the flight is fitted")
+    observe: float = option(0.25, "S", "with --perception: seconds until the flight is fitted")
     overhead: float = option(
         0.05, "S", "with --perception: seconds from a fit until its motion may start"
     )
-    refit: float = option(
-        0.0, "HZ", "with --perception: rate at which the motion is decided anew; 0 for once"
-    )
-    wait: float = option(
+    replan: float = option(0.0, "HZ", "with --perception: rate of planning anew; 0 for once")
+    observe_longer: float = option(
         0.0,
         "S",
-        "with --perception: how much longer than --sense an arm may watch before it begins, frame "
-        "by frame while it could still meet the ball",
+        "with --perception: seconds beyond --observe that an arm may go on observing, frame by "
+        "frame while it could still meet the ball",
     )
     noise: float = option(
         0.02,
@@ -81,18 +79,27 @@ class BlockSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_one_of(REGIMES, "regime", self.regime)
-        for name in ("delay", "count", "sense", "overhead", "wait", "noise"):
+        for name in ("delay", "planning_budget", "observe", "overhead", "observe_longer", "noise"):
             require_moderate(name, vars(self)[name])
-        require_moderate("refit", self.refit, _FASTEST)
+        require_moderate("replan", self.replan, _FASTEST)
         require_frame_rate(self.frame_rate)
         if self.perception:
-            rule = "0 with perception, whose sense and overhead it is"
+            rule = "0 with perception, whose observe and overhead it is"
             require(self.delay == 0.0, "delay", rule, self.delay)
-            once = self.refit == 0.0 or self.wait == 0.0
-            require(once, "wait", "0 with refit", self.wait)
-            require(self.count is None, "count", "left out with perception", self.count)
+            once = self.replan == 0.0 or self.observe_longer == 0.0
+            require(once, "observe_longer", "0 with replan", self.observe_longer)
+            require(
+                self.planning_budget is None,
+                "planning_budget",
+                "left out with perception",
+                self.planning_budget,
+            )
 
     def draw_options(self) -> Entries:
         """Draw options of the task's `draw`: the delay is until the first motion may start."""
-        first = self.sense + self.overhead if self.perception else self.delay + (self.count or 0.0)
+        first = (
+            self.observe + self.overhead
+            if self.perception
+            else self.delay + (self.planning_budget or 0.0)
+        )
         return {**super().draw_options(), "delay": first}

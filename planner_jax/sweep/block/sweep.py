@@ -103,21 +103,29 @@ class BlockSweep(Sweep[BlockSettings]):
         """Return the planner of a run; `ArgumentError` where its file is no library."""
         planner = super().planner(settings)
         if settings.perception:
-            for name in ("refit", "wait"):
+            for name in ("replan", "observe_longer"):
                 value = vars(settings)[name]
                 may = isinstance(planner, OnlineBlock) or value == 0.0
                 require(may, name, "0 for a planner other than online", value)
             own = not isinstance(planner, LibraryBlock)
             require(own, "planner", "one that plans for the very ball", settings.planner)
-            names = ("sense", "overhead", "refit", "wait", "noise", "frame_rate", "seed")
+            names = (
+                "observe",
+                "overhead",
+                "replan",
+                "observe_longer",
+                "noise",
+                "frame_rate",
+                "seed",
+            )
             return SeeingArms(planner, **{name: vars(settings)[name] for name in names})
-        if settings.count is not None:
-            return CountedPlanner(planner, settings.count)
+        if settings.planning_budget is not None:
+            return CountedPlanner(planner, settings.planning_budget)
         return planner
 
     def other_planners(self, settings: BlockSettings) -> Entries:
         """Return the task's other planners; none where a camera or a clock matters."""
-        if settings.perception or settings.count is not None:
+        if settings.perception or settings.planning_budget is not None:
             return {}
         return super().other_planners(settings)
 

@@ -33,9 +33,9 @@ from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,
     Model,
-    begun,
-    go_on,
+    continue_search,
     least_squares,
+    start_search,
 )
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
@@ -277,7 +277,9 @@ class OnlineBlock(Planner):
             is_trial = k < tries
             place = jnp.where(is_trial, k, jnp.argmin(costs))
             most = jnp.where(is_trial, solver.trial, solver.max_steps)
-            search = go_on(model, jax.tree.map(lambda leaf: leaf[place], searches), solver, most)
+            search = continue_search(
+                model, jax.tree.map(lambda leaf: leaf[place], searches), solver, most
+            )
             searches = jax.tree.map(lambda old, new: old.at[place].set(new), searches, search)
             costs = costs.at[place].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
             plan = lax.cond(
@@ -291,7 +293,7 @@ class OnlineBlock(Planner):
         def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
             return (turn[0] < total) & ~is_solved(turn[-1].status)
 
-        searches = jax.vmap(lambda point: begun(point, solver))(starts)
+        searches = jax.vmap(lambda point: start_search(point, solver))(starts)
         turn = (jnp.zeros((), jnp.int32), searches, jnp.full(tries, jnp.inf, starts.dtype), best)
         return lax.while_loop(is_open, next_one, turn)[-1]
 
@@ -301,11 +303,12 @@ class OnlineBlock(Planner):
         """Try all starts (N, n) for a few steps, then refine the cheapest ones, all in step."""
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver = attempt.solver
-        trial = lambda point: go_on(model, begun(point, solver), solver, solver.trial)  # noqa: E731
+        begin = lambda point: start_search(point, solver)  # noqa: E731
+        trial = lambda point: continue_search(model, begin(point), solver, solver.trial)  # noqa: E731
         tried = jax.vmap(trial)(starts)
         _, chosen = lax.top_k(-_trial_cost(tried, solver), min(attempt.kept, attempt.tries))
         kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
-        ends = jax.vmap(lambda state: go_on(model, state, solver))(kept)
+        ends = jax.vmap(lambda state: continue_search(model, state, solver))(kept)
         plans = jax.vmap(lambda end: self.finish(case, flight, end.point, end.steps))(ends)
         least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
         plan = jax.tree.map(lambda leaf: leaf[least], plans)

@@ -20,7 +20,7 @@ from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.replan import Replanning, given_or_own, moment_of
+from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -117,7 +117,7 @@ class ReplanBlock(Planner):
             require_beginning("ball", ball, batch, f"the batch shape {batch}")
         own = (_states if cases.batch_shape else _state)(cases, previous, elapsed)
         angles, rates = (
-            given_or_own(name, given, mine, elapsed)
+            resolve_argument(name, given, mine, elapsed)
             for name, given, mine in zip(("angles", "rates"), (angles, rates), own, strict=True)
         )
         left = dataclasses.replace(

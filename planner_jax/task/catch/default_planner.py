@@ -17,7 +17,7 @@ from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
-from planner_jax.optimise.shipped import StartNetwork, shipped_network
+from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import body_z, tangent_basis
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import (
@@ -117,7 +117,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         is_usual &= case.num_targets == 1 and not case.extras
         if not self.learned or not is_usual or self.scale != self._usual_scale:
             return None
-        return shipped_network(self.package, "exact-6")
+        return load_network(self.package, "exact-6")
 
     def start_features(self, context: CatchContext) -> Array:
         """Return the inputs of the network, (F,): ball, quadrotor and limits."""

@@ -19,7 +19,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, given_or_own, moment_of
+from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -109,7 +109,7 @@ class ReplanCatch(OptimisedPlanner):
         elapsed = moment_of(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
         own = states_at(previous.trajectory, elapsed)
-        head_state = given_or_own("head_state", head_state, own, elapsed)
+        head_state = resolve_argument("head_state", head_state, own, elapsed)
         since = elapsed[..., None]
         order, times = np.asarray(previous.order), np.asarray(previous.times)
         present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)

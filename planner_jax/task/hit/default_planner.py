@@ -21,7 +21,7 @@ from planner_jax.cost.quadrotor import Measure
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import LbfgsConfig, Round, Stage
-from planner_jax.optimise.shipped import StartNetwork, shipped_network
+from planner_jax.optimise.shipped import StartNetwork, load_network
 from planner_jax.robot.quadrotor import tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import (
@@ -181,7 +181,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             return None
         if self.scale != self._fit_scale(self._usual_scale):
             return None
-        return shipped_network(self.package, "exact-12" + "-supple" * self.velocities)
+        return load_network(self.package, "exact-12" + "-supple" * self.velocities)
 
     def start_features(self, context: HitContext) -> Array:
         """Return the inputs of the network, (F,): ball, target, quadrotor and limits."""
@@ -250,7 +250,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Return a point (n,) of a planner without velocities, with zero offsets of velocities."""
+        """Return a point (n,) without velocities as one with the smoothest velocities."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]

@@ -18,7 +18,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, given_or_own, moment_of
+from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
@@ -80,8 +80,8 @@ class ReplanHit(OptimisedPlanner):
         """
         elapsed = moment_of(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
-        head_state = given_or_own("head_state", head_state, own, elapsed)
-        drag = given_or_own("drag", drag, cases.drag, elapsed)
+        head_state = resolve_argument("head_state", head_state, own, elapsed)
+        drag = resolve_argument("drag", drag, cases.drag, elapsed)
         require_kind("ball", ball, BallState)
         require_beginning("ball", ball, cases.batch_shape, f"the batch shape {cases.batch_shape}")
         now = dataclasses.replace(cases, ball=ball, drag=drag, head_state=head_state)

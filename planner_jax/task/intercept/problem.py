@@ -344,7 +344,7 @@ class SmoothIntercept(OptimisedPlanner):
         """Return the plan of a point."""
         return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
 
-    def polished(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
+    def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
         """Return the planner: its plans are optimal already."""
         return self
 

@@ -19,7 +19,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.planning.replan import Replanning, given_or_own, moment_of
+from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -82,7 +82,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             require_beginning("movers", movers, batch, f"the batch shape {batch}")
         own = (_states if cases.batch_shape else _state)(previous, elapsed)
         start, speed, curvature = (
-            given_or_own(name, given, mine, elapsed)
+            resolve_argument(name, given, mine, elapsed)
             for name, given, mine in zip(
                 ("start", "speed", "curvature"), (start, speed, curvature), own, strict=True
             )
