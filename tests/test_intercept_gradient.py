@@ -57,7 +57,9 @@ def at_rest(planner, case):
 def differentiate(planner, quantity, by, steps):
     """What leads from a case at rest to a gradient, compiled."""
     options = {"steps": steps, "curvature": "whole"}
-    return jax.jit(lambda case: gradient_at(planner, case, case.begun, quantity, by, **options))
+    return jax.jit(
+        lambda case: gradient_at(planner, case, case.start_point, quantity, by, **options)
+    )
 
 
 def moved(case, name, by):

@@ -18,7 +18,7 @@ from planner_jax.referee.intercept import (
     referee_intercepts,
     target_positions_of,
 )
-from planner_jax.task.intercept.api import by_own_class
+from planner_jax.task.intercept.api import position_setting
 
 LENGTH, WIDTH, WHEELBASE, REAR = 0.4, 0.25, 0.3, 0.05
 MIDDLE, FRONT = 0.5 * LENGTH - REAR, LENGTH - REAR  # ahead of the rear axle
@@ -435,7 +435,7 @@ def test_referee_and_planner_agree_where_a_target_is():
     paths = [turning, polynomial]
     paths += [LaterPath(path=path, begin=random.uniform(0.0, 5.0, num)) for path in paths]
     for path in paths:
-        assert by_own_class(path) == {}
+        assert position_setting(path) == {}
         with jax.enable_x64(True):
             theirs = jax.vmap(lambda path, time: path.at(time).pos)(path, times)
         # The planner's series of sin(x) / x for small angles is right to 1e-10.
@@ -451,5 +451,5 @@ def test_a_target_of_an_own_class_is_where_its_method_says():
             return PointState(pos=self.pos + 0.0 * time, vel=jnp.zeros_like(self.pos))
 
     target = LaterPath(path=Standing(np.array([[1.0, 2.0]])), begin=np.array([0.5]))
-    where = by_own_class(target)["target_positions"]
+    where = position_setting(target)["target_positions"]
     np.testing.assert_array_equal(where(target, np.array([3.0])), [[1.0, 2.0]])

@@ -8,63 +8,46 @@ from jax import Array, lax
 
 from planner_jax.plane.reach import SPAN, Grid, Lattice, ReachSet, bit_at
 
-# Costs of a step of a path, beside noise.
-_TURNING = 0.5  # of a turn by a bin, and of a change of the turn
-_UNEVEN = 1.0  # of a change of speed by a level
+# Costs of a step of a path, to which noise is added.
+_TURNING = 0.5  # of a turn by one bin, and of a change of the turn by one bin
+_UNEVEN = 1.0  # of a change of speed by one level
 
 
 @struct.dataclass
 class CellPath:
-    """Speed, heading and cell after every layer of a path through a reach set."""
+    """A path through a reach set: speed, heading and cell after every layer."""
 
-    level: Array  # (layers,) int32, of speed from one layer to the next
-    bin: Array  # (layers,) int32, of heading, not wrapped
+    level: Array  # (layers,) int32, level of speed up to the next layer
+    bin: Array  # (layers,) int32, bin of heading, not wrapped
     cell: Array  # (layers, 2) int32
 
 
 @struct.dataclass
-class Chance:
-    """Gumbel noise of one path, the smoothest of D, or of many paths with a leading axis."""
+class PathNoise:
+    """Gumbel noise by which D candidates for a path are drawn; a leading axis for many paths."""
 
-    layers: Array  # (layers + 1,), on the layer of the end
-    ends: Array  # (D, levels, headings, 9), on the cell of the end
-    steps: Array  # (D, layers, 3 (2 SPAN + 1)), on the step before
+    layers: Array  # (layers + 1,), for the choice of the last layer
+    ends: Array  # (D, levels, headings, 9), for the choice of the last cell
+    steps: Array  # (D, layers, 3 (2 SPAN + 1)), for the choice of every step before it
 
 
-def draw_chance(lattice: Lattice, num: int, seed: int, drawn: int) -> Chance:
+def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNoise:
     """Draw the noise of paths, the same for all cases."""
     rng = np.random.default_rng(seed)
-    ends = rng.gumbel(size=(num, drawn, lattice.levels, lattice.headings, 9))
-    steps = rng.gumbel(size=(num, drawn, lattice.layers, 3 * (2 * SPAN + 1)))
+    ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
+    steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
     layers = rng.gumbel(size=(num, lattice.layers + 1))
-    return Chance(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
-
-
-def draw_smooth_path(
-    grid: Grid,
-    reach: ReachSet,
-    num: Array,
-    cells: Array,
-    there: Array,
-    chance: Chance,
-    directness: float,
-) -> CellPath:
-    """Draw the smoothest of some random paths to a goal; arguments as of `draw_path`."""
-    paths = jax.vmap(
-        lambda ends, steps: draw_path(grid, reach, num, cells, there, ends, steps, directness)
-    )(chance.ends, chance.steps)
-    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, grid.lattice, num))(paths))
-    return jax.tree.map(lambda leaf: leaf[best], paths)
+    return PathNoise(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
 
 
 def _velocity(level: Array, heading: Array, lattice: Lattice) -> Array:
-    """Return velocities (..., 2) of levels and bins (...), in levels, along bin 0 and across."""
+    """Return velocities (..., 2) at levels and bins (...), in levels, along bin 0 and across it."""
     angle = (2.0 * np.pi / lattice.headings) * heading
     return level[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def _roughness(path: CellPath, lattice: Lattice, num: Array) -> Array:
-    """Return the sum of the squared changes of velocity over two layers, in levels of speed."""
+    """Return the sum of squared changes of velocity over two layers each, in levels."""
     velocity = _velocity(path.level, path.bin, lattice)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, lattice.layers) < num, change, 0.0))
@@ -75,63 +58,59 @@ def draw_path(
     reach: ReachSet,
     num: Array,
     cells: Array,
-    there: Array,
-    ends: Array,
-    steps: Array,
+    is_reached: Array,
+    noise: PathNoise,
     directness: float,
 ) -> CellPath:
-    """Draw a random path to a goal, step by step back from the goal.
+    """Draw candidates for a path to a goal, step by step back from the goal; return the smoothest.
 
     Args:
         grid: of the reach set.
         reach: the set.
         num: () int32, the layer that meets the goal.
         cells: of `goal_cells`.
-        there: of `goal_cells`; if no cell is there, the path means nothing.
-        ends: (levels, headings, 9), noise on the cell of the end.
-        steps: (layers, 3 (2 SPAN + 1)), noise on the step before.
-        directness: cost of the squared difference between a velocity and the mean velocity of the
-            path up to there, in levels of speed. More makes paths straight and even.
+        is_reached: of `goal_cells`; if it is nowhere true, the path has no meaning.
+        noise: of one path.
+        directness: cost of the squared difference, in levels, between a velocity and the mean
+            velocity from the start to that cell. A greater value makes paths straight and even.
     """
     lattice = grid.lattice
-    noise = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # rather at the goal itself
-    best = jnp.argmax(jnp.where(there, noise, -jnp.inf))
-    level, heading, around = jnp.unravel_index(best, there.shape)
-    choices = jnp.asarray(
-        np.stack(
-            np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij"), axis=-1
-        ).reshape(-1, 2),
-        jnp.int32,
-    )
+    choices = np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij")
+    choices = jnp.asarray(np.stack(choices, axis=-1).reshape(-1, 2), jnp.int32)
 
-    # Velocities are in levels of speed, along the heading of bin 0 and across.
+    # Velocities are in levels of speed, along the heading of bin 0 and across it.
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
     along *= (lattice.levels - 1) / lattice.pace
 
-    def back(state: tuple, n: Array) -> tuple[tuple, tuple]:
-        level, heading, cell, last = state
-        before = cell - jnp.sum(reach.moves[n, level, heading % lattice.headings], axis=0)
-        from_level, turn = level + choices[:, 0], choices[:, 1]
-        bits = reach.bits[n]
-        is_step = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
-        is_step &= reach.turns[n, level, turn + SPAN]
-        rough = _TURNING * (jnp.abs(turn) + jnp.abs(turn - last))
-        rough += _UNEVEN * jnp.abs(choices[:, 0])
-        mean = jnp.dot(along, (before - grid.start) / (n + 0.5), precision=lax.Precision.HIGHEST)
-        velocity = _velocity(from_level, heading - turn, lattice)
-        rough += directness * jnp.sum((velocity - mean) ** 2, axis=-1)
-        chosen = jnp.argmax(jnp.where(is_step, steps[n] - rough, -jnp.inf))
-        after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
-        new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)
-        return new, (level, heading, cell)
+    def draw(ends: Array, steps: Array) -> CellPath:
+        score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # prefer the goal's own cell
+        best = jnp.argmax(jnp.where(is_reached, score, -jnp.inf))
+        level, heading, around = jnp.unravel_index(best, is_reached.shape)
 
-    start = (
-        level.astype(jnp.int32),
-        heading.astype(jnp.int32),
-        cells[heading, around],
-        jnp.int32(0),
-    )
-    _, (levels, bins, passed) = lax.scan(back, start, jnp.arange(lattice.layers), reverse=True)
-    # Bins of heading count from the start on, without a jump.
-    return CellPath(level=levels, bin=bins, cell=passed)
+        def back(state: tuple, n: Array) -> tuple[tuple, tuple]:
+            level, heading, cell, last = state
+            before = cell - jnp.sum(reach.moves[n, level, heading % lattice.headings], axis=0)
+            from_level, turn = level + choices[:, 0], choices[:, 1]
+            bits = reach.bits[n]
+            is_step = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
+            is_step &= reach.turns[n, level, turn + SPAN]
+            rough = _TURNING * (jnp.abs(turn) + jnp.abs(turn - last))
+            rough += _UNEVEN * jnp.abs(choices[:, 0])
+            rate = (before - grid.start) / (n + 0.5)
+            mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
+            velocity = _velocity(from_level, heading - turn, lattice)
+            rough += directness * jnp.sum((velocity - mean) ** 2, axis=-1)
+            chosen = jnp.argmax(jnp.where(is_step, steps[n] - rough, -jnp.inf))
+            after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
+            new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)
+            return new, (level, heading, cell)
+
+        level, heading = level.astype(jnp.int32), heading.astype(jnp.int32)
+        end = (level, heading, cells[heading, around], jnp.int32(0))
+        _, (levels, bins, passed) = lax.scan(back, end, jnp.arange(lattice.layers), reverse=True)
+        return CellPath(level=levels, bin=bins, cell=passed)
+
+    paths = jax.vmap(draw)(noise.ends, noise.steps)
+    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, lattice, num))(paths))
+    return jax.tree.map(lambda leaf: leaf[best], paths)

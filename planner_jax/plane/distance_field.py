@@ -9,26 +9,27 @@ from planner_jax.plane.obstacles import Obstacles, distances
 
 @struct.dataclass
 class DistanceField:
-    """Distances at equally spaced nodes; negative inside of a wall."""
+    """Distances from the nearest wall at equally spaced nodes; negative inside a wall."""
 
     values: Array  # (F, F) [m], rows are y
-    corner: Array  # (2,) [m], the place of entry (0, 0)
+    corner: Array  # (2,) [m], position of the entry (0, 0)
     spacing: Array  # () [m]
 
     def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Return distances [m] of points and their slopes by x and y, bilinear; arrays as `x`.
+        """Interpolate the distances [m] of points, and their derivatives by x and y.
 
-        Beside a corner the distance between nodes is too great by up to spacing^2 / (4 distance).
-        Points beyond the grid have the distance of the nearest one on it.
+        Interpolation is bilinear. Near a corner of a wall it overestimates the distance by up to
+        spacing^2 / (4 distance). A point outside the grid has the distance of the nearest point on
+        it. All arrays have the shape of `x`.
         """
         most = self.values.shape[0] - 2
         at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
         below = [jnp.clip(jnp.floor(each), 0, most).astype(jnp.int32) for each in at]
         (u, v) = (jnp.clip(each - low, 0.0, 1.0) for each, low in zip(at, below, strict=True))
-        place = below[1] * self.values.shape[1] + below[0]
+        index = below[1] * self.values.shape[1] + below[0]
         flat = self.values.reshape(-1)
         corners = [
-            flat.at[place + by].get(mode="promise_in_bounds")
+            flat.at[index + by].get(mode="promise_in_bounds")
             for by in (0, 1, self.values.shape[1], self.values.shape[1] + 1)
         ]
         low, high = (corners[k] + u * (corners[k + 1] - corners[k]) for k in (0, 2))
@@ -42,21 +43,21 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
     Args:
         walls: obstacles, at their positions of time 0.
         corner: (2,) [m], of the grid.
-        spacing: () [m].
-        size: F, places along either side, static.
+        spacing: () [m], of the nodes.
+        size: F, nodes along either side, static.
     """
-    place = spacing * jnp.arange(size, dtype=corner.dtype)
-    x, y = jnp.meshgrid(corner[0] + place, corner[1] + place)
+    offsets = spacing * jnp.arange(size, dtype=corner.dtype)
+    x, y = jnp.meshgrid(corner[0] + offsets, corner[1] + offsets)
     vertices = walls.vertices(jnp.zeros_like(spacing))
 
-    def nearer(k: Array, nearest: Array) -> Array:
+    def take_nearer(k: Array, nearest: Array) -> Array:
         one = (
             lax.dynamic_slice_in_dim(vertices, k, 1),
             lax.dynamic_slice_in_dim(walls.present, k, 1),
         )
         return jnp.minimum(nearest, distances(*one, x.reshape(1, -1), y.reshape(1, -1))[0])
 
-    # One after another: all at once is a program that takes a compiler minutes.
+    # One wall after another: a program for all walls at once takes minutes to compile.
     none = jnp.full((1, size * size), 1e3, corner.dtype)
-    nearest = lax.fori_loop(0, vertices.shape[0], nearer, none)
+    nearest = lax.fori_loop(0, vertices.shape[0], take_nearer, none)
     return DistanceField(values=nearest.reshape(size, size), corner=corner, spacing=spacing)

@@ -1,4 +1,4 @@
-"""Convex polygons that stand or move evenly, and how far a point is from them."""
+"""Convex polygons that stand or move at constant velocity, and distances from them."""
 
 from collections.abc import Sequence
 
@@ -15,19 +15,19 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
 @struct.dataclass
 class Obstacles:
-    """Up to N convex polygons of up to V corners; those that stand have no velocity.
+    """Up to N convex polygons of up to V corners each, which move without turning.
 
-    World frame in the plane, SI units. An obstacle moves evenly and does not turn ([Qu2022,
-    eq. 5], with constant speeds as in its Section IV-A).
+    World frame in the plane, SI units. The velocity of an obstacle is constant ([Qu2022, eq. 5],
+    with constant speeds as in its Section IV-A), and zero for walls.
     """
 
     centre: Array  # (N, 2) [m], at time 0
-    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise; the last one repeated
+    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise; the last may be repeated
     velocity: Array  # (N, 2) [m/s]
-    present: Array  # (N,) bool, which of the N there are
+    present: Array  # (N,) bool, whether each of the N exists
 
     def vertices(self, time: ArrayLike) -> Array:
-        """Return the corners in the world at one time () [s], (N, V, 2) [m]."""
+        """Return the corners (N, V, 2) [m] in the world frame at one time () [s]."""
         return (self.centre + self.velocity * time)[..., None, :] + self.corners
 
 
@@ -41,35 +41,35 @@ def obstacles(
     """Make the obstacles of one case.
 
     Args:
-        polygons: of each its corners (V_k, 2) [m] at time 0, convex, in either sense.
-        velocities: (2,) for all or (N, 2), one each [m/s].
-        room: how many obstacles, and how many corners of each, the arrays hold; just those that
-            are given if left out. Cases of one room share a compiled program.
+        polygons: corners (V_k, 2) [m] of each obstacle at time 0, convex, in either sense.
+        velocities: (2,) [m/s] for all obstacles, or (N, 2) for each.
+        room: numbers of obstacles and of corners that the arrays hold, by default the numbers of
+            the polygons. Cases of the same room share a compiled program.
         dtype: of every floating leaf.
 
     Raises:
         TypeError: an argument is of another kind.
-        ValueError: a polygon is empty or not convex, or there are more than there is room for;
-            one line that says which, and for one that is not convex what parts would do.
+        ValueError: a polygon is empty or not convex, or the polygons exceed the room. The message
+            names the polygon, and proposes convex parts for one that is not convex.
     """
     dtype = floating(dtype)
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
         raise ArgumentTypeError("polygons", "a sequence of corners (V, 2)", polygons)
     checked = [_check_polygon(k, corners) for k, corners in enumerate(polygons)]
     most = max((len(each) for each in checked), default=3)
-    num, size = _room(room) or (max(len(checked), 1), most)
+    num, size = _check_room(room) or (max(len(checked), 1), most)
     if len(checked) > num or most > size:
         shown = f"{len(checked)} of up to {most}: give more room"
         raise ArgumentError("polygons", f"at most {num} of at most {size} corners", shown=shown)
-    given = numeric(velocities)
-    if given is None:
+    numbers = numeric(velocities)
+    if numbers is None:
         raise ArgumentTypeError("velocities", "numbers", velocities)
-    if given.shape not in ((), (2,), (len(checked), 2)):
+    if numbers.shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
-        raise ArgumentError("velocities", rule, given.shape, verb="have")
-    if not np.isfinite(given).all():
+        raise ArgumentError("velocities", rule, numbers.shape, verb="have")
+    if not np.isfinite(numbers).all():
         raise ArgumentError("velocities", "finite", velocities)
-    speeds = np.broadcast_to(np.asarray(given, float), (len(checked), 2))
+    speeds = np.broadcast_to(np.asarray(numbers, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
     for k, polygon in enumerate(checked):
@@ -83,15 +83,15 @@ def obstacles(
     )
 
 
-def _room(given: object) -> tuple[int, int] | None:
+def _check_room(room: object) -> tuple[int, int] | None:
     """Return the numbers of obstacles and corners; raise unless these are two sizes, or None."""
-    if given is None:
+    if room is None:
         return None
-    if not isinstance(given, tuple | list) or len(given) != 2:
-        raise ArgumentTypeError("room", "two whole numbers", given)
-    for value in given:
+    if not isinstance(room, tuple | list) or len(room) != 2:
+        raise ArgumentTypeError("room", "two whole numbers", room)
+    for value in room:
         require_size("room", value)
-    return given[0], given[1]
+    return room[0], room[1]
 
 
 def _check_polygon(k: int, corners: object) -> np.ndarray:
@@ -126,13 +126,13 @@ def distances(
 
     Args:
         corners: (N, V, 2) [m], counter-clockwise; they may be repeated.
-        present: (N,) bool; polygons that are not there are far away.
-        x: (N, P) or (1, P) [m], of points, each row for one polygon or one for all.
+        present: (N,) bool; absent polygons are far away.
+        x: (N, P) or (1, P) [m], of points: a row for each polygon, or one row for all.
         y: (N, P) or (1, P) [m].
 
     Returns:
-        distance: (N, P) [m]; negative inside, where it is measured to the nearest edge's line.
-        away: two of (N, P), the unit vector that is its gradient by the point.
+        distance: (N, P) [m]. Inside a polygon it is negative, to the line of the nearest edge.
+        away: two of (N, P), the gradient of the distance by the point, a unit vector.
     """
     before = jnp.roll(corners, 1, axis=1)
     edge = corners - before
@@ -143,19 +143,19 @@ def distances(
     shape = jnp.broadcast_shapes((corners.shape[0], 1), x.shape)
     nearest, highest = jnp.full(shape, 1e6, x.dtype), jnp.full(shape, -1e6, x.dtype)
     gap_x = gap_y = face_x = face_y = jnp.zeros(shape, x.dtype)
-    for k in range(corners.shape[1]):  # an edge at a time, so that points fill the registers
-        there = is_edge[:, k, None]
+    for k in range(corners.shape[1]):  # one edge at a time, so that points stay in registers
+        exists = is_edge[:, k, None]
         from_x, from_y = x - before[:, k, :1], y - before[:, k, 1:]
         edge_x, edge_y = edge[:, k, :1], edge[:, k, 1:]
         share = jnp.clip((from_x * edge_x + from_y * edge_y) * inverse[:, k, None], 0.0, 1.0)
         to_x, to_y = from_x - share * edge_x, from_y - share * edge_y
         away = to_x**2 + to_y**2
-        closer = there & (away < nearest)
+        closer = exists & (away < nearest)
         nearest = jnp.where(closer, away, nearest)
         gap_x, gap_y = jnp.where(closer, to_x, gap_x), jnp.where(closer, to_y, gap_y)
         normal_x, normal_y = edge_y * root[:, k, None], -edge_x * root[:, k, None]
         height = from_x * normal_x + from_y * normal_y
-        higher = there & (height > highest)
+        higher = exists & (height > highest)
         highest = jnp.where(higher, height, highest)
         face_x, face_y = jnp.where(higher, normal_x, face_x), jnp.where(higher, normal_y, face_y)
     outside = highest > 0.0
@@ -171,21 +171,18 @@ def distances(
 def separation(
     corners: Array, present: Array, x: Array, y: Array, heading: Array, body: tuple
 ) -> Array:
-    """Return distances of a rectangle from convex polygons along the axis that parts them best.
+    """Return separations (N, P) [m] of a rectangle and polygons along their best separating axis.
 
-    It is positive just where they do not touch (the theorem of separating axes), and at most
-    their distance.
+    A separation is positive if and only if rectangle and polygon do not touch (the separating axis
+    theorem). It is at most their distance.
 
     Args:
         corners: (N, V, 2) [m], as for `distances`.
         present: (N,) bool.
-        x: (N, P) or (1, P) [m], of a point on the rectangle's long axis.
+        x: (N, P) or (1, P) [m], of a reference point on the rectangle's long axis.
         y: (N, P) or (1, P) [m].
-        heading: (P,) [rad], of that axis.
+        heading: (P,) [rad], of the long axis.
         body: ends of the rectangle behind and ahead of the point, and half its width [m].
-
-    Returns:
-        (N, P) [m].
     """
     behind, ahead, half = body
     cos, sin = jnp.cos(heading), jnp.sin(heading)
@@ -210,9 +207,9 @@ def separation(
         )
         best = jnp.where(is_edge[:, k, None], jnp.maximum(best, least), best)
         from_x, from_y = corners[:, k, :1] - x, corners[:, k, 1:] - y
-        for axis, place in enumerate((from_x * cos + from_y * sin, from_y * cos - from_x * sin)):
-            low[axis] = jnp.minimum(low[axis], place)
-            high[axis] = jnp.maximum(high[axis], place)
+        for axis, height in enumerate((from_x * cos + from_y * sin, from_y * cos - from_x * sin)):
+            low[axis] = jnp.minimum(low[axis], height)
+            high[axis] = jnp.maximum(high[axis], height)
     along = jnp.maximum(low[0] - ahead, behind - high[0])
     across = jnp.maximum(low[1] - half, -half - high[1])
     best = jnp.maximum(best, jnp.maximum(along, across))

@@ -1,8 +1,8 @@
-"""Paths of targets in the plane: any class with position and velocity at a time.
+"""Paths of targets in the plane: classes that return position and velocity at a time.
 
-A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every
-leaf. The ones here cover [Qu2022]'s targets and what is fitted to observations of them; a class
-of a user's own serves as well. World frame in the plane, SI units.
+A path is a pytree with a method `at(time) -> PointState`, differentiable in time and in every leaf.
+The classes here cover the targets of [Qu2022] and the paths that are fitted to observations of
+them. A user may pass a class of their own. World frame in the plane, SI units.
 """
 
 from typing import Protocol
@@ -14,14 +14,14 @@ from jax import Array
 
 @struct.dataclass
 class PointState:
-    """A point that moves in the plane."""
+    """Position and velocity of a point in the plane."""
 
     pos: Array  # (2,) [m]
     vel: Array  # (2,) [m/s]
 
 
 class PlanePath(Protocol):
-    """The path of a target, as a planner uses it."""
+    """The path of a target, as planners use it."""
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -30,9 +30,9 @@ class PlanePath(Protocol):
 
 @struct.dataclass
 class TurningPath:
-    """A target of constant speed whose direction turns evenly; without turning, a straight line.
+    """A target of constant speed whose direction turns at a constant rate, which may be 0.
 
-    The two modes of [Qu2022, Section V-A], as something that stays on its map.
+    [Qu2022, Section V-A] has two modes of motion, straight and turning; here both stay on the map.
     """
 
     pos: Array  # (2,) [m], at time 0
@@ -53,8 +53,8 @@ class TurningPath:
 class PolynomialPath:
     """A polynomial in time on each axis [Qu2022, eq. 9]."""
 
-    coeffs: Array  # (n + 1, 2) [m/s^k], the power of the time rising
-    origin: Array  # () [s], the time at which the powers are zero
+    coeffs: Array  # (n + 1, 2) [m/s^k], in ascending powers of the time
+    origin: Array  # () [s], the time from which the powers count
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -67,18 +67,18 @@ class PolynomialPath:
 
 @struct.dataclass
 class LaterPath:
-    """Any path, with times that count from a later moment."""
+    """A path whose times count from a later moment."""
 
     path: PlanePath
-    begin: Array  # () [s], that moment in the path's own times
+    begin: Array  # () [s], that moment in the times of `path`
 
     def at(self, time: Array) -> PointState:
-        """Return position [m] and velocity [m/s] at one time () [s] after that moment."""
+        """Return position [m] and velocity [m/s] at one time () [s] after `begin`."""
         return self.path.at(self.begin + time)
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
-    """Return the displacement ahead and to the left (...) [s] of a target of unit speed."""
+    """Return the displacements ahead and to the left (...) [s] of a target of unit speed."""
     angle = turn_rate * time
     return time * _sinc(angle), time * _cosc(angle)
 
@@ -91,5 +91,5 @@ def _sinc(angle: Array) -> Array:
 
 
 def _cosc(angle: Array) -> Array:
-    """Return (1 - cos(x)) / x, as 2 sin(x / 2)^2 / x, which does not cancel."""
+    """Return (1 - cos(x)) / x as 2 sin(x / 2)^2 / x, which avoids cancellation."""
     return 0.5 * angle * _sinc(0.5 * angle) ** 2

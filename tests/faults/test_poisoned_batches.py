@@ -82,7 +82,7 @@ def test_orders_of_forty_targets_differ_and_of_too_many_are_refused():
 def test_groups_of_too_many_targets_are_refused():
     still = np.ones((9, 2), np.float32)
     group = pj.group.case(pj.TurningPath(still, 0.0 * still, still[:, 0]))
-    with pytest.raises(ValueError, match="^targets must be at most 8, of which all orders"):
+    with pytest.raises(ValueError, match="^targets must be at most 8, because all orders"):
         pj.group.planner().decision.propose(group)
 
 

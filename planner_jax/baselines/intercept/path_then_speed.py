@@ -65,7 +65,7 @@ class SpeedStep:
             jnp.maximum(speed, 0.0).at[0].set(case.speed),
             path.curvature_at(station).at[0].set(case.curvature),
             samples=self.checked,
-            places=2,
+            points=2,
             steps=steps,
         )
         return dataclasses.replace(

@@ -17,14 +17,14 @@ from flax import struct
 from jax import Array, lax
 
 from planner_jax.baselines.intercept.path import Path, path_of_drive
-from planner_jax.plane.cell_paths import Chance, draw_chance
+from planner_jax.plane.cell_paths import PathNoise, draw_noise
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import TurningPath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.motion import motion
 from planner_jax.task.intercept.problem import Guess, MotionProblem
-from planner_jax.task.intercept.searches import Found, Search, draw_cell_path, search_reach
-from planner_jax.task.intercept.terms import wrapped
+from planner_jax.task.intercept.searches import Reachability, Search, draw_cell_path, search_reach
+from planner_jax.task.intercept.terms import wrap
 
 _SHARES = 8  # of a way, where it is compared with others
 _OTHER_SIDE = 8.0  # [m], how much farther apart ways are that pass a wall on different sides
@@ -58,14 +58,12 @@ class PathSource:
         found = search_reach(still, attempt, is_time_free=True, layers=layers)
         arrivals, is_reached = found.layers, found.is_reached
         first = jnp.argmax(arrivals)
-        num = self.drawn * attempt.ways
+        num = self.drawn * attempt.paths
         layer = jnp.minimum(first + 1 + np.arange(num) % self.later, found.grid.num)
         layer = jnp.where(arrivals[layer], layer, first).astype(jnp.int32)
-        chances = draw_chance(attempt.lattice, num, attempt.seed, 1)
-        times, guesses = jax.vmap(lambda n, chance: self.guess(still, found, n, chance))(
-            layer, chances
-        )
-        chosen = self.different(still, times, guesses, attempt.ways)
+        noise = draw_noise(attempt.lattice, num, attempt.seed, 1)
+        times, guesses = jax.vmap(lambda n, noise: self.guess(still, found, n, noise))(layer, noise)
+        chosen = self.different(still, times, guesses, attempt.paths)
 
         def path(start: tuple[Array, Guess]) -> tuple[Path, Array, Array]:
             time, guess = start
@@ -89,11 +87,11 @@ class PathSource:
         )
 
     def guess(
-        self, case: InterceptCase, found: Found, layer: Array, chance: Chance
+        self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
         """When a random way arrives that ends at a layer, and where least squares begin."""
         grid = found.grid
-        path = draw_cell_path(case, found, layer, chance, 0.0)
+        path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step
         guess = self.problem.guess_along(dataclasses.replace(case, time=time), grid, path, layer)
         return time, guess
@@ -155,6 +153,6 @@ def turns_around(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Arr
     """
     points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre
     angle = jnp.arctan2(points[..., 1], points[..., 0])  # (M + 2, N)
-    turned = jnp.sum(wrapped(jnp.diff(angle, axis=0)), axis=0)
-    straight = wrapped(angle[-1] - angle[0])
+    turned = jnp.sum(wrap(jnp.diff(angle, axis=0)), axis=0)
+    straight = wrap(angle[-1] - angle[0])
     return jnp.round((turned - straight) / (2.0 * np.pi)).astype(jnp.int32)

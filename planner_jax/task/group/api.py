@@ -1,4 +1,4 @@
-"""The functions `pj.group.planner` and `judge`; `case` and `draw` are in modules of their own."""
+"""The functions `pj.group.planner` and `pj.group.judge`."""
 
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
@@ -8,22 +8,23 @@ from planner_jax.task.arguments import find_decision, judge_by, require_settings
 from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 from planner_jax.task.group.spec import DECISIONS, TASK
-from planner_jax.task.intercept.api import by_own_class
+from planner_jax.task.intercept.api import position_setting
 
 
 def planner(
     name: str = "spacetime", *, decide: str | Decision = "best", **options: object
 ) -> DecidedPlanner[InterceptGroup, GroupPlan]:
-    """Make the group planner of a name, behind a decision about the order of the targets.
+    """Make a planner of groups that first decides the order of the targets.
 
-    * `spacetime`: one target after another by the intercept planner of that name, each as early
-      as it can be met.
+    The planner `spacetime` meets one target after another, each as early as possible, by the
+    intercept planner `spacetime`.
 
     Args:
-        name: `spacetime`, or a name that another package offers.
-        decide: "best" plans the most promising of all orders and keeps the earliest last meeting,
+        name: `spacetime`, or a planner of another package.
+        decide: "best" plans the most promising of all orders and selects the earliest last meeting,
             "greedy" meets next the target with the earliest estimated meeting, "given" takes the
-            order of the cases; or a decision with settings, such as `Best(finalists=3)`.
+            order of the cases. A decision with settings, such as `Best(finalists=3)`, is also
+            accepted.
         **options: fields of that planner's dataclass.
 
     Returns:
@@ -39,9 +40,10 @@ def planner(
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
     """Judge every leg of one plan, or of a batch of plans; see `referee_groups`.
 
-    Arguments, result and errors are those of `pj.hit.judge`; `referee_intercepts` has the settings.
+    Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
+    `referee_intercepts`.
     """
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):
-        settings = {**by_own_class(cases.shared.target), **settings}
+        settings = {**position_setting(cases.shared.target), **settings}
     return judge_by(referee_groups, cases, plans, (InterceptGroup, GroupPlan), settings)

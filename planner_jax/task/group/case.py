@@ -1,6 +1,6 @@
-"""Several targets for one car, met one after another in an order to be decided.
+"""The case of a group: one car meets several targets in an order that a decision selects.
 
-[Qu2022] meets one target and names groups as future work; what is here is this library's.
+[Qu2022] meets one target and names groups as future work; groups are this library's extension.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.case import case as single_case
 
-# What the numbers of a case must be.
+# Shapes, types and ranges of the leaves of a case.
 RULES: Table = (
     Field("present", ("N",), kind=np.bool_),
     Field("order", ("N",), PERMUTATION, kind=np.integer),
@@ -29,14 +29,14 @@ RULES: Table = (
 
 @struct.dataclass
 class GroupChoice:
-    """What a decision settles of a group."""
+    """The decision about one group, or about a batch."""
 
     order: Array  # (N,) int32, a permutation, present targets first
 
 
 @struct.dataclass
 class CarState:
-    """Where a car is, and how it moves."""
+    """Pose, speed and curvature of a car."""
 
     pose: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     speed: Array  # () [m/s]
@@ -45,19 +45,19 @@ class CarState:
 
 @struct.dataclass
 class InterceptGroup:
-    """One group. Every number is a leaf: batch it, randomise it.
+    """The case of one group, or a batch; every number is a leaf of the pytree.
 
-    What goes for an `InterceptCase` goes for every target: the body's middle meets it, within the
-    same tolerance and with the same heading if one is given.
+    The body's middle has to meet every target as in an `InterceptCase`, with the same tolerance
+    and, if it is not free, the same heading.
     """
 
     rules: ClassVar[Table] = RULES
 
-    # Car, obstacles and map. Its `target` has leaves with a leading axis N, and all are to be met
-    # until its `time`.
+    # Car, obstacles and map. The leaves of `shared.target` have a leading axis N. All targets must
+    # be met before `shared.time`.
     shared: InterceptCase
-    present: Array  # (N,) bool, which of the N targets there are
-    order: Array  # (N,) int32, a permutation: which target is met first, second, ...
+    present: Array  # (N,) bool, whether each of the N targets exists
+    order: Array  # (N,) int32, a permutation: index of the first target to meet, the second, ...
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -66,17 +66,17 @@ class InterceptGroup:
 
     @property
     def num_targets(self) -> int:
-        """N, the number of targets that the shape holds."""
+        """N, the number of present and absent targets."""
         return np.shape(self.present)[-1]
 
     def with_choice(self, choice: GroupChoice) -> "InterceptGroup":
-        """The group, or the batch, with an order."""
+        """Return the group, or the batch, with the order of a choice."""
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """Return the interception of a target, by its index () int, from a time () [s] on.
+        """Return the interception of the target with an index () int that starts at a time () [s].
 
-        Its times count from then; the car is where it is then.
+        The times of the interception count from `begin`; `car` is the car's state at `begin`.
         """
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)
@@ -87,7 +87,7 @@ class InterceptGroup:
             speed=car.speed,
             curvature=car.curvature,
             target=LaterPath(path=path, begin=begin),
-            # Never nothing: what is left of the time may be used up.
+            # Positive even if no time is left.
             time=jnp.maximum(shared.time - begin, 1e-3),
             movers=dataclasses.replace(movers, centre=movers.centre + begin * movers.velocity),
         )
@@ -96,15 +96,21 @@ class InterceptGroup:
 def case(
     targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: Any
 ) -> InterceptGroup:
-    """Return a group, or a batch, by default with the car and the map of `pj.intercept.case`.
+    """Make a group, or a batch, by default with the car and the map of `pj.intercept.case`.
 
-    The order is a placeholder until a decision sets it: the targets as they come. `targets` is a
-    path pytree such as `TurningPath`, leaves with axes (..., N) first, `present` is (N,) or (B, N)
-    bool, and all targets are to be met until `time`. `pj.intercept.case` describes the settings,
-    such as `start` and `walls`, and the errors.
+    The order is 0, 1, ..., N - 1 until a decision sets it.
+
+    Args:
+        targets: a path pytree such as `TurningPath`, leaves with axes (..., N) first.
+        time: () or (B,) [s], by which all targets must be met.
+        present: () or (N,) or (B, N) bool, whether each target exists.
+        **settings: arguments of `pj.intercept.case`, such as `start` and `walls`.
+
+    Raises:
+        TypeError, ValueError: as for `pj.intercept.case`.
     """
-    given = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
-    shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, given)]
+    scalars = [settings.get(name, 0.0) for name in ("initial_speed", "tolerance")]
+    shapes = [np.shape(time), np.shape(settings.get("start", 0.0))[:-1], *map(np.shape, scalars)]
     axis, leaves = len(max(shapes, key=len)), jax.tree.leaves(targets)
     if not leaves or any(np.ndim(leaf) <= axis for leaf in leaves):
         raise ArgumentError("targets", f"paths with {axis + 1} axes in front", targets)
@@ -112,11 +118,11 @@ def case(
     shared = single_case(one, time, **settings)
     batch, num = shared.batch_shape, np.shape(leaves[0])[axis]
     require_path("targets", targets, (*batch, num), 2)
-    there = np.asarray(present)
-    if there.dtype != np.bool_ or there.shape not in ((), (num,), (*batch, num)):
+    exists = np.asarray(present)
+    if exists.dtype != np.bool_ or exists.shape not in ((), (num,), (*batch, num)):
         raise ArgumentError("present", f"True or False of {num} targets", present)
     return InterceptGroup(
         shared=dataclasses.replace(shared, target=targets),
-        present=jnp.asarray(np.broadcast_to(there, (*batch, num))),
+        present=jnp.asarray(np.broadcast_to(exists, (*batch, num))),
         order=jnp.asarray(np.broadcast_to(np.arange(num), (*batch, num)), jnp.int32),
     )

@@ -1,7 +1,7 @@
-"""In what order to meet the targets of a group: by estimated meetings, or the best of all orders.
+"""Decisions about the order in which to meet the targets of a group.
 
-The estimate sees a car that turns towards where it meets a target and then drives straight on,
-whatever is in the way. It serves to rank orders; legs are then planned for the most promising.
+Orders are ranked by an estimate: the car turns towards the meeting point and then drives straight
+on, without regard to obstacles. Legs are planned for the most promising orders only.
 """
 
 import dataclasses
@@ -20,31 +20,32 @@ from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 from planner_jax.task.group.plan import GroupPlan
 
-_GRID = 128  # times at which every target is looked at
-_PACE = 0.8  # of the greatest speed, sustained
-_TURNING = 0.6  # of the turn rate that limits allow at that speed where both bind, sustained
+_GRID = 128  # times at which every target is evaluated
+_PACE = 0.8  # assumed mean speed over the greatest speed
+_TURNING = 0.6  # assumed mean turn rate over the greatest turn rate
 
 
 @struct.dataclass
 class _Meeting:
-    """A car at a meeting, as the estimate has it."""
+    """The estimated state of the car at a meeting."""
 
     time: Array  # () [s]
-    place: Array  # (2,) [m]
+    position: Array  # (2,) [m]
     heading: Array  # () [rad]
-    late: Array  # () [s], how much more time than there is it and those before would have taken
+    delay: Array  # () [s], time that is missing for this and the previous meetings
 
 
-def _begin(group: InterceptGroup) -> _Meeting:
+def _start(group: InterceptGroup) -> _Meeting:
+    """Return the car at time 0 as if it met a target there."""
     shared = group.shared
     heading = shared.start[2]
     ahead = shared.body.middle * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
     zero = jnp.zeros_like(shared.time)
-    return _Meeting(time=zero, place=shared.start[:2] + ahead, heading=heading, late=zero)
+    return _Meeting(time=zero, position=shared.start[:2] + ahead, heading=heading, delay=zero)
 
 
 def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
-    """Times (K,) [s] up to that of the case, and where the targets are then, (N, K, 2) [m]."""
+    """Return times (K,) [s] up to the case's time, and positions (N, K, 2) [m] of the targets."""
     shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, group.shared.time.dtype)
     times = group.shared.time * shares
     of_one = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
@@ -54,52 +55,52 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """The earliest meeting with a target after another meeting."""
-    times, places = table[0], table[1][target]
+    """Return the earliest estimated meeting with a target after another meeting."""
+    times, positions = table[0], table[1][target]
     limits = group.shared.limits
-    away = places - last.place
+    away = positions - last.position
     distance = jnp.sqrt(jnp.maximum(jnp.sum(away**2, axis=1), 1e-12))
     heading = jnp.arctan2(away[:, 1], away[:, 0])
     turn = jnp.abs((heading - last.heading + np.pi) % (2.0 * np.pi) - np.pi)
-    # v kappa where both its own limit and that of v^2 kappa bind.
+    # The turn rate v kappa is greatest if the limits of kappa and of v^2 kappa are both reached.
     rate = _TURNING * jnp.sqrt(limits.curvature * limits.lateral_acceleration)
-    takes = distance / (_PACE * limits.speed) + turn / rate
-    lack = last.time + takes - times
+    duration = distance / (_PACE * limits.speed) + turn / rate
+    lack = last.time + duration - times
     first = jnp.where(jnp.any(lack <= 0.0), jnp.argmax(lack <= 0.0), jnp.argmin(lack))
     return _Meeting(
         time=jnp.maximum(times[first], last.time),
-        place=places[first],
+        position=positions[first],
         heading=heading[first],
-        late=last.late + jnp.maximum(lack[first], 0.0),
+        delay=last.delay + jnp.maximum(lack[first], 0.0),
     )
 
 
-def _where(condition: Array, yes: _Meeting, no: _Meeting) -> _Meeting:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
-
-
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Estimated time () [s] of the last meeting in an order (N,); what is late counts tenfold."""
+    """Return the estimated time () [s] of the last meeting in an order (N,), plus ten delays."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
-        return _where(group.present[target], _next(group, table, last, target), last), None
+        return _select(group.present[target], _next(group, table, last, target), last), None
 
-    last, _ = jax.lax.scan(advance, _begin(group), order)
-    return last.time + 10.0 * last.late
+    last, _ = jax.lax.scan(advance, _start(group), order)
+    return last.time + 10.0 * last.delay
+
+
+def _select(condition: Array, meeting: _Meeting, other: _Meeting) -> _Meeting:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), meeting, other)
 
 
 class GroupDecision:
-    """What the decisions about groups have in common."""
+    """The methods that all decisions about groups share."""
 
     def check(self, cases: InterceptGroup) -> None:
-        """Any batch will do."""
+        """Accept every batch."""
 
     def rank(self, plans: GroupPlan) -> Array:
-        """The time of the last meeting [s], one a plan."""
+        """Return the time [s] of the last meeting of every plan."""
         return plans.cost
 
     def explain(self, case: InterceptGroup, status: Array) -> Array:
-        """What the planner says."""
+        """Return the status of the planner unchanged."""
         return status
 
 
@@ -109,57 +110,55 @@ MOST_PERMUTED = 8  # targets of a group
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(GroupDecision):
-    """The most promising of all orders are planned, and the earliest last meeting is kept.
+    """Plans the orders with the earliest estimated last meeting, and selects the best plan.
 
-    All N! orders are estimated, of at most 8 targets, and those of the earliest last meeting are
-    the finalists.
+    All N! orders of at most 8 targets are estimated. The best of them are the finalists.
     """
 
-    finalists: int = 6  # orders that are planned
+    finalists: int = 6  # number of orders that are planned
 
     def __post_init__(self) -> None:
         require_settings(self)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """The finalists of one group, leaves (F, N)."""
+        """Return the finalists of one group, leaves (F, N)."""
         num = case.num_targets
         if num > MOST_PERMUTED:
-            rule = f"at most {MOST_PERMUTED}, of which all orders are looked at"
+            rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
             raise ArgumentError("targets", rule, num)
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
         table = _timetable(case)
         rank = jax.vmap(functools.partial(_rank, case, table))(orders)
-        # Of orders that differ in absent targets alone, one is enough.
-        there = case.present[orders]
-        is_first = jnp.all(there[:, 1:] <= there[:, :-1], axis=1)
-        falls = (orders[:, 1:] < orders[:, :-1]) & ~there[:, :-1]
-        is_wanted = is_first & ~jnp.any(falls, axis=1)
-        chosen = jnp.argsort(jnp.where(is_wanted, rank, jnp.inf))[
-            : min(self.finalists, len(orders))
-        ]
-        # Where there are fewer, the best one again; equal legs are planned once.
-        chosen = jnp.where(is_wanted[chosen], chosen, chosen[0])
+        # One of several orders that differ in absent targets alone is enough: absent targets last,
+        # in ascending order.
+        exists = case.present[orders]
+        is_last = jnp.all(exists[:, 1:] <= exists[:, :-1], axis=1)
+        falls = (orders[:, 1:] < orders[:, :-1]) & ~exists[:, :-1]
+        is_proposed = is_last & ~jnp.any(falls, axis=1)
+        ranking = jnp.argsort(jnp.where(is_proposed, rank, jnp.inf))
+        chosen = ranking[: min(self.finalists, len(orders))]
+        # Repeat the best order if there are fewer orders; equal legs are planned once.
+        chosen = jnp.where(is_proposed[chosen], chosen, chosen[0])
         return GroupChoice(order=orders[chosen])
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Greedy(GroupDecision):
-    """Next is met whatever can be met earliest, as estimated."""
+    """Meets next the target with the earliest estimated meeting."""
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """The one choice for one group, leaves (1, N)."""
+        """Return the one choice for one group, leaves (1, N)."""
         table, num = _timetable(case), case.num_targets
-        last, left, order = _begin(case), jnp.ones(num, bool), []
+        last, is_open, order = _start(case), jnp.ones(num, bool), []
         for _ in range(num):
-            meet = functools.partial(_next, case, table, last)
-            found = jax.vmap(meet)(jnp.arange(num))
+            meetings = jax.vmap(functools.partial(_next, case, table, last))(jnp.arange(num))
             # Absent targets come last, in any order.
-            rank = jnp.where(case.present, found.time + 10.0 * found.late, 1e9)
-            target = jnp.argmin(jnp.where(left, rank, jnp.inf))
-            chosen = jax.tree.map(lambda leaf, at=target: leaf[at], found)
-            last = _where(case.present[target], chosen, last)
-            left = left & (jnp.arange(num) != target)
+            rank = jnp.where(case.present, meetings.time + 10.0 * meetings.delay, 1e9)
+            target = jnp.argmin(jnp.where(is_open, rank, jnp.inf))
+            chosen = jax.tree.map(lambda leaf, at=target: leaf[at], meetings)
+            last = _select(case.present[target], chosen, last)
+            is_open = is_open & (jnp.arange(num) != target)
             order.append(target)
         return GroupChoice(order=jnp.stack(order).astype(jnp.int32)[None])
 
@@ -167,13 +166,13 @@ class Greedy(GroupDecision):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Given(GroupDecision):
-    """The order is that of the cases, absent targets last."""
+    """Takes the order of the cases, with absent targets last."""
 
     def check(self, cases: InterceptGroup) -> None:
         """Raise `ValueError` unless every order is a permutation."""
         require_orders(cases.order)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """The one choice of one group, leaves (1, N)."""
+        """Return the one choice for one group, leaves (1, N)."""
         present_first = jnp.argsort(~case.present[case.order], stable=True)
         return GroupChoice(order=case.order[present_first][None])

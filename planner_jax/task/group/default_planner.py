@@ -1,10 +1,9 @@
-"""Groups planned leg after leg: each target as early as it can be met, from where the last was.
+"""The default planner of groups: it plans leg after leg, each as early as possible.
 
-A leg is an interception of its own, with the car as the leg before leaves it, and targets and
-movers moved on to that time. `SpacetimeIntercept` plans it as early as it can; or where that fails,
-since a car cannot always drive what a reach set of cells has as early, with the least effort. Legs
-of all groups of a batch, and of all orders that are tried, are planned together: first all first
-ones, then all second ones.
+A leg is an interception that starts at the end of the previous leg, with targets and movers moved
+to that time. `SpacetimeIntercept` plans it as early as possible. If that fails, because the car
+cannot drive the early paths of the reach set, it plans the leg of least effort. The first legs of
+all groups of a batch, and of all their proposed orders, are planned together, then the second legs.
 """
 
 import dataclasses
@@ -24,27 +23,26 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# Fewer ways than one target alone is met by: there are many legs.
-_EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], ways=12)
+# Fewer paths than for a single target, because there are many legs.
+_EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class GroupIntercept(Planner):
-    """A composite planner of groups whose order is decided.
+    """Composite planner of groups whose order is decided.
 
-    What it gives up for the sake of speed: every leg ends as early as it can, whatever that
-    means for the next one.
+    For the sake of speed every leg ends as early as possible, even if that delays the next leg.
     """
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    # One search: where it fails, others take long.
+    # A single search: the others take long.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
-    patient: SpacetimeIntercept = SpacetimeIntercept("least")  # of legs that it leaves unsolved
+    patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """The plans of a batch, or of one group."""
+        """Return the plans of a batch, or of one group."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)
@@ -53,54 +51,58 @@ class GroupIntercept(Planner):
         state = (car, jnp.zeros_like(shared.time), jnp.ones(shared.time.shape, bool))
 
         def leg(state: tuple, k: Array | int) -> tuple[tuple, tuple[Array, InterceptPlan]]:
-            car, begin, fine = state
-            case, wanted = _leg(cases, k, begin, car, fine)
-            plans = _of_wanted(case, self._planned(drive, case, wanted), wanted)
-            return _after(plans, begin, fine, wanted), (begin, plans)
+            car, begin, solved = state
+            case, needed = _make_legs(cases, k, begin, car, solved)
+            plans = _clear_unneeded(case, self._plan_legs(drive, case, needed), needed)
+            return _advance(plans, begin, solved, needed), (begin, plans)
 
         if drive.is_pure:
             _, (begins, legs) = lax.scan(leg, state, jnp.arange(cases.num_targets))
-            return _joined(cases, begins, legs)
-        found = []
+            return _join(cases, begins, legs)
+        plans = []
         for k in range(cases.num_targets):
             state, one = leg(state, k)
-            found.append(one)
-        begins, legs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
-        return jax.device_get(_joined(cases, begins, legs))
+            plans.append(one)
+        begins, legs = jax.tree.map(lambda *leaves: jnp.stack(leaves), *plans)
+        return jax.device_get(_join(cases, begins, legs))
 
-    def _planned(self, drive: Drive, case: InterceptCase, wanted: Array) -> InterceptPlan:
-        """Plans of the legs that are wanted, (B,) bool; what the others hold means nothing."""
+    def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
+        """Plan the legs that are needed, (B,) bool; the plans of other legs have no meaning."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
-            return drive.plan_again(patiently, case, plans, wanted & _is_left(plans.status))
-        case, wanted = jax.tree.map(np.asarray, (case, wanted))
-        # Orders that begin alike have legs in common. Without any leg, one stands for all.
-        some = np.flatnonzero(wanted) if np.any(wanted) else np.zeros(1, int)
+            return drive.plan_again(patiently, case, plans, needed & _is_open(plans.status))
+        case, needed = jax.tree.map(np.asarray, (case, needed))
+        # Plan equal legs once: orders with the same first targets share legs. Plan one leg if none
+        # is needed.
+        some = np.flatnonzero(needed) if np.any(needed) else np.zeros(1, int)
         leaves = [leaf[some].reshape(some.size, -1) for leaf in jax.tree.leaves(case)]
         rows = np.concatenate(leaves, axis=1)
-        _, first, place = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
         case = jax.tree.map(lambda leaf: leaf[some[first]], case)
         plans, _ = drive(self.planner, case)
-        plans = drive.plan_again(patiently, case, plans, _is_left(plans.status))
-        places = np.zeros(len(wanted), int)
-        places[some] = place
-        return jax.tree.map(lambda leaf: leaf[places], plans)
+        plans = drive.plan_again(patiently, case, plans, _is_open(plans.status))
+        indices = np.zeros(len(needed), int)
+        indices[some] = inverse
+        return jax.tree.map(lambda leaf: leaf[indices], plans)
 
 
-def _is_left(status: Array) -> Array:
-    """Which legs are worth another planner; it has other meeting times, and thinner bodies."""
+def _is_open(status: Array) -> Array:
+    """Return whether another planner may solve a leg.
+
+    It may solve legs without a path, too, since its searches end at other times and scale the body.
+    """
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 
 @jax.jit
-def _leg(
-    cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, fine: Array
+def _make_legs(
+    cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, solved: Array
 ) -> tuple[InterceptCase, Array]:
-    """Return the legs to the k-th targets of the orders, and which of the legs are to be planned.
+    """Return the legs to the k-th targets of the orders, and whether each is needed.
 
-    They start at times (B,) [s] where the cars are then; `fine` (B,) bool says whether all legs
-    before are solved.
+    They start at the times `begin` (B,) [s] from the states `car`. `solved` (B,) bool is true if
+    all previous legs are solved.
     """
 
     def of_one(case: InterceptGroup, begin: Array, car: CarState) -> tuple[InterceptCase, Array]:
@@ -108,15 +110,15 @@ def _leg(
         return case.leg(target, begin, car), case.present[target]
 
     legs, present = jax.vmap(of_one)(cases, begin, car)
-    return legs, present & fine
+    return legs, present & solved
 
 
 @jax.jit
-def _of_wanted(cases: InterceptCase, plans: InterceptPlan, wanted: Array) -> InterceptPlan:
-    """The plans (B, ...) of legs; where none is wanted, one that takes no time."""
+def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -> InterceptPlan:
+    """Replace the plans (B, ...) of legs that are not needed by plans that take no time."""
     num = plans.speed.shape[1]
     zero = jnp.zeros_like(plans.time)
-    nothing = InterceptPlan(
+    empty = InterceptPlan(
         cost=zero,
         violation=zero,
         iterations=jnp.zeros_like(plans.iterations),
@@ -129,49 +131,40 @@ def _of_wanted(cases: InterceptCase, plans: InterceptPlan, wanted: Array) -> Int
     )
 
     def pick(plan: Array, other: Array) -> Array:
-        return jnp.where(wanted.reshape(-1, *[1] * (plan.ndim - 1)), plan, other)
+        return jnp.where(needed.reshape(-1, *[1] * (plan.ndim - 1)), plan, other)
 
-    return jax.tree.map(pick, plans, nothing)
+    return jax.tree.map(pick, plans, empty)
 
 
 @jax.jit
-def _after(
-    plans: InterceptPlan, begin: Array, fine: Array, wanted: Array
+def _advance(
+    plans: InterceptPlan, begin: Array, solved: Array, needed: Array
 ) -> tuple[CarState, Array, Array]:
-    """Where the cars are after legs (B, ...), when (B,) [s], and whether all was solved (B,)."""
+    """Return the cars' states and times (B,) [s] after legs, and whether all legs are solved."""
 
     def end(plan: InterceptPlan) -> CarState:
-        return CarState(
-            pose=pose_at(
-                plan.start,
-                jnp.where(plan.time > 0.0, plan.time, 1.0),
-                plan.speed,
-                plan.curvature,
-                plan.time,
-            ),
-            speed=plan.speed[-1],
-            curvature=plan.curvature[-1],
-        )
+        duration = jnp.where(plan.time > 0.0, plan.time, 1.0)
+        pose = pose_at(plan.start, duration, plan.speed, plan.curvature, plan.time)
+        return CarState(pose=pose, speed=plan.speed[-1], curvature=plan.curvature[-1])
 
-    return jax.vmap(end)(plans), begin + plans.time, fine & (is_solved(plans.status) | ~wanted)
+    return jax.vmap(end)(plans), begin + plans.time, solved & (is_solved(plans.status) | ~needed)
 
 
 @jax.jit
-def _joined(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
-    """The plans of legs (N, B, ...), which begin at times (N, B) [s]."""
-    begin, of_all = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
-    # What the first leg that is not solved says goes for the whole; the last if all are.
-    first = jnp.argmax(~is_solved(of_all.status), axis=1)
+def _join(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
+    """Join legs (N, B, ...), which start at times (N, B) [s], to plans of groups."""
+    begins, legs = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
+    # The status of a plan is the status of its first unsolved leg.
+    first = jnp.argmax(~is_solved(legs.status), axis=1)
     lanes = jnp.arange(first.size)
-    solved = jnp.all(is_solved(of_all.status), axis=1)
+    solved = jnp.all(is_solved(legs.status), axis=1)
+    worst = jnp.max(legs.violation, axis=1)
     return GroupPlan(
-        cost=jnp.max(begin + of_all.time, axis=1),
-        violation=jnp.where(
-            solved, jnp.max(of_all.violation, axis=1), of_all.violation[lanes, first]
-        ),
-        iterations=jnp.sum(of_all.iterations, axis=1),
-        status=of_all.status[lanes, first],
+        cost=jnp.max(begins + legs.time, axis=1),
+        violation=jnp.where(solved, worst, legs.violation[lanes, first]),
+        iterations=jnp.sum(legs.iterations, axis=1),
+        status=legs.status[lanes, first],
         order=cases.order,
-        begins=begin,
-        legs=of_all,
+        begins=begins,
+        legs=legs,
     )

@@ -10,18 +10,18 @@ from planner_jax.task.intercept.plan import InterceptPlan
 
 @struct.dataclass
 class GroupPlan(Plan):
-    """One plan, or a batch of them with a leading axis on every leaf: a leg to each target.
+    """One plan with a leg to each target, or a batch with a leading axis on every leaf.
 
-    Every leg begins where and when the one before ends. Legs to absent targets are the last ones
-    and take no time. Where a leg is not solved, those behind it take no time either. The cost is
-    when the last target is met [s].
+    Every leg starts at the state and the time at which the previous leg ends. Legs to absent
+    targets come last and take no time. Legs after an unsolved leg take no time either. The cost is
+    the time [s] at which the last target is met.
     """
 
-    order: Array  # (N,) int32, which target is met first, second, ...
-    begins: Array  # (N,) [s], when each leg begins
-    legs: InterceptPlan  # leaves with a leading axis N, in that order
+    order: Array  # (N,) int32, index of the target that is met first, second, ...
+    begins: Array  # (N,) [s], start of each leg
+    legs: InterceptPlan  # leaves with a leading axis N, in the order of `order`
 
     @property
     def choice(self) -> GroupChoice:
-        """What was decided."""
+        """The order as a choice."""
         return GroupChoice(order=self.order)

@@ -1,10 +1,10 @@
 """Named, seeded suites of groups: several targets for one car among walls and movers.
 
 The suites are this library's. Start, walls, movers and one target are drawn as in
-`planner_jax.task.intercept.suites`, for the time until which all targets are to be met. Then the
-number of targets is drawn, and other targets are drawn as the first one, each again until no cause
-of rejection applies. So all targets stay on the map and off the walls up to that time. World frame
-in the plane, SI units.
+`planner_jax.task.intercept.suites`, for the time by which all targets must be met. Then the number
+of targets and the other targets are drawn, each target again until no cause of rejection applies.
+All targets therefore stay on the map and off the walls up to that time. World frame in the plane,
+SI units.
 """
 
 import dataclasses
@@ -20,9 +20,9 @@ from planner_jax.task.group.case import InterceptGroup
 from planner_jax.task.group.spec import SUITES, TASK
 from planner_jax.task.intercept.suites import (
     CAUSES,
-    accepted_draws,
     anywhere,
     cases_of,
+    draw_accepted,
     first_cause,
     path_of,
     target_to,
@@ -41,33 +41,33 @@ def draw(
 ) -> InterceptGroup:
     """Draw a batch of groups of a suite in float64, and cast it.
 
-    Arguments and errors are those of `pj.hit.draw`. The suite is "group" by default, or one that
-    another package offers.
+    Arguments and errors are as for `pj.hit.draw`. The suite is "group" by default, or a suite of
+    another package.
     """
     suite = suite_named(suite, "group")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
-    drawn, _, _ = accepted_draws(own, randoms)
+    drawn, _, _ = draw_accepted(own, randoms)
     fewest, most = own.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])
     targets = [{name: drawn[name] for name in _TARGET}]
-    targets += [_another_target(suite, randoms, drawn) for _ in range(most - 1)]
-    together = {name: np.stack([each[name] for each in targets], axis=1) for name in _TARGET}
+    targets += [_draw_target(suite, randoms, drawn) for _ in range(most - 1)]
+    stacked = {name: np.stack([each[name] for each in targets], axis=1) for name in _TARGET}
     return InterceptGroup(
-        shared=dataclasses.replace(cases_of(drawn, dtype), target=path_of(together, dtype)),
+        shared=dataclasses.replace(cases_of(drawn, dtype), target=path_of(stacked, dtype)),
         present=jnp.asarray(np.arange(most) < count[:, None]),
         order=jnp.asarray(np.broadcast_to(np.arange(most), (num, most)), jnp.int32),
     )
 
 
-def _another_target(
+def _draw_target(
     suite: str, randoms: list[np.random.Generator], drawn: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """One more target for each of B draws, with which nothing is wrong either."""
+    """Draw one more target for each of B draws, to which no cause of rejection applies."""
     own, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
-    found = {name: np.zeros_like(drawn[name]) for name in _TARGET}
+    targets = {name: np.zeros_like(drawn[name]) for name in _TARGET}
     while len(pending):
         uniform = np.stack([randoms[k].random(6) for k in pending])
         meeting = anywhere(uniform[:, :2])
@@ -75,6 +75,6 @@ def _another_target(
         around = {name: leaf[pending] for name, leaf in drawn.items()}
         is_good = first_cause(own, {**around, **target, "meeting": meeting}) == len(CAUSES)
         for name in _TARGET:
-            found[name][pending[is_good]] = target[name][is_good]
+            targets[name][pending[is_good]] = target[name][is_good]
         pending = pending[~is_good]
-    return found
+    return targets

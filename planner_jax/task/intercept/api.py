@@ -31,10 +31,10 @@ def draw(
     first: int = 0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Draw a batch of interceptions of a suite; arguments and errors are those of `pj.hit.draw`.
+    """Draw a batch of interceptions of a suite, with the arguments and errors of `pj.hit.draw`.
 
-    The suite is "easy" by default, "medium", "hard", "storm", "gale", "maze", "rush", or one that
-    another package offers. `drawn` also reports how many draws it rejected.
+    The suite is "easy" by default, "medium", "hard", "storm", "gale", "maze", "rush", or a suite of
+    another package. `drawn` also returns the number of rejected draws.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:
@@ -51,13 +51,15 @@ def observe(
     first: int = 0,
     until: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw noisy observations of the targets until the cars set out [Qu2022, eq. 4], or longer.
+    """Draw noisy observations of the targets up to the time when the cars set out, or longer.
+
+    See [Qu2022, eq. 4].
 
     Args:
         cases: leaves with leading axis B.
-        seed: >= 0. The observations of case k of a seed are always the same.
+        seed: >= 0. The observations of case k are the same for every batch of a seed.
         noise: [m], standard deviation on each axis.
-        count: number of observations up to time 0, when the last of them is made.
+        count: number of observations up to time 0; the last of them is at time 0.
         interval: [s], between two observations.
         first: index of the first case, >= 0.
         until: [s], time of the last observation, >= 0. It does not change earlier observations.
@@ -67,10 +69,10 @@ def observe(
         positions: (B, L, 2) [m].
 
     Raises:
-        ValueError: an argument is out of its range; one line.
+        ValueError: an argument is out of its range.
     """
-    given = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
-    for name, (value, least) in given.items():
+    ranges = {"count": (count, 1), "noise": (noise, 0), "first": (first, 0), "until": (until, 0)}
+    for name, (value, least) in ranges.items():
         if not value >= least:
             raise ArgumentError(name, f">= {least}", value)
     if not interval > 0.0:
@@ -96,28 +98,28 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
 
     * `spacetime`: plans path and speed together, from a reach set in space and time.
     * `quick`: `spacetime` with fewer paths and steps, for large batches on a GPU.
-    * `best`: `spacetime` with more paths and steps; the plan of least effort is selected.
-    * `lattice`: a path among the walls, then a speed along it among the movers, on eight paths
-      from a reach set; the best one is selected.
-    * `paper`: one path by Hybrid A*, smoothed, then a speed along it, as [Qu2022] has it; on the
-      host, with the extra `baselines`.
+    * `best`: `spacetime` with more paths and steps; selects the plan of least effort.
+    * `lattice`: plans eight paths among the walls from a reach set, then a speed along each among
+      the movers, and selects the best plan.
+    * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then a speed along it. It
+      runs on the host and needs the extra `baselines`.
     * `em`: the best path of `lattice` with the speed step of the EM planner.
-    * `constant`: the best path of `lattice` at constant speed, whatever moves.
+    * `constant`: the best path of `lattice` at constant speed; it ignores the movers.
 
-    Arguments and errors are those of `pj.hit.planner`; the options are fields of
+    Arguments and errors are as for `pj.hit.planner`. The options are the fields of
     `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
     """
     return TASK.make_planner(name, options)
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
-    """Judge one plan, or a batch of plans, by the referee.
+    """Judge one plan, or a batch of plans, with arguments, result and errors of `pj.hit.judge`.
 
     The referee computes the positions of `TurningPath`, `PolynomialPath` and `LaterPath` itself.
     It calls the method `at` of a target of any other class, in float64.
-    Arguments, result and errors are those of `pj.hit.judge`. `referee_intercepts` has the settings,
-    such as `truth`: the path, or a batch of paths, that the target really takes, where the case
-    holds a predicted one.
+
+    The settings are keyword arguments of `referee_intercepts`, such as `truth`: the path, or a
+    batch of paths, that the target really takes if the case holds a predicted path.
     """
     require_kind("cases", cases, InterceptCase)
     target = cases.target
@@ -127,20 +129,20 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
         if cases.batch_shape == ():
             one = jax.tree.map(lambda leaf: np.asarray(leaf)[None], truth)
             settings = {**settings, "truth": one}
-    settings = {**by_own_class(target), **settings}
+    settings = {**position_setting(target), **settings}
     return judge_by(referee_intercepts, cases, plans, (InterceptCase, InterceptPlan), settings)
 
 
-def by_own_class(target: PlanePath) -> dict[str, object]:
-    """Return the setting by which the referee follows a target whose class it does not know."""
+def position_setting(target: PlanePath) -> dict[str, object]:
+    """Return the setting that the referee needs for a target of a class that it does not know."""
     while isinstance(target, LaterPath):
         target = target.path
-    known = type(target) in (TurningPath, PolynomialPath)
-    return {} if known else {"target_positions": positions}
+    is_known = type(target) in (TurningPath, PolynomialPath)
+    return {} if is_known else {"target_positions": positions}
 
 
 def positions(target: PlanePath, times: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 2"]:
-    """Return the positions [m] of targets (B,) of any class at times (B,) [s], in float64."""
+    """Compute the positions [m] of targets (B,) of any class at times (B,) [s], in float64."""
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), target)
         return np.asarray(jax.vmap(lambda path, time: path.at(time).pos)(double, times))

@@ -1,5 +1,6 @@
-"""One interception: a car, its target, and what stands or moves in its way."""
+"""The case of one interception: a car, its target, and the obstacles between them."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -27,7 +28,9 @@ from planner_jax.plane.target import PlanePath
 from planner_jax.robot.car import CarBody, CarLimits
 from planner_jax.task.arguments import array_of, batch_of
 
-# What the numbers of a case must be.
+_BODY, _LIMITS = ([field.name for field in dataclasses.fields(c)] for c in (CarBody, CarLimits))
+
+# Shapes, types and ranges of the leaves of a case.
 RULES: Table = (
     Field("start", (3,)),
     Field("speed", (), NOT_NEGATIVE),
@@ -48,37 +51,25 @@ RULES: Table = (
     ),
     Field("lower", (2,), below("upper")),
     Field("upper", (2,)),
-    Field("body.length", (), POSITIVE),
-    Field("body.width", (), POSITIVE),
-    Field("body.wheelbase", (), POSITIVE),
+    *(Field(f"body.{name}", (), POSITIVE) for name in _BODY if name != "rear_overhang"),
     Field("body.rear_overhang", ()),
-    Field("limits.speed", (), POSITIVE_OR_NONE),
-    Field("limits.acceleration", (), POSITIVE_OR_NONE),
-    Field("limits.lateral_acceleration", (), POSITIVE_OR_NONE),
-    Field("limits.curvature", (), POSITIVE_OR_NONE),
-    Field("limits.steering_rate", (), POSITIVE_OR_NONE),
+    *(Field(f"limits.{name}", (), POSITIVE_OR_NONE) for name in _LIMITS),
 )
-
-
-# Arguments of `case` by the fields that they become, for messages.
+# Field of a case -> argument of `case`, for error messages.
 _ARGUMENTS = {
     "speed": "initial_speed",
     "curvature": "initial_curvature",
-    **{f"body.{name}": name for name in ("length", "width", "wheelbase", "rear_overhang")},
-    "limits.speed": "speed",
-    "limits.acceleration": "acceleration",
-    "limits.lateral_acceleration": "lateral_acceleration",
-    "limits.curvature": "curvature",
-    "limits.steering_rate": "steering_rate",
+    **{f"body.{name}": name for name in _BODY},
+    **{f"limits.{name}": name for name in _LIMITS},
 }
 
 
 @struct.dataclass
 class InterceptCase:
-    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+    """The case of one interception, or a batch; every number is a leaf of the pytree.
 
-    World frame in the plane, SI units. Times count from the moment at which the car sets out.
-    The middle of the car's body meets the target.
+    World frame in the plane, SI units. Times count from the moment at which the car sets out. The
+    middle of the car's body has to meet the target.
     """
 
     rules: ClassVar[Table] = RULES
@@ -86,14 +77,14 @@ class InterceptCase:
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
     speed: Array  # () [m/s], at time 0
     curvature: Array  # () [1/m], at time 0, from the steering angle
-    target: PlanePath  # where it is expected to be
-    time: Array  # () [s], when to meet it; the latest time for planners that choose it
-    tolerance: Array  # () [m], how far from the target the body's middle may then be
+    target: PlanePath  # the expected path
+    time: Array  # () [s], of the meeting; the latest time for planners that choose the time
+    tolerance: Array  # () [m], greatest distance of the body's middle from the target then
     end_heading: Array  # () [rad], at the meeting
     heading_tolerance: Array  # () [rad]; pi leaves the heading free
-    walls: Obstacles  # that stand
-    movers: Obstacles  # that move
-    lower: Array  # (2,) [m], corner of the map, which the body's middle does not leave
+    walls: Obstacles  # standing obstacles
+    movers: Obstacles  # moving obstacles
+    lower: Array  # (2,) [m], corner of the map; the body's middle must not leave the map
     upper: Array  # (2,) [m], the opposite corner
     body: CarBody
     limits: CarLimits
@@ -130,26 +121,25 @@ def case(
     steering_rate: ArrayLike = 2.0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Return an interception, or a batch, by default with the setting of [Qu2022].
+    """Make an interception, or a batch, by default with the setting of [Qu2022].
 
-    The paper gives a map of 80 x 80 pixels, T = 10 s and 0.5 m/s at the start (Section V); sizes
-    and limits of the car are those of a model car of scale 1:10 on a map of 8 m x 8 m: an
-    assumption.
+    The paper states a map of 80 x 80 pixels, T = 10 s, and 0.5 m/s at the start (Section V). The
+    default car is a model car of scale 1:10 on a map of 8 m x 8 m; that is an assumption.
 
     Args:
         target: a path pytree such as `TurningPath`, leaves with the batch's axes first.
-        time: () or (B,) [s], when to meet it, > 0. The time and all later numbers are one value,
-            or one value a case.
+        time: () or (B,) [s], of the meeting, > 0. The time and all later numbers are one value, or
+            one value for each case.
         start: (3,) x, y of the rear axle's middle [m], and heading [rad].
         initial_speed: [m/s].
         initial_curvature: [1/m].
-        walls: polygons (V, 2) [m] each, convex, the same for all cases; or `Obstacles` with the
+        walls: convex polygons, (V, 2) [m] each, the same for all cases; or `Obstacles` with the
             batch's axes on every leaf.
-        movers: like the walls, at time 0.
-        mover_velocities: (2,) or (N, 2) [m/s], of polygons in `movers`.
-        tolerance: [m], how far from the target the body's middle may be at the end.
-        end_heading: [rad]; left free if not given.
-        heading_tolerance: [rad], of a given heading.
+        movers: moving obstacles at time 0, in the form of the walls.
+        mover_velocities: (2,) or (N, 2) [m/s], of the polygons in `movers`.
+        tolerance: [m], greatest distance of the body's middle from the target at the end.
+        end_heading: [rad]; free by default.
+        heading_tolerance: [rad], greatest deviation from `end_heading`.
         lower: (2,) [m], corner of the map.
         upper: (2,) [m], the opposite corner.
         length: [m], of the body.
@@ -164,62 +154,53 @@ def case(
         dtype: of every floating leaf.
 
     Raises:
-        ValueError: a polygon is not convex; or as of `pj.hit.case`, as all other errors.
+        ValueError: a polygon is not convex; otherwise the errors of `pj.hit.case`.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
-    own = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
-    shapes += [shape_of(name, value) for name, value in own.items()]
+    scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
+    shapes += [shape_of(name, value) for name, value in scalars.items()]
     batch = max(shapes, key=len)
 
     def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
     require_path("target", target, batch, 2)
-    free = end_heading is None
+    is_free = end_heading is None
     around = leaf("heading_tolerance", heading_tolerance)
-    made = InterceptCase(
+    body = (length, width, wheelbase, rear_overhang)
+    limits = (speed, acceleration, lateral_acceleration, curvature, steering_rate)
+    result = InterceptCase(
         start=leaf("start", start, 3),
         speed=leaf("initial_speed", initial_speed),
         curvature=leaf("initial_curvature", initial_curvature),
         target=target,
         time=leaf("time", time),
         tolerance=leaf("tolerance", tolerance),
-        end_heading=leaf("end_heading", 0.0 if free else end_heading),
-        heading_tolerance=jnp.full_like(around, np.pi) if free else around,
-        walls=_for_batch("walls", walls, 0.0, batch, dtype),
-        movers=_for_batch("movers", movers, mover_velocities, batch, dtype),
+        end_heading=leaf("end_heading", 0.0 if is_free else end_heading),
+        heading_tolerance=jnp.full_like(around, np.pi) if is_free else around,
+        walls=_make_obstacles("walls", walls, 0.0, batch, dtype),
+        movers=_make_obstacles("movers", movers, mover_velocities, batch, dtype),
         lower=leaf("lower", lower, 2),
         upper=leaf("upper", upper, 2),
-        body=CarBody(
-            length=leaf("length", length),
-            width=leaf("width", width),
-            wheelbase=leaf("wheelbase", wheelbase),
-            rear_overhang=leaf("rear_overhang", rear_overhang),
-        ),
-        limits=CarLimits(
-            speed=leaf("speed", speed),
-            acceleration=leaf("acceleration", acceleration),
-            lateral_acceleration=leaf("lateral_acceleration", lateral_acceleration),
-            curvature=leaf("curvature", curvature),
-            steering_rate=leaf("steering_rate", steering_rate),
-        ),
+        body=CarBody(*map(leaf, _BODY, body)),
+        limits=CarLimits(*map(leaf, _LIMITS, limits)),
     )
-    require_sound(made, _ARGUMENTS)
-    return made
+    require_sound(result, _ARGUMENTS)
+    return result
 
 
-def _for_batch(
+def _make_obstacles(
     name: str,
-    given: Sequence[ArrayLike] | Obstacles,
+    polygons: Sequence[ArrayLike] | Obstacles,
     velocities: ArrayLike,
     batch: tuple[int, ...],
     dtype: DTypeLike,
 ) -> Obstacles:
-    """Return obstacles with the batch's axes on every leaf; errors name the argument."""
-    if isinstance(given, Obstacles):
-        return given
+    """Make obstacles with the batch's axes on every leaf; errors name the argument of `case`."""
+    if isinstance(polygons, Obstacles):
+        return polygons
     try:
-        one = obstacles(given, velocities, dtype=dtype)
+        one = obstacles(polygons, velocities, dtype=dtype)
     except ArgumentError as error:
         names = {"polygons": name, "velocities": "mover_velocities"}
         raise error.with_names(names) from None

@@ -1,11 +1,13 @@
 """The default planner: a reach set in space and time, random paths through it, least squares.
 
-[Qu2022] plans a path among the walls and then a speed along it among the movers; where the path
-crosses a mover that stays on it, no speed helps. Here path and speed are planned together. A reach
-set of cells (`plane.reach`) says what the car can reach and when. Levenberg-Marquardt on speed and
-curvature at knots (`problem`) starts from random paths through the set. It runs in stages: a motion
-that follows the cells, for speeds and turns of cells alone drift through walls; a motion that keeps
-every limit; and, once one does, a motion of less effort, or an earlier one.
+[Qu2022] plans a path among the walls, and then a speed along it among the movers. If a mover stays
+on the path, no speed helps. Here path and speed are planned together. A reach set of cells
+(`plane.reach`) contains what the car can reach and when. Levenberg-Marquardt on speed and curvature
+at knots (`problem`) starts from random paths through the set, and runs in three stages:
+
+1. follow the positions of the cells, since their speeds and turns alone drift through walls;
+2. meet every limit;
+3. once every limit holds, reduce the effort, or meet the target earlier.
 """
 
 import dataclasses
@@ -26,14 +28,14 @@ from planner_jax.core.protocol import (
     require_settings,
     select,
 )
-from planner_jax.plane.cell_paths import Chance
+from planner_jax.plane.cell_paths import PathNoise
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan, explain, make_straight_plan
 from planner_jax.task.intercept.problem import (
-    BegunCase,
     Guess,
     MotionProblem,
     SmoothIntercept,
+    StartedCase,
     add_start,
 )
 from planner_jax.task.intercept.replan import ReplanIntercept
@@ -41,36 +43,36 @@ from planner_jax.task.intercept.searches import (
     BEST,
     QUICK,
     SEARCHES,
-    Found,
+    Reachability,
     Search,
     draw_cell_path,
     make_grid,
     search_reach,
 )
 
-_SPREAD = 2  # layers from the earliest one on at which paths to the earliest meeting end
+_SPREAD = 2  # number of earliest layers at which paths to an early meeting end
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
-    """Meets the target at the case's time, or earlier.
+    """Planner of interceptions by a reach set and least squares.
 
-    `meet` says when: at the "given" time, as "early" as possible until then, or at the time until
-    then which takes the "least" effort, the integral of the squared acceleration. A plan's cost
-    is the meeting time of the early ones [s], and the effort of the others [m^2/s^3].
+    `meet` selects the time of the meeting: the "given" time of the case, as "early" as possible
+    before it, or the earlier time of the "least" effort. The effort is the integral of the squared
+    acceleration. The cost of a plan is its time [s] for "early", else its effort [m^2/s^3].
     """
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32  # of speed and curvature
-    samples: int = 3  # of each piece, at which obstacles are checked
-    checked: int = 10  # samples of each piece of the plan that is returned
-    # Whether all paths of a search are tried and the best one is selected; always if the time is
-    # free.
+    samples: int = 3  # of each piece, at which least squares check obstacles
+    checked: int = 10  # samples of each piece, at which the final check of a plan is made
+    # Whether all paths of a search are tried and the best plan is selected, as is always done if
+    # the time is free.
     tries_all: bool = False
-    searches: tuple[Search, ...] | None = None  # by default those that suit `meet`
+    searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -81,7 +83,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches."""
+        """The searches, in the order in which they are tried."""
         return self.searches or SEARCHES[self.meet]
 
     @property
@@ -90,15 +92,15 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return MotionProblem(self.meet, self.pieces, self.samples, self.checked)
 
     def replanner(self) -> ReplanIntercept:
-        """Return the planner that continues from a plan that is being driven; see `pj.replan`."""
+        """Return the planner that updates a plan while it is being driven; see `pj.replan`."""
         return ReplanIntercept(self, self.attempts[0], self.problem)
 
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
-    ) -> tuple[SmoothIntercept, BegunCase]:
-        """Return the planner that minimises the cost from plans on, and the cases with the plans.
+    ) -> tuple[SmoothIntercept, StartedCase]:
+        """Return the planner that minimises the cost from plans, and the cases with these plans.
 
-        `pj.gradient` and `pj.optimal_plan` use them.
+        `pj.gradient` and `pj.optimal_plan` use both.
         """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
@@ -108,8 +110,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         self,
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
-    ) -> tuple[SmoothIntercept, BegunCase]:
-        """Return `smooth_near` of plans; by default of the plan of the first search."""
+    ) -> tuple[SmoothIntercept, StartedCase]:
+        """Return `smooth_near` for the plans of `plan_of`, by default of the first search."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
@@ -117,83 +119,80 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.smooth_near(cases, plans)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plan of one case: path after path is tried until one keeps every limit.
+        """Return the plan of one case: try path after path until one meets every limit.
 
-        With `tries_all`, or if the meeting time is free, all are tried, and the best is selected.
+        With `tries_all`, or if the meeting time is free, try all and select the best plan.
         """
-        found = search_reach(case, attempt, is_time_free=self.problem.is_time_free)
-        chances = attempt.draw_chances()
-        num = jnp.where(found.is_reached, attempt.ways, 0)
+        problem = self.problem
+        found = search_reach(case, attempt, is_time_free=problem.is_time_free)
+        stages, noises = problem.list_stages(attempt), attempt.draw_noise()
+        num = jnp.where(found.is_reached, attempt.paths, 0)
 
         def try_path(state: tuple) -> tuple:
             k, best = state
-            chance = jax.tree.map(lambda leaf: leaf[k], chances)
-            return k + 1, select(self._solve_along(case, found, chance, attempt), best)
+            noise = jax.tree.map(lambda leaf: leaf[k], noises)
+            guess = self._guess(case, found, noise, attempt)
+            return k + 1, select(problem.refine(case, found.field, guess, attempt, stages), best)
 
         def is_open(state: tuple) -> Array:
             k, best = state
-            tries_all = self.tries_all or self.problem.is_time_free
+            tries_all = self.tries_all or problem.is_time_free
             return (k < num) & (tries_all | ~is_solved(best.status))
 
         _, best = lax.while_loop(is_open, try_path, (0, make_straight_plan(case, self.pieces)))
         return self._explain(case, attempt, found, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch: all paths of all cases together, the best one of each."""
-        # All compute as many layers as the case with the most, so that they stay in step.
+        """Return the plans of a batch: try all paths together, select the best of each case."""
+        # All cases compute the largest number of layers of the batch, so that they stay in step.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
 
     def _solve_all_paths(
         self, case: InterceptCase, attempt: Search, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case together, and run the last stage for the best one alone.
+        """Try all paths of one case together, and run the last stage for the best path alone.
 
-        With `tries_all` the last stage runs for all of them.
+        With `tries_all` the last stage runs for all paths.
         """
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
 
-        def solve_without_last_stage(chance: Chance) -> InterceptPlan:
-            guess = self._guess(case, found, chance, attempt)
-            stages = problem.list_stages(attempt)[:-1]
-            points, steps = problem.run_stages(case, found.field, guess, attempt, stages)
+        def solve_along(noise: PathNoise) -> InterceptPlan:
+            guess, stages = self._guess(case, found, noise, attempt), problem.list_stages(attempt)
+            if self.tries_all:
+                return problem.refine(case, found.field, guess, attempt, stages)
+            points, steps = problem.run_stages(case, found.field, guess, attempt, stages[:-1])
             return problem.decode(case, points[-1], steps)
 
-        def solve_along(chance: Chance) -> InterceptPlan:
-            return self._solve_along(case, found, chance, attempt)
-
-        solve = solve_along if self.tries_all else solve_without_last_stage
-        plans = jax.vmap(solve)(attempt.draw_chances())
+        plans = jax.vmap(solve_along)(attempt.draw_noise())
         best = index_of_best(plans)
         plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
             plan = problem.refine_solved(case, found.field, plan, attempt)
         return self._explain(case, attempt, found, plan)
 
-    def _solve_along(
-        self, case: InterceptCase, found: Found, chance: Chance, attempt: Search
-    ) -> InterceptPlan:
-        """Return the plan that one random path leads to, after all stages."""
-        guess = self._guess(case, found, chance, attempt)
-        stages = self.problem.list_stages(attempt)
-        return self.problem.refine(case, found.field, guess, attempt, stages)
+    def _guess(
+        self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
+    ) -> Guess:
+        """Draw a random path that meets the target, and return the guess along it.
 
-    def _guess(self, case: InterceptCase, found: Found, chance: Chance, attempt: Search) -> Guess:
-        """Draw a random path to one of the first layers that reach the target, or to any layer."""
+        It ends at the case's time, at one of the first layers that meet the target ("early"), or
+        at any layer that does ("least").
+        """
         layer = found.grid.num
         if self.problem.is_time_free:
             allowed = found.layers
             if self.meet == "early":
                 allowed &= jnp.cumsum(found.layers) <= _SPREAD
-            layer = jnp.argmax(jnp.where(allowed, chance.layers, -jnp.inf))
-        path = draw_cell_path(case, found, layer, chance, attempt.directness)
+            layer = jnp.argmax(jnp.where(allowed, noise.layers, -jnp.inf))
+        path = draw_cell_path(case, found, layer, noise, attempt.directness)
         return self.problem.guess_along(case, found.grid, path, layer)
 
     def _explain(
-        self, case: InterceptCase, attempt: Search, found: Found, plan: InterceptPlan
+        self, case: InterceptCase, attempt: Search, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
-        """Set the status of an unsolved plan to the reason why there is none."""
+        """Set the status of an unsolved plan to the reason why the case has no plan."""
         reason = plan.status
         if attempt == self.attempts[-1]:
             reason = jnp.where(found.is_reached, reason, Status.NO_PATH)

@@ -1,14 +1,14 @@
-"""Speed and curvature at knots, the way that follows, and what a cost of the way is by the knots.
+"""The motion of a car by speed and curvature at knots, and derivatives of costs by the knots.
 
-Between equal knots both change evenly, so that the heading is a cubic in time, known exactly; the
-position is its integral by Simpson's rule. Unknowns: speeds at the knots 1..K, then curvatures
-there, then, where it is free, the time of the end; values at knot 0 are where the car is.
+Speed and curvature are linear in time between equally spaced knots. The heading is then a cubic in
+time, known exactly, and the position is its integral by Simpson's rule. The unknowns are the speeds
+at the knots 1..K, then the curvatures there, then the time of the end if it is free. The values at
+knot 0 are the car's state.
 
-A knot bends the way in the two pieces beside it. All that comes later turns and moves with their
-end as one rigid piece, so that a small change of a knot is a twist (..., 3) of the rest: (a, b)
-moves a pose at p by a + b (-p_y, p_x) and turns it by b. Gradient and curvature of a sum over
-samples are then sums over pieces and products of twists; no matrix of all samples by all unknowns
-is ever made.
+A knot deforms the motion in the two pieces beside it. The motion after these pieces moves as one
+rigid piece, so that a small change of a knot is a twist (a, b) (3,) of it: the twist moves a pose
+at p by a + b (-p_y, p_x) and turns it by b. Gradient and curvature of a sum over samples are then
+sums over pieces and products of twists. No matrix of all samples by all unknowns is ever formed.
 """
 
 import functools
@@ -19,42 +19,46 @@ from flax import struct
 from jax import Array, lax
 
 _HIGHEST = lax.Precision.HIGHEST
-# What a piece is changed by: both values at its beginning and end, and the time of the end.
+# The five variables of a piece: speed and curvature at its start and end, and the time of the end.
 V_LEFT, V_RIGHT, C_LEFT, C_RIGHT, TIME = range(5)
 
 
 @struct.dataclass
 class Motion:
-    """The way at K pieces of S equally spaced samples, the last one of each at its end."""
+    """The motion over K pieces of S equally spaced samples, the last of each at the piece's end."""
 
     pos: Array  # (K, S, 2) [m], of the rear axle's middle
     heading: Array  # (K, S) [rad]
     direction: Array  # (K, S, 2), the heading's cosine and sine
     time: Array  # (K, S) [s]
-    # By what the samples' own piece is changed by, and by a twist of what was before it: x, y,
-    # heading and time of each sample.
+    # Derivatives of x, y, heading and time of each sample by the five variables of its own piece,
+    # and by a twist of the motion before the piece.
     slope: Array  # (K, S, 4, 8)
-    right: Array  # (K, 2, 3), twist after a piece by speed and curvature at its end
-    left: Array  # (K, 2, 3), the same by those at its beginning
+    right: Array  # (K, 2, 3), twist after a piece by speed and curvature at the piece's end
+    left: Array  # (K, 2, 3), twist after a piece by speed and curvature at its start
 
 
 @struct.dataclass
 class Quadratic:
-    """A cost of the way near it: half its gradient, and the curvature that goes with it."""
+    """A quadratic model of a cost of the motion: half its gradient and half its Hessian."""
 
-    push: Array  # (K, S, 4), by x, y, heading and time of every sample
-    stiffness: Array  # (K, S, 4, 4)
-    piece_push: Array  # (K, 5), by what each piece is changed by
-    piece_stiffness: Array  # (K, 5, 5)
+    push: Array  # (K, S, 4), gradient by x, y, heading and time of every sample
+    stiffness: Array  # (K, S, 4, 4), Hessian
+    piece_push: Array  # (K, 5), gradient by the five variables of each piece
+    piece_stiffness: Array  # (K, 5, 5), Hessian
 
 
 @functools.cache
 def _weights(samples: int) -> tuple[np.ndarray, ...]:
-    """What is the same for all pieces, of the 2 S + 1 nodes of one piece at u = 0 .. 1.
+    """Return constants of a piece for its 2 S + 1 nodes at u = 0 .. 1.
 
-    With hat functions l = 1 - u and r = u of its two knots: the integrals from 0 to u of l l, l r
-    and r r at the nodes, (3, 2 S + 1); and weights of the nodes (2 S + 1, 9 S) that pick each of S
-    samples, and integrate up to each by Simpson's rule l, r, and these times the three integrals.
+    The hat functions of the piece's two knots are l = 1 - u and r = u.
+
+    Returns:
+        turned: (3, 2 S + 1), integrals of l l, l r and r r from 0 to the nodes.
+        weights: (2 S + 1, 9 S), of values at the nodes. They select each of S samples; and
+            integrate up to each sample, by Simpson's rule, the values times l, times r, and times
+            the products of l and r with the three integrals.
     """
     u = np.linspace(0.0, 1.0, 2 * samples + 1)
     hats = np.stack([1.0 - u, u])
@@ -63,15 +67,20 @@ def _weights(samples: int) -> tuple[np.ndarray, ...]:
     for k in range(samples):
         simpson[k:, 2 * k : 2 * k + 3] += np.array([1.0, 4.0, 1.0]) / (6.0 * samples)
     factors = np.concatenate([hats, (hats[:, None] * turned).reshape(6, -1)])
-    picked = np.eye(2 * samples + 1)[2::2]
-    weights = np.concatenate([picked, (factors[:, None] * simpson).reshape(8 * samples, -1)])
+    selection = np.eye(2 * samples + 1)[2::2]
+    weights = np.concatenate([selection, (factors[:, None] * simpson).reshape(8 * samples, -1)])
     return turned, weights.T
 
 
 def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: int) -> Motion:
-    """Return the motion of K pieces and its slopes, with a static number of samples a piece.
+    """Return the motion of K pieces and its derivatives.
 
-    Speed [m/s] and curvature [1/m] (K + 1,) are at knots up to a time () [s].
+    Args:
+        start: (3,) x, y [m] and heading [rad] at time 0.
+        time: () [s], of the last knot.
+        speed: (K + 1,) [m/s], at the knots.
+        curvature: (K + 1,) [1/m], at the knots.
+        samples: number of samples of each piece, static.
     """
     num, dtype = speed.shape[0] - 1, speed.dtype
     turned, weights = (jnp.asarray(each, dtype) for each in _weights(samples))
@@ -84,7 +93,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     whole = angle[:, -1]
     heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + angle
     direction = jnp.concatenate([jnp.cos(heading), jnp.sin(heading)])
-    # The only place where they are used: all else follows from sums over nodes.
+    # All else follows from these sums over the nodes.
     sums = jnp.matmul(direction, weights, precision=_HIGHEST).reshape(2, num, 9, samples)
     cos, sin = sums[:, :, 0]
     by_hat = sums[:, :, 1:3]  # (2, K, 2, S), integrals of the direction
@@ -92,13 +101,13 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     p0, p1, p2 = (v0 * aside[:, :, 0, k] + v1 * aside[:, :, 1, k] for k in range(3))  # (2, K, S)
     hat0, hat1 = by_hat[:, :, 0], by_hat[:, :, 1]
     local = step * (v0 * hat0 + v1 * hat1)
-    bent = (v0 * c0) * p0 + (v0 * c1 + v1 * c0) * p1 + (v1 * c1) * p2
+    stretch = (v0 * c0) * p0 + (v0 * c1 + v1 * c0) * p1 + (v1 * c1) * p2
     ends = local[:, :, -1]
     pos = start[:2, None, None] + (jnp.cumsum(ends, axis=1) - ends)[:, :, None] + local
     x, y = pos  # (K, S)
     at_ll, at_lr, at_rr = turned[:, 2::2]
     square = step * step
-    own = jnp.stack(  # x, y and heading of the samples by the five, (5, 3, K, S)
+    own = jnp.stack(  # x, y and heading of the samples by the five variables, (5, 3, K, S)
         [
             jnp.stack([*moved, turning])
             for moved, turning in (
@@ -106,7 +115,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
                 (step * hat1 + square * (c0 * p1 + c1 * p2), step * (at_lr * c0 + at_rr * c1)),
                 (square * (v0 * p0 + v1 * p1), step * (at_ll * v0 + at_lr * v1)),
                 (square * (v0 * p1 + v1 * p2), step * (at_lr * v0 + at_rr * v1)),
-                ((local + square * bent) / time, angle[:, 2::2] / time),
+                ((local + square * stretch) / time, angle[:, 2::2] / time),
             )
         ]
     )
@@ -115,8 +124,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # as twists, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # A later piece is changed by time all along, and by its left values also through what the
-    # piece before made of them.
+    # Time changes all pieces before a piece. The values at a piece's start also change the piece
+    # before it.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
@@ -152,69 +161,67 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     )
 
 
-def by_unknowns(way: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
-    """Gradient (n,) and curvature (n, n) of a cost by the unknowns, n = 2 K or 2 K + 1.
+def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
+    """Return half the gradient (n,) and Hessian (n, n) of a cost by the n unknowns.
 
-    Both halved, as `Quadratic` has them.
+    There are n = 2 K unknowns, or 2 K + 1 with a free time.
     """
-    num, samples = way.heading.shape
-    flat = way.slope.reshape(num, samples * 4, 8)
-    pushed = jnp.matmul(cost.stiffness, way.slope, precision=_HIGHEST).reshape(flat.shape)
+    num, samples = drive.heading.shape
+    flat = drive.slope.reshape(num, samples * 4, 8)
+    pushed = jnp.matmul(cost.stiffness, drive.slope, precision=_HIGHEST).reshape(flat.shape)
     pushed = jnp.concatenate([pushed, cost.push.reshape(num, -1, 1)], axis=2)
     seen = jnp.matmul(flat.swapaxes(1, 2), pushed, precision=_HIGHEST)  # (K, 8, 9)
     own = seen[:, :5, :5] + cost.piece_stiffness
     pull = seen[:, :5, 8] + cost.piece_push
 
-    def later(values: Array, by: int) -> Array:
-        """Those of `by` pieces on, zero past the end."""
+    def shift(values: Array, by: int) -> Array:
+        """Return for each piece the value of the piece `by` later, zero past the end."""
         if by >= num:
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
-    # Sums over all pieces from the second one after each knot on.
-    rest = later(jnp.cumsum(seen[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
+    # Sums over all pieces from the second one after each knot.
+    rest = shift(jnp.cumsum(seen[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
     lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
-    twist = way.right + later(way.left, 1)  # (K, 2, 3)
+    twist = drive.right + shift(drive.left, 1)  # (K, 2, 3)
     rigid = jnp.sum(rest[:, None, :, 5:8] * twist[:, :, None], axis=-1)  # (K, 2, 3)
-    next_left = later(seen[:, 5:, lefts], 1).swapaxes(1, 2)  # (K, 2, 3)
+    next_left = shift(seen[:, 5:, lefts], 1).swapaxes(1, 2)  # (K, 2, 3)
     own_right = seen[:, 5:, rights].swapaxes(1, 2)
-    beside = own[:, rights][:, :, lefts]  # (K, 2, 2), of a knot with the one before
-    same = own[:, rights][:, :, rights] + later(own[:, lefts][:, :, lefts], 1)
+    beside = own[:, rights][:, :, lefts]  # (K, 2, 2), of a knot with the knot before
+    same = own[:, rights][:, :, rights] + shift(own[:, lefts][:, :, lefts], 1)
 
-    def flattened(values: Array) -> Array:
-        """(K, 2, ...) in the order of the unknowns, (2 K, ...)."""
+    def flatten(values: Array) -> Array:
+        """Reorder (K, 2, ...) in the order of the unknowns, (2 K, ...)."""
         return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
 
     size = 2 * num
-    place = np.arange(size) % num
-    gap = place[:, None] - place
-    twists = flattened(twist)
+    knot = np.arange(size) % num
+    gap = knot[:, None] - knot
+    twists = flatten(twist)
 
     def product(left: Array) -> Array:
-        left = flattened(left)
+        left = flatten(left)
         x, y, turn = (left[:, None, k] * twists[None, :, k] for k in range(3))
         return x + y + turn
 
-    def banded(values: Array) -> Array:
-        """(K, 2, 2) as rows of the unknowns' knots, for all columns of either kind, (n, n)."""
-        return jnp.repeat(flattened(values), num, axis=1)
+    def spread(values: Array) -> Array:
+        """Repeat (K, 2, 2) for all columns of the same kind of unknown, (n, n)."""
+        return jnp.repeat(flatten(values), num, axis=1)
 
     lower = jnp.where(
         gap >= 2,
         product(rigid + next_left + own_right),
         jnp.where(
-            gap == 1,
-            product(rigid + next_left) + banded(beside),
-            product(rigid) + banded(same),
+            gap == 1, product(rigid + next_left) + spread(beside), product(rigid) + spread(same)
         ),
     )
     curvature = jnp.where(gap >= 0, lower, lower.T)
-    gradient = pull[:, rights] + later(pull[:, lefts], 1)
-    gradient = flattened(gradient + jnp.sum(twist * rest[:, None, :, 8], axis=-1))
+    gradient = pull[:, rights] + shift(pull[:, lefts], 1)
+    gradient = flatten(gradient + jnp.sum(twist * rest[:, None, :, 8], axis=-1))
     if not is_time_free:
         return gradient, curvature
-    with_time = own[:, rights, TIME] + later(own[:, lefts, TIME], 1)
-    with_time = flattened(with_time + jnp.sum(twist * rest[:, None, :, TIME], axis=-1))
+    with_time = own[:, rights, TIME] + shift(own[:, lefts, TIME], 1)
+    with_time = flatten(with_time + jnp.sum(twist * rest[:, None, :, TIME], axis=-1))
     last = jnp.sum(own[:, TIME, TIME])
     return (
         jnp.append(gradient, jnp.sum(pull[:, TIME])),

@@ -1,4 +1,4 @@
-"""The plan of an interception, and how compiled planners make it and set its status."""
+"""The plan of an interception, and functions that make it, check it and set its status."""
 
 import dataclasses
 
@@ -19,14 +19,14 @@ from planner_jax.task.intercept.terms import (
     meeting_terms,
 )
 
-_GRAZING = 5e-3  # [m], kept from obstacles, so that nothing is touched between two samples
+_GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between them
 
 
 @struct.dataclass
 class InterceptPlan(CarPlan):
-    """One plan, or a batch of plans with a leading axis on every leaf; it ends at the meeting."""
+    """One plan that ends at the meeting, or a batch of plans with a leading axis on every leaf."""
 
-    meeting: Array  # (2,) [m], the position of the target at the end, as the planner expects it
+    meeting: Array  # (2,) [m], expected position of the target at the end
 
 
 def make_plan(
@@ -36,21 +36,21 @@ def make_plan(
     curvature: Array,
     *,
     samples: int,
-    places: int,
+    points: int,
     steps: Array,
 ) -> InterceptPlan:
     """Make the plan of knots and check it against every limit of its case.
 
     The cost of the plan is the integral of the squared acceleration [m^2/s^3] [Qu2022, eq. 8a].
     Speed [m/s] and curvature [1/m] (K + 1,) are at equal knots up to the time () [s] of the end.
-    Obstacles are checked at `samples` of every piece, the lateral acceleration at `places`; both
-    are static. The plan took () int32 steps.
+    Obstacles are checked at `samples` points of every piece, the lateral acceleration at `points`;
+    both numbers are static. `steps` () int32 is the number of iterations.
     """
     drive = motion(case.start, time, speed, curvature, samples)
-    _, violation = limit_terms(case, time, speed, curvature, Weights(), places)
+    _, violation = limit_terms(case, time, speed, curvature, Weights(), points)
     _, missed = meeting_terms(case, drive, time, Weights())
-    bumped = (_GRAZING - jnp.min(clearance(case, drive))) / case.body.width
-    worst = jnp.maximum(jnp.maximum(violation, missed), bumped)
+    too_close = (_GRAZING - jnp.min(clearance(case, drive))) / case.body.width
+    worst = jnp.maximum(jnp.maximum(violation, missed), too_close)
     effort = jnp.sum((speed[1:] - speed[:-1]) ** 2) * (speed.shape[0] - 1) / time
     return InterceptPlan(
         cost=effort,
@@ -66,7 +66,7 @@ def make_plan(
 
 
 def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
-    """Make the unsolved plan of a case for which there is no other plan."""
+    """Make the unsolved plan of a case that has no other plan: constant speed and curvature."""
     return InterceptPlan(
         cost=jnp.zeros_like(case.time),
         violation=jnp.full_like(case.time, jnp.inf),
@@ -85,8 +85,8 @@ def explain(
 ) -> InterceptPlan:
     """Set the status of an unsolved plan to the reason why the case has no plan.
 
-    The status is `reason` () int32 if nothing is wrong with the case itself. `is_time_free` says
-    whether the target may be met before the case's time.
+    The status is `reason` () int32 unless the case itself is blocked or not finite. `is_time_free`
+    is true if the target may be met before the case's time.
     """
     is_start_blocked, is_goal_blocked = is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked

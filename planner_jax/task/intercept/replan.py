@@ -1,8 +1,8 @@
-"""Re-planning: from the plan that is being driven, for the path that the target is now expected on.
+"""Re-planning from the plan that is being driven, for a new expected path of the target.
 
 Between two observations of a target its expected path moves by centimetres, and so does the best
-trajectory. The rest of the previous plan is a guess from which a few steps of least squares
-suffice. Planning from scratch remains for cases that these steps do not solve.
+trajectory. From the remainder of the previous plan a few steps of least squares suffice. Cases that
+they do not solve are planned from scratch.
 """
 
 import dataclasses
@@ -30,29 +30,29 @@ from planner_jax.task.intercept.searches import Search, Warm, make_field, make_g
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanIntercept(Planner[Replanning, InterceptPlan]):
-    """Plans interceptions again from the previous plan; `SpacetimeIntercept.replanner` makes it.
+    """Planner of the remainder of interceptions; made by `SpacetimeIntercept.replanner`.
 
-    With less than `shortest` left until the meeting nothing is planned: the rest of the previous
-    plan is returned.
+    If less than `shortest` remains until the meeting, the remainder of the previous plan is
+    returned.
     """
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
     plan_type: ClassVar[type] = InterceptPlan
-    planner: Planner[InterceptCase, InterceptPlan]  # from scratch, by a `Search`
-    search: Search  # of that planner
-    problem: MotionProblem  # of that planner
+    planner: Planner[InterceptCase, InterceptPlan]  # plans from scratch, by a `Search`
+    search: Search  # of `planner`
+    problem: MotionProblem  # of `planner`
     warm: Warm = Warm()
     shortest: float = 0.1  # [s]
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One from the previous plan, then the first from scratch: others take too long."""
+        """One from the previous plan, then the first search from scratch: others take too long."""
         return (self.warm, self.search)
 
     @property
     def inner(self) -> Planner[InterceptCase, InterceptPlan]:
-        """The planner of the cases that are planned again."""
+        """The planner from scratch."""
         return self.planner
 
     def begin(
@@ -69,33 +69,38 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     ) -> Replanning:
         """Return the remainder of a case, or of a batch, some time into its plan.
 
-        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. `target` is
-        the expected path, with times that count from now, and `movers` are the moving obstacles at
-        this moment, by default moved on evenly. The car's `start` (3,) or (B, 3), x, y [m] and
-        heading [rad] of the rear axle, `speed` [m/s] and `curvature` [1/m], () or (B,), are by
-        default the plan's; speed and curvature are clipped to the car's limits.
+        Args:
+            cases: as for `pj.replan`, which also describes the errors.
+            previous: as for `pj.replan`.
+            elapsed: as for `pj.replan`.
+            target: the expected path; its times count from this moment.
+            movers: the moving obstacles at this moment; by default moved at their velocities.
+            start: (3,) or (B, 3) x, y [m] and heading [rad] of the rear axle; by default the
+                plan's.
+            speed: () or (B,) [m/s]; by default the plan's; clipped to the car's limits.
+            curvature: () or (B,) [1/m]; by default the plan's; clipped to the car's limits.
         """
         elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
         require_path("target", target, batch, 2)
         if movers is not None:
             require_kind("movers", movers, Obstacles)
             require_beginning("movers", movers, batch, f"the batch shape {batch}")
-        own = (_states if cases.batch_shape else _state)(previous, elapsed)
+        planned = (_states if cases.batch_shape else _state)(previous, elapsed)
         start, speed, curvature = (
-            resolve_argument(name, given, mine, elapsed)
-            for name, given, mine in zip(
-                ("start", "speed", "curvature"), (start, speed, curvature), own, strict=True
+            resolve_argument(name, value, default, elapsed)
+            for name, value, default in zip(
+                ("start", "speed", "curvature"), (start, speed, curvature), planned, strict=True
             )
         )
         limits = cases.limits
         speed = np.clip(speed, 0.0, limits.speed)
         curvature = np.clip(curvature, -np.asarray(limits.curvature), limits.curvature)
         if movers is None:
-            passed = cases.movers.velocity * elapsed[..., None, None]
-            movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + passed)
-        # A plan that was free to choose its time may choose a later one again.
+            moved = cases.movers.velocity * elapsed[..., None, None]
+            movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + moved)
+        # A planner that is free to choose the time may choose a later time than before.
         until = cases.time if self.problem.is_time_free else previous.time
-        left = dataclasses.replace(
+        remainder = dataclasses.replace(
             cases,
             start=start,
             speed=speed,
@@ -104,7 +109,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             time=np.maximum(np.asarray(until) - elapsed, 0.5 * self.shortest).astype(elapsed.dtype),
             movers=movers,
         )
-        return Replanning(case=left, previous=previous, elapsed=elapsed)
+        return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
         """Return the plan of one case."""
@@ -112,7 +117,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             return self.planner.solve(task.case, attempt)
         case, problem = task.case, self.problem
         time = jnp.maximum(task.previous.time - task.elapsed, 0.5 * self.shortest)
-        guess = problem.guess_at(problem.pack(*self._sample_rest(task, time), time))
+        guess = problem.guess_at(problem.pack(*self._sample_previous(task, time), time))
         grid = make_grid(case, self.search.lattice)
         stages = [
             dataclasses.replace(stage, steps=jnp.where(time < self.shortest, 0, stage.steps))
@@ -127,7 +132,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             return self.planner.solve_at_once(tasks.case, attempt)
         return super().solve_at_once(tasks, attempt)
 
-    def _sample_rest(self, task: Replanning, time: Array) -> tuple[Array, Array]:
+    def _sample_previous(self, task: Replanning, time: Array) -> tuple[Array, Array]:
         """Sample speed and curvature of the previous plan at the new knots 1..K, (K,) each."""
         previous, num = task.previous, self.problem.pieces
         at = task.elapsed + time * (jnp.arange(1, num + 1) / num)

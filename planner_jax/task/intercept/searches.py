@@ -1,4 +1,4 @@
-"""Searches for starting points of an interception: their sizes, and the reach set of a case."""
+"""Searches for starting points of an interception: their settings, and the reach set of a case."""
 
 import dataclasses
 
@@ -14,79 +14,86 @@ from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.terms import discs_of, wrapped
+from planner_jax.task.intercept.terms import discs_of, wrap
 
-# A path takes about as much memory as so many starts of planners with few unknowns.
-_ROOM = 8
-_ROOM_OF_WORD = 1 / 32768  # a word of a reach set takes as much memory as so many starts
+# Memory of a path, and of a word of a reach set, in units of a start of a planner of few unknowns.
+_PATH_STARTS = 8
+_WORD_STARTS = 1 / 32768
 _FIELD = 128  # nodes of the distance field along either side of the map
 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt at a case: a number of paths, and of steps from each; static."""
+    """An attempt at a case: random paths, and least squares from each; static."""
 
     starts: int = dataclasses.field(init=False, default=1)
-    ways: int = 16  # paths
-    solver: LevenbergConfig = LevenbergConfig()  # of the stage that keeps limits
-    following: int = 4  # steps that follow the path of cells
-    settling: int = 16  # steps towards less effort, or an earlier meeting
-    margin: float = 0.03  # [m], kept from obstacles
-    slack: float = 0.015  # share of every limit that is kept free
-    discs: int = 3  # that stand for the body in least squares
+    paths: int = 16  # number of paths
+    solver: LevenbergConfig = LevenbergConfig()  # of the stage that meets all limits
+    following: int = 4  # steps of the stage that follows the path of cells
+    settling: int = 16  # steps of the last stage, towards less effort or an earlier meeting
+    margin: float = 0.03  # [m], distance from obstacles at which hinges start
+    slack: float = 0.015  # share of every limit below it at which hinges start
+    discs: int = 3  # that cover the body in least squares
     seed: int = 0  # of the paths
-    drawn: int = 4  # paths for each that is tried: the smoothest of them
-    directness: float = 2.0  # of these paths; see `cell_paths.draw_path`
+    candidates: int = 4  # paths that are drawn for each path; the smoothest is used
+    directness: float = 2.0  # of paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
-    girth: float = 1.0  # of the body in the reach set; less finds paths that rounding closes
+    # Factor on the body's radius in the reach set. Below 1 it admits paths that the rounding to
+    # cells closes.
+    body_scale: float = 1.0
 
     def __post_init__(self) -> None:
-        if self.ways < 1:
-            raise ArgumentError("ways", ">= 1", self.ways)
+        if self.paths < 1:
+            raise ArgumentError("paths", ">= 1", self.paths)
         lattice = self.lattice
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
-        starts = max(_ROOM * self.ways, round(_ROOM_OF_WORD * words))
+        starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
         object.__setattr__(self, "starts", starts)
 
-    def draw_chances(self) -> cell_paths.Chance:
+    def draw_noise(self) -> cell_paths.PathNoise:
         """Draw the noise of every path; leaves have a leading axis for the paths."""
-        return cell_paths.draw_chance(self.lattice, self.ways, self.seed, self.drawn)
+        return cell_paths.draw_noise(self.lattice, self.paths, self.seed, self.candidates)
 
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """An attempt at re-planning: steps from the rest of the previous plan; static."""
+    """An attempt at re-planning: least squares from the remainder of the previous plan; static."""
 
     solver: LevenbergConfig = LevenbergConfig(8)
-    settling: int = 4  # steps towards less effort
-    margin: float = 0.03  # of a `Search`
+    settling: int = 4  # this and the other fields are as in `Search`
+    margin: float = 0.03
     slack: float = 0.015
     discs: int = 3
 
 
 _GIVEN = (
     Search(2, LevenbergConfig(10), following=3),
-    Search(4, LevenbergConfig(16), seed=1, girth=0.9),
-    Search(16, LevenbergConfig(24), seed=2, girth=0.75, drawn=1, directness=0.0),
+    Search(4, LevenbergConfig(16), seed=1, body_scale=0.9),
+    Search(16, LevenbergConfig(24), seed=2, body_scale=0.75, candidates=1, directness=0.0),
 )
 QUICK = tuple(
-    dataclasses.replace(search, ways=ways, solver=LevenbergConfig(steps), settling=12)
-    for search, ways, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
+    dataclasses.replace(search, paths=paths, solver=LevenbergConfig(steps), settling=12)
+    for search, paths, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
 )
-# A car that starts beside a wall has no room for margins: many paths, with next to no margin.
+# For a car that starts beside a wall: many paths with almost no margin.
 _NARROW = tuple(
-    Search(64, LevenbergConfig(60), seed=seed, girth=girth, margin=0.006, slack=1e-3, discs=7)
+    Search(64, LevenbergConfig(60), seed=seed, body_scale=girth, margin=0.006, slack=1e-3, discs=7)
     for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
 )
-BEST = (dataclasses.replace(_GIVEN[0], ways=8, settling=48), *_GIVEN[1:], *_NARROW)
-# If the time is free, every path is tried until it improves little, and the best one is selected.
-# Early meetings come out earlier if no step follows the cells.
+BEST = (dataclasses.replace(_GIVEN[0], paths=8, settling=48), *_GIVEN[1:], *_NARROW)
+# If the time is free, least squares run from every path until they improve little, and the best
+# plan is selected. Meetings are earlier if no stage follows the cells.
 _EARLY = Search(
-    32, LevenbergConfig(60, tolerance=5e-4), following=0, girth=0.85, drawn=1, directness=0.0
+    32,
+    LevenbergConfig(60, tolerance=5e-4),
+    following=0,
+    body_scale=0.85,
+    candidates=1,
+    directness=0.0,
 )
 _LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
 _LATER = (
-    Search(8, seed=1, girth=0.9),
+    Search(8, seed=1, body_scale=0.9),
     dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
 )
 SEARCHES = {
@@ -97,17 +104,17 @@ SEARCHES = {
 
 
 @struct.dataclass
-class Found:
-    """The parts of a case that all its paths share."""
+class Reachability:
+    """The grid, the distance field and the reach set of a case, which all its paths share."""
 
     grid: reach.Grid
     field: DistanceField  # of the walls
     reach: reach.ReachSet
-    layers: Array  # (layers + 1,) bool, at which a path of cells leads to the target
+    layers: Array  # (layers + 1,) bool, layers at which a path of cells meets the target
 
     @property
     def is_reached(self) -> Array:
-        """Whether a path of cells leads to the target, () bool."""
+        """Whether a path of cells meets the target, () bool."""
         return jnp.any(self.layers)
 
 
@@ -117,17 +124,17 @@ def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
 
 
 def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
-    """Make the field of distances from the walls, with some nodes for each cell."""
+    """Compute the distances from the walls, at one or more nodes for each cell."""
     spacing = grid.cell * (grid.lattice.cells / _FIELD)
     return distance_field(case.walls, grid.corner, spacing, _FIELD)
 
 
 def search_reach(
     case: InterceptCase, search: Search, *, is_time_free: bool, layers: Array | None = None
-) -> Found:
+) -> Reachability:
     """Compute the reach set of a case, by default for the layers up to the case's time.
 
-    `is_time_free` says whether earlier layers may meet the target.
+    `is_time_free` is true if earlier layers may meet the target.
     """
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)
@@ -138,7 +145,10 @@ def search_reach(
         case.limits.lateral_acceleration / jnp.maximum(level, 0.1 * case.limits.speed),
     )
     vehicle = reach.Vehicle(
-        radius=search.girth * radius, ahead=ahead, speed=case.limits.speed, turn_rates=turn_rates
+        radius=search.body_scale * radius,
+        ahead=ahead,
+        speed=case.limits.speed,
+        turn_rates=turn_rates,
     )
     needed = grid.num if layers is None else layers
     by = _FIELD // search.lattice.cells
@@ -150,7 +160,7 @@ def search_reach(
         reached = is_met(numbers) & (numbers >= 1) & (numbers <= grid.num)
     else:
         reached = is_met(grid.num[None])[0] & (numbers == grid.num)
-    return Found(grid=grid, field=field, reach=found, layers=reached)
+    return Reachability(grid=grid, field=field, reach=found, layers=reached)
 
 
 def _meeting_cells(
@@ -161,28 +171,32 @@ def _meeting_cells(
     num = grid.lattice.headings
     width = 2.0 * np.pi / num
     angle = grid.heading + width * jnp.arange(num)
-    headings = jnp.abs(wrapped(angle - case.end_heading)) <= case.heading_tolerance + width
+    headings = jnp.abs(wrap(angle - case.end_heading)) <= case.heading_tolerance + width
     return reach.goal_cells(grid, found.bits[layer], goal, case.body.middle, headings)
 
 
 def draw_cell_path(
-    case: InterceptCase, found: Found, layer: Array, chance: cell_paths.Chance, directness: float
+    case: InterceptCase,
+    found: Reachability,
+    layer: Array,
+    noise: cell_paths.PathNoise,
+    directness: float,
 ) -> cell_paths.CellPath:
     """Draw a random path of cells that meets the target at a layer () int32."""
-    cells, there = _meeting_cells(case, found.grid, found.reach, layer)
-    draw = cell_paths.draw_smooth_path
-    return draw(found.grid, found.reach, layer, cells, there, chance, directness)
+    cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
+    draw = cell_paths.draw_path
+    return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)
 
 
-# Written out, since published cases are drawn by it.
-_ARRIVAL = Search(ways=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), girth=1.0)
+# All values are explicit: published cases depend on them.
+_ARRIVAL = Search(paths=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), body_scale=1.0)
 
 
 def earliest_arrival(case: InterceptCase) -> Array:
-    """Return the time () [s] of the first layer of a reach set at which one case's target is met.
+    """Return the time () [s] of the first layer of a reach set that meets one case's target; pure.
 
-    The layers are half a second apart where the case's time is 10 s. Infinite where no layer up to
-    that time meets the target; pure. No path is drawn, and nothing is optimised.
+    The layers are about half a second apart if the case's time is 10 s. The result is infinite if
+    no layer up to that time meets the target. No path is drawn, and nothing is optimised.
     """
     found = search_reach(case, _ARRIVAL, is_time_free=True)
     first = jnp.argmax(found.layers).astype(case.time.dtype)

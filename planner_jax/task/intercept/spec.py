@@ -1,4 +1,4 @@
-"""What the registry knows of interceptions; imports no JAX."""
+"""Specification of the task `intercept` for the registry; imports no JAX."""
 
 import dataclasses
 
@@ -7,27 +7,25 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """One kind of interception: how much stands and moves in the way, and how much time there is.
+    """A kind of interception: numbers of obstacles, and the time of the meeting.
 
-    The shapes of a suite's arrays depend on its room alone, so that all of its cases share a
-    compiled program.
+    The shapes of a suite's arrays depend on its rooms only, so that all its cases share a compiled
+    program.
     """
 
     description: str
-    num_walls: tuple[int, int]  # fewest and most; of a maze, of the walls across the map
+    num_walls: tuple[int, int]  # fewest and most; in a maze, of walls across the map
     num_movers: tuple[int, int]  # fewest and most
     mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s]
-    time: float = 10.0  # [s], when the target is to be met
-    # [s], if the target is to be met earlier: so long after a reach set first meets it.
-    spare: float | None = None
+    time: float = 10.0  # [s], of the meeting
+    spare: float | None = None  # [s]; if not None, the meeting is so long after a reach set's first
     is_maze: bool = False
-    # How many polygons of how many corners the arrays hold.
-    wall_room: tuple[int, int] = (12, 6)
+    wall_room: tuple[int, int] = (12, 6)  # numbers of polygons and corners that the arrays hold
     mover_room: tuple[int, int] = (4, 6)
-    num_targets: tuple[int, int] = (1, 1)  # fewest and most, for which there is room
+    num_targets: tuple[int, int] = (1, 1)  # fewest and most
 
 
-# The other ranges are those of `planner_jax.task.intercept.suites`.
+# `planner_jax.task.intercept.suites` has the other ranges.
 SUITES = {
     "easy": Suite("Four to six walls and one mover.", (4, 6), (1, 1)),
     "medium": Suite("Seven to nine walls, two or three movers.", (7, 9), (2, 3)),
@@ -48,7 +46,7 @@ SUITES = {
         is_maze=True,
     ),
     "rush": Suite(
-        "What stands and moves in `hard`, to be met 0.5 s after a reach set first meets it.",
+        "The obstacles of `hard`; the meeting is 0.5 s after a reach set first meets the target.",
         (10, 12),
         (3, 4),
         spare=0.5,

@@ -1,8 +1,8 @@
 """Named, seeded suites of interceptions on a map of 8 m x 8 m.
 
-[Qu2022] shows one map of its own (Section V) and gives no ranges. The ranges here and in
-`planner_jax.task.intercept.spec` are this library's, and part of each suite's name: a change of a
-range is another suite. All draws are uniform; the car is the default of `case`; SI units.
+[Qu2022] shows one map (Section V) and states no ranges. The ranges here and in
+`planner_jax.task.intercept.spec` are this library's. They are fixed for each name of a suite: other
+ranges need another name. All draws are uniform; the car is the default of `case`; SI units.
 
 | what | drawn from |
 |---|---|
@@ -12,20 +12,20 @@ range is another suite. All draws are uniform; the car is the default of `case`;
 | walls | 3 to 6 corners on a circle of 0.2 to 0.8 m anywhere on the map |
 | movers | 4 to 6 corners on a circle of 0.2 to 0.4 m, 0.1 to 0.6 m/s (`storm`: 0.2 to 1 m/s) |
 
-A mover's middle crosses the straight line from start to meeting point at 0.2 to 0.8 of the time,
-in any direction, at the point where a car that drives evenly along that line is then.
+A mover crosses the straight line from start to meeting point in any direction at 0.2 to 0.8 of the
+time. Its middle is then at the point of a car that drives along this line at constant speed.
 
 A maze has walls of 0.2 m across the whole map, each with a gap of 0.7 to 1.1 m. Two arms of 0.5
 to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end where the straight line to
-the meeting point runs into a wall, or at the nearest position that leaves the gap alone; walls less
-than 2.5 m from the map's edge have none, so that the start has room to turn.
+the meeting point runs into a wall, or at the nearest position that leaves the gap open. Walls less
+than 2.5 m from the map's edge have no arms, so that the start has room to turn.
 
-The suite `rush` draws the cases of `hard` with a tag of its own. The time to meet the target is not
-10 s, but 0.5 s after the first layer of the reach set (`searches.earliest_arrival`, in double
-precision), so that it differs from case to case.
+The suite `rush` draws the cases of `hard` with a seed of its own. Its meeting is not at 10 s, but
+0.5 s after the first layer of the reach set that meets the target (`searches.earliest_arrival`, in
+double precision), so that the time differs from case to case.
 
-Whether the target turns and how many walls and movers there are is drawn once a case. The rest is
-drawn again until no cause of rejection (`_APPLIES`) applies.
+Whether the target turns, and the numbers of walls and movers, are drawn once for each case. All
+else is drawn again until no cause of rejection (`_APPLIES`) applies.
 
 Draws are dictionaries of arrays with leading axis B: "start" and "meeting" (B, 2) [m], of the rear
 axle's middle and of the target; the "time" (B,) [s] of the meeting, and whether the target is
@@ -60,24 +60,24 @@ BODY_MIDDLE = 0.15  # [m], ahead of the rear axle
 START_ROOM = 0.35  # [m], from the body's middle at the start to walls and movers
 MEETING_ROOM = 0.4  # [m], from the meeting point to walls and movers
 TARGET_ROOM = 0.05  # [m], from the target to walls
-BODY_ROOM = 0.13  # [m], from the middle of a body that drives to walls: half its width
-_STEP = 0.1  # [s], between the positions of a target that are tested
-_CELL = 0.1  # [m], side of a cell of the grid
+BODY_ROOM = 0.13  # [m], from the middle of the driving body to walls: half its width
+_STEP = 0.1  # [s], between tested positions of a target
+_CELL = 0.1  # [m], side of a cell of the grid on which paths are tested
 START_X, START_SPEED = 0.8, 0.5  # [m], [m/s]
 EDGE_ROOM = 0.3  # [m], from the meeting point to the edge of the map
 THICKNESS = 0.2  # [m], of a maze's walls
-_SHAPE = 9  # numbers that a polygon takes: radius, corners, rotation, and six angles
+_SHAPE = 9  # random numbers for a polygon: radius, number of corners, rotation, six angles
 
 Draws = dict[str, np.ndarray]  # leaves with leading axis B; see above
 
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """Cases of a suite, and the number of draws that they took."""
+    """Cases of a suite, and the numbers of draws that they took."""
 
     cases: InterceptCase  # leaves with leading axis B
-    draws: np.ndarray  # (B,) int, the accepted one included
-    rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws to which it was the first to apply
+    draws: np.ndarray  # (B,) int, including the accepted draw
+    rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws that it rejected first
 
 
 def drawn(
@@ -85,60 +85,60 @@ def drawn(
 ) -> Drawn:
     """Draw a batch of cases of a suite in float64, cast it, and count the rejected draws.
 
-    Arguments and errors are those of `pj.hit.draw`; `suite` is a key of `SUITES`.
+    Arguments and errors are as for `pj.hit.draw`; `suite` is a key of `SUITES`.
     """
     require_name(SUITES, "suite", suite)
     own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
-    accepted, draws, rejected = accepted_draws(own, randoms)
-    return Drawn(cases=cases_of(accepted, dtype), draws=draws, rejected=rejected)
+    accepted, counts, rejected = draw_accepted(own, randoms)
+    return Drawn(cases=cases_of(accepted, dtype), draws=counts, rejected=rejected)
 
 
-def accepted_draws(
+def draw_accepted(
     own: Suite, randoms: list[np.random.Generator]
 ) -> tuple[Draws, np.ndarray, dict[str, np.ndarray]]:
-    """Return the first draw of every generator to which no cause of rejection applies.
+    """Draw from every generator until no cause of rejection applies.
 
     Returns:
-        accepted: (B,) draws.
-        draws: as of `Drawn`.
-        rejected: as of `Drawn`.
+        accepted: the last draw of each of the B generators.
+        counts: (B,) int, `Drawn.draws`.
+        rejected: `Drawn.rejected`.
     """
     num = len(randoms)
     kinds = np.stack([random.random(3) for random in randoms])
-    pending, draws = np.arange(num), np.zeros(num, int)
+    pending, counts = np.arange(num), np.zeros(num, int)
     rejected = np.zeros((len(CAUSES), num), int)
     accepted: Draws = {}
     while len(pending):
-        uniform = np.stack([randoms[k].random(_columns(own)) for k in pending])
+        uniform = np.stack([randoms[k].random(_count_numbers(own)) for k in pending])
         candidates = _candidates(own, kinds[pending], uniform)
         cause = first_cause(own, candidates)
         if own.spare is not None and (good := np.flatnonzero(cause == len(CAUSES))).size:
-            some = _hurried(own, {name: leaf[good] for name, leaf in candidates.items()})
+            some = _shorten_time(own, {name: leaf[good] for name, leaf in candidates.items()})
             cause[good] = first_cause(own, some)
             for name, leaf in some.items():
                 candidates[name][good] = leaf
-        draws[pending] += 1
+        counts[pending] += 1
         is_good = cause == len(CAUSES)
         rejected[cause[~is_good], pending[~is_good]] += 1
         for name, leaf in candidates.items():
-            kept = accepted.setdefault(name, np.zeros((num, *leaf.shape[1:]), leaf.dtype))
-            kept[pending[is_good]] = leaf[is_good]
+            stored = accepted.setdefault(name, np.zeros((num, *leaf.shape[1:]), leaf.dtype))
+            stored[pending[is_good]] = leaf[is_good]
         pending = pending[~is_good]
-    return accepted, draws, dict(zip(CAUSES, rejected, strict=True))
+    return accepted, counts, dict(zip(CAUSES, rejected, strict=True))
 
 
-def _columns(suite: Suite) -> int:
-    """Return how many numbers one draw takes."""
+def _count_numbers(suite: Suite) -> int:
+    """Return the number of random numbers of one draw."""
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
 def _between(uniform: np.ndarray, low: float | np.ndarray, high: float) -> np.ndarray:
-    """Spread numbers of [0, 1) over an interval."""
+    """Map numbers of [0, 1) to an interval."""
     return low + uniform * (high - low)
 
 
-def _whole(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
-    """Turn numbers of [0, 1) into whole ones from the fewest to the most."""
+def _integer(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
+    """Map numbers of [0, 1) to integers from the fewest to the most."""
     return np.floor(_between(uniform, fewest, most + 1)).astype(int)
 
 
@@ -148,12 +148,13 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Make one draw for each of B cases, from numbers of [0, 1).
+    """Make one draw for each of B cases from numbers of [0, 1).
 
-    `kinds` (B, 3) holds for all draws of a case, `uniform` (B, `_columns(suite)`) for this draw.
+    `kinds` (B, 3) are the same for all draws of a case; `uniform` has the shape
+    (B, `_count_numbers(suite)`).
     """
-    turning, count_walls = kinds[:, 0] < 0.5, _whole(kinds[:, 1], *suite.num_walls)
-    count_movers = _whole(kinds[:, 2], *suite.num_movers)
+    turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
+    count_movers = _integer(kinds[:, 2], *suite.num_movers)
     cuts = np.cumsum([7, suite.wall_room[0] * (2 + _SHAPE)])
     u, walls, movers = np.split(uniform, cuts, axis=1)
     start = np.stack([np.full(len(u), START_X), _between(u[:, 0], 1.0, SIZE - 1.0)], axis=1)
@@ -170,8 +171,8 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
     target = target_to(meeting, suite.time, turning, u[:, 3:7])
     movers = movers.reshape(len(u), suite.mover_room[0], 3 + _SHAPE)
     when = suite.time * _between(movers[..., 2], 0.2, 0.8)
-    way = (meeting - start)[:, None]
-    crossing = start[:, None] + (when / suite.time)[..., None] * way
+    line = (meeting - start)[:, None]
+    crossing = start[:, None] + (when / suite.time)[..., None] * line
     velocity = _between(movers[..., 0], *suite.mover_speed)[..., None]
     velocity = velocity * _unit(2.0 * np.pi * movers[..., 1])
     middle = crossing - velocity * when[..., None]
@@ -190,32 +191,32 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
 
 
 def anywhere(uniform: np.ndarray) -> np.ndarray:
-    """Return positions (..., 2) [m] at which targets may be met, from numbers of [0, 1)."""
+    """Map numbers (..., 2) of [0, 1) to meeting points [m] on the map."""
     return _between(uniform, EDGE_ROOM, SIZE - EDGE_ROOM)
 
 
 def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Return the parts of draws for targets at positions (B, 2) [m] at a time [s].
+    """Return the entries of draws for targets that are at `meeting` (B, 2) [m] at a time [s].
 
-    They are drawn by numbers (B, 4) of [0, 1); `turning` (B,) bool says whether they turn.
+    Targets turn if `turning` (B,) bool; `uniform` (B, 4) are numbers of [0, 1).
     """
     side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
     rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
     angle, speed = 2.0 * np.pi * uniform[:, 0], _between(uniform[:, 1], 0.2, 0.5)
-    pos = meeting - _moved(angle, speed, rate, np.full(len(meeting), time))
+    pos = meeting - _displace(angle, speed, rate, np.full(len(meeting), time))
     return {"pos": pos, "angle": angle, "speed": speed, "rate": rate}
 
 
-def _hurried(suite: Suite, drawn: Draws) -> Draws:
-    """Return draws with an earlier meeting, and whether the reach set meets the target at all."""
+def _shorten_time(suite: Suite, drawn: Draws) -> Draws:
+    """Return draws with an earlier meeting, and whether the target can be "reached" by then."""
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(drawn, jnp.float64))
         num = len(drawn["time"])
         arrivals = np.array([float(_earliest(take(cases, k))) for k in range(num)])
     reached = np.isfinite(arrivals)
     time = np.where(reached, arrivals + suite.spare, drawn["time"])
-    way = _moved(drawn["angle"], drawn["speed"], drawn["rate"], time)
-    return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + way}
+    moved = _displace(drawn["angle"], drawn["speed"], drawn["rate"], time)
+    return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + moved}
 
 
 # One case at a time, so that the result does not depend on the batch.
@@ -227,17 +228,17 @@ def _polygons(
 ) -> np.ndarray:
     """Make convex polygons (..., 6, 2) [m] around the origin from `_SHAPE` numbers each.
 
-    Their corners lie on a circle, counter-clockwise; the last one is repeated.
+    The corners lie on a circle, counter-clockwise; the last corner is repeated.
     """
-    size, num = _between(uniform[..., 0], *radius), _whole(uniform[..., 1], *corners)[..., None]
-    place = np.minimum(np.arange(6), num - 1)
-    shift = 0.6 * np.take_along_axis(uniform[..., 3:], place, axis=-1)
-    angle = 2.0 * np.pi * (place + shift + uniform[..., 2, None]) / num
+    size, num = _between(uniform[..., 0], *radius), _integer(uniform[..., 1], *corners)[..., None]
+    index = np.minimum(np.arange(6), num - 1)
+    shift = 0.6 * np.take_along_axis(uniform[..., 3:], index, axis=-1)
+    angle = 2.0 * np.pi * (index + shift + uniform[..., 2, None]) / num
     return size[..., None, None] * _unit(angle)
 
 
 def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Return positions on the x axis (B, 3) [m] of a maze's walls, from a number each."""
+    """Map numbers (B, 3) of [0, 1) to the x positions [m] of a maze's walls."""
     even = np.where((count == 2)[:, None], [2.9, 5.5, SIZE], [2.2, 4.1, 6.0])
     return even + _between(uniform, -0.2, 0.2)
 
@@ -245,10 +246,10 @@ def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _maze(
     uniform: np.ndarray, across: np.ndarray, count: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (B, 12, 6, 2) [m] of a maze's polygons, and which are present, (B, 12).
+    """Return corners (B, 12, 6, 2) [m] of a maze's polygons, and whether they exist, (B, 12).
 
-    The `count` walls stand at `across` (B, 3) [m]; straight lines from start to end run into dead
-    ends. Of `uniform` (B, 12, M) the first three rows are used.
+    The first `count` (B,) walls at `across` (B, 3) [m] exist. Straight lines from start to end run
+    into dead ends. The first three rows of `uniform` (B, 12, M) are used.
     """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
@@ -256,7 +257,7 @@ def _maze(
     outer = mouth + THICKNESS
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
-    # The line's position, or the nearest one on either side of the gap that is wide enough.
+    # The line's position, or the nearest position beside the gap that leaves enough space.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)
@@ -276,7 +277,7 @@ def _maze(
 
 
 def _boxes(left, low, right, high) -> np.ndarray:
-    """Return corners (B, N, 6, 2) of upright rectangles with sides (B, N), the last repeated."""
+    """Return corners (B, N, 6, 2) of axis-aligned rectangles; the last corner is repeated."""
     x = np.stack([left, right, right, left, left, left], axis=-1)
     y = np.stack([low, low, high, high, high, high], axis=-1)
     return np.stack([x, y], axis=-1)
@@ -319,7 +320,7 @@ def cases_of(drawn: Draws, dtype: DTypeLike) -> InterceptCase:
     )
 
 
-def _moved(angle, speed, rate, time) -> np.ndarray:
+def _displace(angle, speed, rate, time) -> np.ndarray:
     """Return the displacement (..., 2) [m] of targets with direction `angle` at time 0."""
     half = 0.5 * rate * time
     direction, chord = angle + half, speed * time * np.sinc(half / np.pi)
@@ -330,7 +331,7 @@ def _path(suite: Suite, drawn: Draws) -> np.ndarray:
     """Return positions (B, M, 2) [m] of the targets from time 0 to the meeting."""
     times = np.linspace(0.0, drawn["time"], round(suite.time / _STEP) + 1, axis=1)
     angle, speed, rate = (drawn[name][:, None] for name in ("angle", "speed", "rate"))
-    return drawn["pos"][:, None] + _moved(angle, speed, rate, times)
+    return drawn["pos"][:, None] + _displace(angle, speed, rate, times)
 
 
 def _is_off_map(suite: Suite, drawn: Draws) -> np.ndarray:
@@ -345,7 +346,7 @@ def _middle(drawn: Draws) -> np.ndarray:
 
 
 def _is_too_far(_: Suite, drawn: Draws) -> np.ndarray:
-    """Return whether the greatest speed does not suffice, (B,)."""
+    """Return whether a straight drive at the greatest speed takes too long, (B,)."""
     distance = drawn["meeting"] - _middle(drawn)
     return np.linalg.norm(distance, axis=1) > TOP_SPEED * drawn["time"]
 
@@ -353,16 +354,16 @@ def _is_too_far(_: Suite, drawn: Draws) -> np.ndarray:
 def _room(
     drawn: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,)."""
+    """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,) [s]."""
     corners, points = drawn[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
         times = np.broadcast_to(times, len(points))[:, None, None, None]
         corners = corners + times * drawn["velocity"][:, :, None]
     least = np.full(len(points), np.inf)
     for k in range(corners.shape[1]):
-        there = drawn[f"{kind} present"][:, k]
-        far = _distance(points[there], corners[there, None, k])
-        least[there] = np.minimum(least[there], far.min(axis=1))
+        present = drawn[f"{kind} present"][:, k]
+        far = _distance(points[present], corners[present, None, k])
+        least[present] = np.minimum(least[present], far.min(axis=1))
     return least
 
 
@@ -380,11 +381,11 @@ def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.where(left_of.all(axis=-1), 0.0, np.sqrt(gap))
 
 
-def _is_parted(_: Suite, drawn: Draws) -> np.ndarray:
-    """Return whether walls part the start from the meeting point, (B,)."""
+def _is_separated(_: Suite, drawn: Draws) -> np.ndarray:
+    """Return whether walls separate the start from the meeting point for a disc, (B,)."""
     count = round(SIZE / _CELL)
     middles = (np.arange(count) + 0.5) * _CELL
-    parted = np.zeros(len(drawn["start"]), bool)
+    separated = np.zeros(len(drawn["start"]), bool)
     for k, ends in enumerate(np.stack([_middle(drawn), drawn["meeting"]], axis=1)):
         free = np.ones((count, count), bool)
         for corners in drawn["walls"][k][drawn["walls present"][k]]:
@@ -397,12 +398,12 @@ def _is_parted(_: Suite, drawn: Draws) -> np.ndarray:
             free[box] &= _distance(points, corners) > BODY_ROOM
         parts = np.zeros(free.shape, np.int32)
         ndimage.label(free, np.ones((3, 3)), output=parts)
-        here, there = parts[tuple((ends / _CELL).astype(int).T)]
-        parted[k] = here != there
-    return parted
+        first_part, last_part = parts[tuple((ends / _CELL).astype(int).T)]
+        separated[k] = first_part != last_part
+    return separated
 
 
-# Cause of rejection -> whether it applies, (B,), in the order in which the causes are tested.
+# Cause of rejection -> whether it applies, (B,), in the order of the tests.
 _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "target off the map": _is_off_map,
     "start near a wall": lambda _, drawn: _room(drawn, "walls", _middle(drawn)) < START_ROOM,
@@ -414,19 +415,19 @@ _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "mover at the meeting": lambda _, drawn: (
         _room(drawn, "movers", drawn["meeting"], drawn["time"]) < MEETING_ROOM
     ),
-    "too far": _is_too_far,  # straight on at its greatest speed
-    "no way": _is_parted,  # for a disc as wide as the car
+    "too far": _is_too_far,  # at the greatest speed
+    "no way": _is_separated,  # for a disc of the car's width
     "out of reach": lambda _, drawn: ~drawn["reached"],  # by a layer of the reach set
 }
 CAUSES = tuple(_APPLIES)
 
 
 def first_cause(suite: Suite, drawn: Draws) -> np.ndarray:
-    """Return the index (B,) in `CAUSES` of the first cause that applies; their number if none."""
+    """Return the index (B,) in `CAUSES` of the first cause that applies; len(CAUSES) if none."""
     cause = np.full(len(drawn["start"]), len(CAUSES))
     alive = np.arange(len(cause))
-    for place, applies in enumerate(_APPLIES.values()):
-        found = applies(suite, {name: leaf[alive] for name, leaf in drawn.items()})
-        cause[alive[found]] = place
-        alive = alive[~found]
+    for index, applies in enumerate(_APPLIES.values()):
+        rejected = applies(suite, {name: leaf[alive] for name, leaf in drawn.items()})
+        cause[alive[rejected]] = index
+        alive = alive[~rejected]
     return cause

@@ -1,4 +1,4 @@
-"""What an interception costs: hinges on limits, obstacles and the miss, with their slopes."""
+"""The cost of an interception: hinges on limits, obstacles and the miss, with derivatives."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -13,47 +13,40 @@ from planner_jax.plane.distance_field import DistanceField
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 from planner_jax.robot.car import CarBody
 from planner_jax.task.intercept.case import InterceptCase
-from planner_jax.task.intercept.motion import (
-    C_LEFT,
-    C_RIGHT,
-    TIME,
-    V_LEFT,
-    V_RIGHT,
-    Motion,
-)
+from planner_jax.task.intercept.motion import C_LEFT, C_RIGHT, TIME, V_LEFT, V_RIGHT, Motion
 
 _HIGHEST = lax.Precision.HIGHEST
 
 
 @struct.dataclass
 class Weights:
-    """Of the squares, and where the hinges among them set in.
+    """Weights of the squared residuals, and the thresholds of hinges.
 
-    Costs are made comparable by the limits themselves.
+    Residuals on limits are relative to the limit.
     """
 
-    miss: float = 300.0  # of the distance to the target over its tolerance of 0.05 m
+    miss: float = 300.0  # of the distance to the target at the end [1/m^2]
     obstacle: float = 1e3
     limit: float = 1e3
-    effort: float = 0.064  # of the squared acceleration's integral over time
-    early: float = 300.0  # of the share of the case's time until the meeting, where it is free
-    turning: float = 3e-3  # the same of the change of curvature
-    follow: float = 0.0  # of the squared distance at knots from the places of a guess [1/m^2]
-    margin: float = 0.03  # [m], kept from obstacles
-    slack: float = 0.015  # share of every limit that is kept free
+    effort: float = 0.064  # of the integral of the squared acceleration
+    early: float = 300.0  # of the meeting time over the case's time, if the time is free
+    turning: float = 3e-3  # of the integral of the squared rate of curvature
+    follow: float = 0.0  # of the distance at knots from the positions of a guess [1/m^2]
+    margin: float = 0.03  # [m], distance from obstacles at which hinges start
+    slack: float = 0.015  # share of every limit below it at which hinges start
 
 
-def wrapped(angle: Array) -> Array:
-    """An angle between -pi and pi [rad]."""
+def wrap(angle: Array) -> Array:
+    """Return the equal angle [rad] between -pi and pi."""
     return angle - 2.0 * np.pi * jnp.round(angle / (2.0 * np.pi))
 
 
 def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
-    """Radius () and places ahead of the rear axle (num,) [m] of discs that cover the body."""
+    """Return radius () and distances ahead of the rear axle (num,) [m] of discs over the body."""
     half = 0.5 * body.length / num
     radius = jnp.sqrt(half**2 + (0.5 * body.width) ** 2)
-    places = np.arange(1 - num, num, 2)
-    return radius, body.middle + half * jnp.asarray(places, body.length.dtype)
+    steps = np.arange(1 - num, num, 2)
+    return radius, body.middle + half * jnp.asarray(steps, body.length.dtype)
 
 
 def limit_terms(
@@ -62,13 +55,15 @@ def limit_terms(
     speed: Array,
     curvature: Array,
     weights: Weights,
-    places: int,
+    points: int,
 ) -> tuple[Array, Array]:
-    """Hinges on the car's limits, and effort.
+    """Compute the hinges on the car's limits, and the effort.
+
+    The lateral acceleration is checked at a static number of points of every piece.
 
     Returns:
-        squares: (K, 6, 6), of every piece the products of its residuals' slopes by what it is
-            changed by, see `motion`, and of the residuals, which are the last of the six.
+        squares: (K, 6, 6), for every piece the sum over its residuals r of w g g', where g holds
+            the derivatives of r by the five variables of the piece (see `motion`), and r itself.
         violation: (), largest relative excess.
     """
     limits, dtype = case.limits, speed.dtype
@@ -76,7 +71,7 @@ def limit_terms(
     none = jnp.zeros_like(speed[1:])
     v, c = speed[1:], curvature[1:]
     acceleration = (v - speed[:-1]) * rate
-    # The steering angle changes quickest where the curvature is least.
+    # The steering angle changes fastest where the curvature is least.
     flat = jnp.where(c * curvature[:-1] > 0.0, jnp.minimum(c**2, curvature[:-1] ** 2), 0.0)
     gain = case.body.wheelbase / (1.0 + case.body.wheelbase**2 * flat) * rate
     steering = gain * (c - curvature[:-1])
@@ -89,13 +84,13 @@ def limit_terms(
         excesses.append(excess)
         squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
 
-    # Between 0 and the limit: as far from the middle as half of it.
+    # The speed is between 0 and its limit: at most half the limit from their middle.
     hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, {V_RIGHT: 1.0})
     hinge(c, limits.curvature, {C_RIGHT: 1.0})
     by = {V_LEFT: -rate, V_RIGHT: rate, TIME: -acceleration / time}
     hinge(acceleration, limits.acceleration, by)
     hinge(steering, limits.steering_rate, {C_LEFT: -gain, C_RIGHT: gain, TIME: -steering / time})
-    for share in (np.arange(places) + 1.0) / places:  # of every piece
+    for share in (np.arange(points) + 1.0) / points:  # of every piece
         fast, bend = (share * each[1:] + (1.0 - share) * each[:-1] for each in (speed, curvature))
         by_speed, by_curvature = 2.0 * fast * bend, fast**2
         by = {
@@ -115,46 +110,49 @@ def limit_terms(
 
 
 class SumOfSquares:
-    """Products of residuals' slopes, added up one by one: zeros cost nothing."""
+    """The sum over residuals r of w g g', where g holds the derivatives of r, and r itself.
 
-    def __init__(self, size: int):
-        """Of so many numbers that a residual has: its slopes, and itself."""
-        self._size, self._sums = size, {}
+    Only the entries of g that may differ from zero are multiplied.
+    """
 
-    def add(self, row: Mapping[int, Array | float], weight: Array | float) -> None:
-        """Add the products of one residual's numbers, those that are not zero."""
+    def __init__(self, size: int, sums: dict[tuple[int, int], Array] | None = None):
+        """Start from the sums of the entries (a, b), a <= b, of a matrix of a size."""
+        self._size, self._sums = size, dict(sums or {})
+
+    def add(self, row: Mapping[int, Array | float], weight: Array | float = 1.0) -> None:
+        """Add the products of the entries of one residual's g, by their indices."""
         for a, left in row.items():
             for b, right in row.items():
                 if a <= b:
                     self._sums[a, b] = self._sums.get((a, b), 0.0) + weight * (left * right)
 
     def matrix(self, like: Array) -> Array:
-        """The sums (..., size, size) of arrays that broadcast to `like`."""
-        places = range(self._size)
+        """Return the sums as a matrix (..., size, size), broadcast to the shape of `like`."""
+        indices = range(self._size)
         sums = [
             jnp.broadcast_to(self._sums.get((min(a, b), max(a, b)), 0.0), like.shape)
-            for a in places
-            for b in places
+            for a in indices
+            for b in indices
         ]
         stacked = jnp.stack(sums).astype(like.dtype)
         return jnp.moveaxis(stacked.reshape(self._size, self._size, *like.shape), (0, 1), (-2, -1))
 
 
 def meeting_terms(
-    case: InterceptCase, way: Motion, time: Array, weights: Weights
+    case: InterceptCase, drive: Motion, time: Array, weights: Weights
 ) -> tuple[Array, Array]:
-    """Miss and heading at the end.
+    """Compute the miss and the hinge on the heading at the end.
 
     Returns:
-        squares: (5, 5), products of the residuals' slopes by x, y, heading and time of the last
-            sample, and of the residuals, which are the last of the five.
+        squares: (5, 5), the sum over residuals r of w g g', where g holds the derivatives of r by
+            x, y, heading and time of the last sample, and r itself.
         violation: (), largest relative excess.
     """
-    pos, heading, direction = way.pos[-1, -1], way.heading[-1, -1], way.direction[-1, -1]
+    pos, heading, direction = drive.pos[-1, -1], drive.heading[-1, -1], drive.direction[-1, -1]
     target = case.target.at(time)
     aside = jnp.stack([-direction[1], direction[0]])
     miss = pos + case.body.middle * direction - target.pos
-    off = wrapped(heading - case.end_heading)
+    off = wrap(heading - case.end_heading)
     turned = jnp.abs(off) / case.heading_tolerance - 1.0
     over = jnp.where(case.heading_tolerance < np.pi, jnp.maximum(turned + 0.1, 0.0), 0.0)
     sign = jnp.where(over > 0.0, jnp.sign(off), 0.0) / case.heading_tolerance
@@ -167,13 +165,13 @@ def meeting_terms(
     return squares, jnp.maximum(missed, turned)
 
 
-def following_terms(way: Motion, places: Array, weights: Weights) -> Array:
-    """Distance from places (K, 2) [m] at the end of every piece.
+def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
+    """Compute the distances from positions (K, 2) [m] at the end of every piece.
 
     Returns:
-        squares: (K, 5, 5), as those of `meeting_terms`, for the last sample of every piece.
+        squares: (K, 5, 5), as in `meeting_terms`, for the last sample of every piece.
     """
-    x, y = (way.pos[:, -1] - places).T
+    x, y = (drive.pos[:, -1] - positions).T
     squares = SumOfSquares(5)
     squares.add({0: 1.0, 4: x}, weights.follow)
     squares.add({1: 1.0, 4: y}, weights.follow)
@@ -181,30 +179,28 @@ def following_terms(way: Motion, places: Array, weights: Weights) -> Array:
 
 
 def obstacle_terms(
-    case: InterceptCase, field: DistanceField, way: Motion, weights: Weights, discs: int
+    case: InterceptCase, field: DistanceField, drive: Motion, weights: Weights, discs: int
 ) -> tuple[Array, Array]:
-    """Hinges on the distance of the body from obstacles, and on the map's edge.
+    """Compute the hinges on the distance of the body from obstacles and from the map's edge.
 
-    The body counts as so many discs, static, that cover it: the fewer they are, the more they
-    stand out at its sides.
+    A static number of discs covers the body. Fewer discs extend further beyond its sides.
 
     Returns:
-        squares: (K, S, 5, 5), products of the residuals' slopes by x, y, heading and time of
-            every sample, and of the residuals, which are the last of the five.
-        close: (), largest excess of a disc into an obstacle, or of the body's middle beyond the
-            map, relative to the body's width.
+        squares: (K, S, 5, 5), as in `meeting_terms`, for every sample.
+        close: (), largest penetration of an obstacle by a disc, or excess of the body's middle
+            beyond the map, relative to the body's width.
     """
     radius, ahead = discs_of(case.body, discs)
-    shape = way.heading.shape
-    x, y = (way.pos[..., k].reshape(-1) for k in range(2))  # (M,)
-    cos, sin = (way.direction[..., k].reshape(-1) for k in range(2))
+    shape = drive.heading.shape
+    x, y = (drive.pos[..., k].reshape(-1) for k in range(2))  # (M,)
+    cos, sin = (drive.direction[..., k].reshape(-1) for k in range(2))
     weight = weights.obstacle * (100.0 / x.size)
-    movers, times = case.movers, way.time.reshape(-1)
+    movers, times = case.movers, drive.time.reshape(-1)
     velocity = movers.velocity[..., None]  # (N, 2, 1)
 
-    def around(place: Array) -> tuple[Array, Array, Array]:
-        """Distances and ways out (1 + N, M) of one disc, from what stands and what moves."""
-        at_x, at_y = x + place * cos, y + place * sin
+    def measure(offset: Array) -> tuple[Array, Array, Array]:
+        """Return distances of one disc from walls and movers, and their gradients, (1 + N, M)."""
+        at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times  # (N, 2, M)
         far, (away_x, away_y) = distances(
@@ -216,8 +212,8 @@ def obstacle_terms(
             jnp.concatenate([still_y, away_y]),
         )
 
-    # A loop, so that a compiler works the distances out once and not for every use.
-    far, away_x, away_y = lax.map(around, ahead)  # (discs, 1 + N, M)
+    # A loop, because XLA would otherwise compute the distances again for every use.
+    far, away_x, away_y = lax.map(measure, ahead)  # (discs, 1 + N, M)
     inside = jnp.maximum(radius + weights.margin - far, 0.0)
     is_inside = inside > 0.0
     speed_x, speed_y = (
@@ -227,7 +223,9 @@ def obstacle_terms(
     passing = -(away_x * speed_x + away_y * speed_y)
     slopes = [jnp.where(is_inside, -each, 0.0) for each in (away_x, away_y, turn, passing)]
     rows = [*slopes, inside]
-    sums = {(a, b): jnp.sum(rows[a] * rows[b], axis=(0, 1)) for a in range(5) for b in range(a, 5)}
+    squares = SumOfSquares(
+        5, {(a, b): jnp.sum(rows[a] * rows[b], axis=(0, 1)) for a in range(5) for b in range(a, 5)}
+    )
     middle = case.body.middle
     off_map = []
     for axis, (at, slope) in enumerate(((x + middle * cos, -sin), (y + middle * sin, cos))):
@@ -236,40 +234,36 @@ def obstacle_terms(
         over, under = (jnp.maximum(each + weights.margin, 0.0) for each in (above, below))
         beyond = over - under
         is_beyond = jnp.where(beyond != 0.0, 1.0, 0.0)
-        row = {axis: is_beyond, 2: middle * slope * is_beyond, 4: beyond}
-        for a, left in row.items():
-            for b, right in row.items():
-                if a <= b:
-                    sums[a, b] += left * right
-    squares = jnp.stack([sums[min(a, b), max(a, b)] for a in range(5) for b in range(5)])
-    squares = weight * jnp.moveaxis(squares.reshape(5, 5, *shape), (0, 1), (-2, -1))
+        squares.add({axis: is_beyond, 2: middle * slope * is_beyond, 4: beyond})
     close = jnp.maximum(jnp.max(radius - far), jnp.max(jnp.stack(off_map)))
-    return squares, close / case.body.width
+    return weight * squares.matrix(x).reshape(*shape, 5, 5), close / case.body.width
 
 
 def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Return walls and movers as one."""
+    """Return walls and movers as one group of obstacles."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
-    def padded(corners: Array) -> Array:
+    def pad(corners: Array) -> Array:
         more = size - corners.shape[1]
         return jnp.concatenate([corners, *[corners[:, -1:]] * more], axis=1)
 
-    walls, movers = (
-        dataclasses.replace(each, corners=padded(each.corners)) for each in (walls, movers)
-    )
+    walls, movers = (dataclasses.replace(x, corners=pad(x.corners)) for x in (walls, movers))
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), walls, movers)
 
 
 def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
-    """Rear and front end from the rear axle, and half the width [m]."""
+    """Return rear and front end, relative to the rear axle, and half the width [m]."""
     return -body.rear_overhang, body.length - body.rear_overhang, 0.5 * body.width
 
 
-def clearance(case: InterceptCase, way: Motion) -> Array:
-    """How far the body is from obstacles, and its middle inside of the map, at M samples [m]."""
-    pos, heading, times = way.pos.reshape(-1, 2), way.heading.reshape(-1), way.time.reshape(-1)
-    middle = pos + case.body.middle * way.direction.reshape(-1, 2)
+def clearance(case: InterceptCase, drive: Motion) -> Array:
+    """Return the clearance (M,) [m] at M samples.
+
+    It is the lesser of the body's distance from obstacles and its middle's distance from the edge.
+    """
+    pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
+    times = drive.time.reshape(-1)
+    middle = pos + case.body.middle * drive.direction.reshape(-1, 2)
     free = jnp.min(jnp.minimum(middle - case.lower, case.upper - middle), axis=1)
     both = join_obstacles(case.walls, case.movers)
     moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]
@@ -285,11 +279,11 @@ def clearance(case: InterceptCase, way: Motion) -> Array:
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
-    """Whether the car stands in an obstacle, and whether it cannot be at the meeting; () each."""
+    """Return whether the start is blocked, and whether the meeting is, () bool each."""
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
     before = both.centre - case.start[:2]
-    here = separation(
+    at_start = separation(
         both.corners,
         both.present,
         -before[:, :1],
@@ -298,6 +292,6 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
         ends_of(case.body),
     )
     apart = goal - (both.centre + both.velocity * case.time)
-    there, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
+    at_goal, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
     on_map = jnp.all((goal > case.lower) & (goal < case.upper))
-    return jnp.min(here) < 0.0, (jnp.min(there) < 0.5 * case.body.width) | ~on_map
+    return jnp.min(at_start) < 0.0, (jnp.min(at_goal) < 0.5 * case.body.width) | ~on_map
