@@ -32,6 +32,7 @@ LAYERS = (
 BY_NAME = {
     "cli": {"benchmarks"},
     "core": {"runs"},
+    "robot": {"sims"},
     "task": {"baselines", "cli", "policies", "sims", "sweep"},
 }
 REGENERATE = "run `python -m tests.layers --write` and commit CONTRIBUTING.md"

@@ -110,7 +110,7 @@ def test_a_nan_serve_is_a_row_and_leaves_its_neighbours_bits_alone(cases, plans)
 
 
 def test_an_impossible_lane_says_so_and_stays_finite(cases):
-    crippled = cases.limits.scaled(0.05, cases.gravity)
+    crippled = cases.limits.scale(0.05, cases.gravity)
     crippled_lane = np.arange(NUM) == 1
     limits = jax.tree.map(lambda a, b: np.where(crippled_lane, b, a), cases.limits, crippled)
     found = plan(FIRST_ROUND, cases.replace(limits=limits))

@@ -182,7 +182,9 @@ def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
     assert len(poly4d(quadrotor(num=31))) == 31
     with pytest.raises(ArgumentError, match="^plan must have at most 31 pieces, .* got 32$"):
         poly4d(quadrotor(num=32))
-    with pytest.raises(ArgumentError, match="^plan must be of degree 7 or less for this, got 9$"):
+    with pytest.raises(
+        ArgumentError, match="^plan must be of degree 7 or less for a Crazyflie, got 9$"
+    ):
         poly4d(quadrotor(powers=10))
     high = quadrotor(powers=10)
     nought = high.trajectory.coeffs * (np.arange(10)[:, None] < 8)
@@ -217,7 +219,7 @@ def test_a_batch_another_class_and_a_plan_that_is_not_whole_are_refused(tmp_path
     ):
         exported(tmp_path, batch)
     with pytest.raises(
-        ArgumentError, match=r"^plan must be that of a robot .* got a PiecewisePoly"
+        ArgumentError, match=r"^plan must be the plan of a robot .* got a PiecewisePoly"
     ):
         exported(tmp_path, quadrotor().trajectory)
     shorter = quadrotor().replace(trajectory=quadrotor().trajectory.replace(durations=np.ones(3)))
@@ -256,8 +258,7 @@ def test_the_bounds_of_a_rate_are_two_setpoints_and_very_many():
 
 @pytest.mark.parametrize(("robot", "to"), [("car", "px4"), ("arm", "px4"), ("arm", "crazyflie")])
 def test_a_format_that_cannot_carry_the_robot_says_so(tmp_path, robot, to):
-    article = "an arm" if robot == "arm" else "a car"
-    says = f"^to must be a format for plans of {article}, got '{to}', which is for quadrotor$"
+    says = f"^to must be a format for plans of the {robot}, got '{to}', which is for quadrotor$"
     with pytest.raises(ArgumentError, match=says):
         exported(tmp_path, PLANS[robot], to=to)
 
@@ -286,7 +287,7 @@ def test_a_file_is_new_whole_and_has_an_ending_of_its_format(tmp_path):
     with pytest.raises(ArgumentError, match="^out must end in .tlog or .mcap or .csv for px4, got"):
         exported(tmp_path, to="px4", name="b.bin")
     with pytest.raises(
-        ArgumentError, match="^rate must not be given for crazyflie, which takes poly"
+        ArgumentError, match="^rate must not be given for crazyflie, which has poly"
     ):
         exported(tmp_path, to="crazyflie", name="b.csv", rate=100.0)
     assert [each.name for each in tmp_path.iterdir()] == ["a.csv"] and path.read_bytes() == before

@@ -238,7 +238,7 @@ def test_setpoints_are_sent_to_a_port(capsys, here):
         ("run --row 3 --to csv", "--row must be from 0 to 2, got 3"),
         ("run --to csv", "--row must be from 0 to 2, got nothing"),
         ("run --row 2 --to csv", "plan must be solved, got the status INFEASIBLE: stationary with"),
-        ("arms --row 0 --to px4", "--to must be a format for plans of an arm, got 'px4'"),
+        ("arms --row 0 --to px4", "--to must be a format for plans of the arm, got 'px4'"),
         ("run --row 0 --to csv --rate 1e9", "--rate must be from "),
         ("run --row 0 --to csv --rate 0", "--rate must be from "),
         ("run --row 0 --to crazyflie --rate 9", "--rate must not be given for crazyflie"),

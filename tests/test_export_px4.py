@@ -67,7 +67,7 @@ def test_yaw_and_its_rate_are_those_of_the_nose_seen_from_above():
 
 def test_a_nose_that_points_straight_up_has_no_yaw():
     up = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]])
-    assert frames.rotated(up, np.array([1.0, 0.0, 0.0]))[0, 2] == pytest.approx(1.0)
+    assert frames.rotate(up, np.array([1.0, 0.0, 0.0]))[0, 2] == pytest.approx(1.0)
     yaw, rate = frames.yaw_of(np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.3, 0.2, -0.7]]))
     assert (yaw, rate) == (0.0, -0.7)
 

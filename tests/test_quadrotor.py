@@ -180,7 +180,7 @@ def test_the_body_rate_is_right_to_rounding_in_float32(float64):
 
 def test_scaled_limits_keep_the_ground():
     limits = QuadrotorLimits(speed=5.0, acceleration=15.0, body_rate=4.0, min_height=0.25)
-    half = limits.scaled(0.5, 9.81)
+    half = limits.scale(0.5, 9.81)
     assert (half.speed, half.acceleration, half.body_rate) == (2.5, 7.5, 2.0)
     assert half.min_height == limits.min_height
     assert limits.speed == 5.0

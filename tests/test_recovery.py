@@ -230,7 +230,7 @@ def test_a_plan_that_has_its_own_keeps_it_or_leaves_without_it(hit, here):
 
 
 def test_without_its_case_a_plan_is_refused_in_one_line(here):
-    says = "^case must be given, .* or recovery=None to leave that out, got neither$"
+    says = "^case must be given, .* or recovery=None to omit it, got neither$"
     with pytest.raises(ArgumentError, match=says):
         pj.export(quadrotor(), to="csv", out="a.csv")
     with pytest.raises(ArgumentError, match="^recovery must be one of brake, home, got 'land'$"):
@@ -240,7 +240,9 @@ def test_without_its_case_a_plan_is_refused_in_one_line(here):
 
 def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
     case, plan = hit
-    with pytest.raises(ArgumentError, match="^case must be that of the plan, got InterceptCase$"):
+    with pytest.raises(
+        ArgumentError, match="^case must be the case of a quadrotor, got InterceptCase$"
+    ):
         pj.export(plan, to="csv", out="a.csv", case=driving()[0])
     many = jax.tree.map(lambda leaf: leaf[None], case)
     with pytest.raises(ArgumentError, match=r"^case must be one, .* got a batch of shape \(1,\)$"):

@@ -1,8 +1,8 @@
-"""Plans as a Crazyflie's high-level commander takes them: polynomials of degree 7, piece by piece.
+"""Plans for a Crazyflie's high-level commander: polynomials of degree 7, piece by piece.
 
-Its memory holds 132 bytes a piece: eight coefficients of x, of y, of z [m] and of yaw [rad], from
-the constant on, and the duration [s], all little-endian float32. Its frame is ours, z up, and its
-time in a piece begins at zero as ours does, so that no number changes.
+Its memory holds 132 bytes for each piece: eight coefficients of x, y, z [m] and yaw [rad], the
+constant first, and the duration [s], all little-endian float32. Its frame is the library's, z up,
+and time starts at zero in each piece, as it does here, so that all numbers are unchanged.
 """
 
 from typing import BinaryIO
@@ -16,14 +16,14 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 
 MEMORY = 4096  # bytes for trajectories in the firmware
 POWERS = 8
-_BYTES = 4 * (4 * POWERS + 1)  # of a piece
+_BYTES = 4 * (4 * POWERS + 1)  # bytes of a piece
 
 
 def poly4d(plan: QuadrotorPlan) -> np.ndarray:
-    """The pieces of a plan, (M, 33) float32: duration [s], then x, y, z [m] and yaw [rad].
+    """Return the pieces of a plan, (M, 33) float32.
 
-    Of each there are eight coefficients, from the constant on, in the time [s] since the piece
-    began. The yaw is zero throughout.
+    A row has the duration [s] and eight coefficients each of x, y, z [m] and yaw [rad], the
+    constant first, in the time [s] since the start of the piece. The yaw is always zero.
 
     Raises:
         ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than
@@ -33,27 +33,27 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
     num, powers, _ = pieces.coeffs.shape
     degree = int(np.max(np.nonzero(pieces.coeffs)[1], initial=0))
     if degree >= POWERS:
-        raise ArgumentError("plan", f"of degree {POWERS - 1} or less for this", degree)
+        raise ArgumentError("plan", f"of degree {POWERS - 1} or less for a Crazyflie", degree)
     if num > MEMORY // _BYTES:
         rule = f"at most {MEMORY // _BYTES} pieces, which fill a Crazyflie's {MEMORY} bytes"
         raise ArgumentError("plan", rule, num, verb="have")
     rows = np.zeros((num, 4, POWERS), np.float32)
-    kept = min(powers, POWERS)
+    stored = min(powers, POWERS)
     with np.errstate(over="ignore"):
-        rows[:, :3, :kept] = np.swapaxes(pieces.coeffs[:, :kept], 1, 2)
-        found = np.hstack([pieces.durations[:, None].astype(np.float32), rows.reshape(num, -1)])
-    if not np.isfinite(found).all() or not (found[:, 0] > 0.0).all():
+        rows[:, :3, :stored] = np.swapaxes(pieces.coeffs[:, :stored], 1, 2)
+        table = np.hstack([pieces.durations[:, None].astype(np.float32), rows.reshape(num, -1)])
+    if not np.isfinite(table).all() or not (table[:, 0] > 0.0).all():
         raise ArgumentError("plan", "numbers that float32 holds", verb="have", shown="larger ones")
-    return found
+    return table
 
 
 def write_csv(plan: QuadrotorPlan, rate: None, file: BinaryIO) -> None:
-    """Write the pieces as the table of 33 columns that Crazyflie tools read."""
+    """Write the pieces as a table of 33 columns, the format of Crazyflie tools."""
     powers = [f"{name}^{k}" for name in ("x", "y", "z", "yaw") for k in range(POWERS)]
     write_table(file, ["duration", *powers], [poly4d(plan)])
 
 
 def write_bin(plan: QuadrotorPlan, rate: None, file: BinaryIO) -> None:
-    """Write the pieces as they lie in the Crazyflie's memory, the duration behind the rest."""
-    found = poly4d(plan)
-    file.write(np.hstack([found[:, 1:], found[:, :1]]).astype("<f4").tobytes())
+    """Write the pieces in the layout of the Crazyflie's memory, with the duration last."""
+    table = poly4d(plan)
+    file.write(np.hstack([table[:, 1:], table[:, :1]]).astype("<f4").tobytes())

@@ -8,7 +8,7 @@ from planner_jax.core.protocol import Plan
 from planner_jax.export.setpoints import robot_of, setpoints_of
 
 _AXES, _JOINTS = ("x", "y", "z"), ("1", "2", "3", "4", "5", "6")
-# Of each robot: a field of its setpoints, the names of its columns, and their unit.
+# For each robot: fields of its setpoints, with the names of their columns and the unit.
 _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
     "quadrotor": [
         ("time", ["time"], "s"),
@@ -41,7 +41,7 @@ _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
 def write(plan: Plan, rate: float, file: BinaryIO) -> None:
     """Write the setpoints of a plan, in the units and frames of its `sample`.
 
-    Every number has as many digits as bring it back bit for bit.
+    Numbers have enough digits to be read back bit for bit.
     """
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
@@ -50,7 +50,7 @@ def write(plan: Plan, rate: float, file: BinaryIO) -> None:
 
 
 def write_table(file: BinaryIO, header: list[str], columns: list[np.ndarray]) -> None:
-    """Write a header and columns (K,) or (K, N) beside each other."""
+    """Write a header, and columns (K,) or blocks of columns (K, N), as comma-separated text."""
     file.write((",".join(header) + "\n").encode())
     blocks = [np.asarray(column).reshape(len(column), -1) for column in columns]
     for parts in zip(*blocks, strict=True):

@@ -13,19 +13,19 @@ from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import DEFAULT_RATE
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
-FASTEST = 1000.0  # [Hz], as the messages count milliseconds
-_VEHICLE, _AUTOPILOT = 1, 1  # system and component that is meant
-_SENDER = 255  # the system of ground stations
+FASTEST = 1000.0  # [Hz]: the messages count milliseconds
+_VEHICLE, _AUTOPILOT = 1, 1  # system and component of the receiver
+_SENDER = 255  # system of a ground station
 _NO_FIELD_IGNORED = 0
 
 
 def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
-    """When each message is due [us] since the plan began, and the MAVLink 2 packet.
+    """Yield the time [us] of each message since the start of the plan, and its MAVLink 2 packet.
 
     Position, velocity, acceleration, yaw and its rate are all set; see `trajectory_setpoints`.
 
     Raises:
-        ArgumentError: the plan cannot be exported, or the rate is absurd.
+        ArgumentError: the plan cannot be exported, or the rate is out of its range.
     """
     fields = trajectory_setpoints(plan, rate)
     if rate > FASTEST:
@@ -47,29 +47,29 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
 
 
 def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write the packets as a telemetry log: each behind its time [us], eight bytes, big-endian.
+    """Write a telemetry log: before each packet its time [us] in eight bytes, big-endian.
 
-    Times count from the beginning of the plan.
+    Times count from the start of the plan.
     """
     for stamp, packet in packets(plan, rate):
         file.write(struct.pack(">Q", stamp) + packet)
 
 
 def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
-    """Send the packets to a UDP port of this machine, each when it is due; return their number.
+    """Send the packets to a UDP port of this machine, each at its time; return their number.
 
     Raises:
-        ArgumentError: the plan cannot be exported, the rate is absurd, or nobody listens on the
-            port.
+        ArgumentError: the plan cannot be exported, the rate is out of its range, or no program
+            listens on the port.
     """
     if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
         raise ArgumentError("udp", f"a port from 1 to {2**16 - 1}", port)
     ready = list(packets(plan, rate))
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as out:
         out.connect(("127.0.0.1", port))
-        began = time.monotonic()
+        start = time.monotonic()
         for stamp, packet in ready:
-            time.sleep(max(0.0, began + 1e-6 * stamp - time.monotonic()))
+            time.sleep(max(0.0, start + 1e-6 * stamp - time.monotonic()))
             try:
                 out.send(packet)
             except ConnectionRefusedError:

@@ -1,6 +1,6 @@
-"""MCAP files as rosbag2 writes and plays them: profile ros2, schemas ros2msg, messages CDR.
+"""MCAP files for rosbag2: profile ros2, schemas ros2msg, messages CDR.
 
-Times of messages count from the beginning of the plan.
+Times of messages count from the start of the plan.
 """
 
 from typing import BinaryIO
@@ -44,13 +44,10 @@ def _full_name(kind: str) -> str:
 
 
 def _definition(kind: str) -> str:
-    """The fields of a type, and behind them those of all types that it consists of."""
-    needed, place = [kind], 0
-    while place < len(needed):
-        inner = (line.split()[0].removesuffix("[]") for line in _TYPES[needed[place]].splitlines())
-        needed += [each for each in dict.fromkeys(inner) if each in _TYPES and each not in needed]
-        place += 1
-    rule = "\n" + 80 * "=" + "\n"
-    return (
-        rule.join([_TYPES[kind], *(f"MSG: {each}\n{_TYPES[each]}" for each in needed[1:])]) + "\n"
-    )
+    """Return the definition of a type, followed by the definitions of all types in its fields."""
+    types = [kind]
+    for each in types:  # the list grows while it is read
+        inner = (line.split()[0].removesuffix("[]") for line in _TYPES[each].splitlines())
+        types += [name for name in dict.fromkeys(inner) if name in _TYPES and name not in types]
+    parts = [_TYPES[kind], *(f"MSG: {each}\n{_TYPES[each]}" for each in types[1:])]
+    return ("\n" + 80 * "=" + "\n").join(parts) + "\n"

@@ -1,4 +1,4 @@
-"""Setpoints as PX4 takes them: the fields of its message TrajectorySetpoint, in NED."""
+"""Setpoints for PX4: the fields of its message TrajectorySetpoint, in NED."""
 
 from typing import BinaryIO
 
@@ -13,25 +13,25 @@ _VECTORS = ("position", "velocity", "acceleration", "jerk")
 
 
 def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarray]:
-    """The fields of K messages `px4_msgs/TrajectorySetpoint` by name; local NED frame.
+    """Return the fields of K messages `px4_msgs/TrajectorySetpoint` by name, local NED frame.
 
     Args:
-        plan: one, solved.
+        plan: one solved plan.
         rate: [Hz].
 
     Returns:
-        timestamp: (K,) uint64 [us], since the plan began.
+        timestamp: (K,) uint64 [us], since the start of the plan.
         position, velocity, acceleration, jerk: (K, 3) float32 [m], [m/s], [m/s^2], [m/s^3]. The
-            acceleration is that of the motion: PX4 adds gravity itself.
-        yaw: (K,) float32 [rad], of the plan's attitude, clockwise from north, in [-pi, pi].
-        yawspeed: (K,) float32 [rad/s], its rate.
+            acceleration is without gravity, which PX4 adds itself.
+        yaw: (K,) float32 [rad], yaw of the attitude, clockwise from north, in [-pi, pi].
+        yawspeed: (K,) float32 [rad/s], rate of the yaw.
     """
-    found = setpoints_of(plan, rate)
-    assert isinstance(found, QuadrotorSetpoints)
-    yaw, yaw_rate = yaw_of(found.quat_wxyz, found.body_rate)
-    vectors = zip(_VECTORS, (found.pos, found.vel, found.acc, found.jerk), strict=True)
+    points = setpoints_of(plan, rate)
+    assert isinstance(points, QuadrotorSetpoints)
+    yaw, yaw_rate = yaw_of(points.quat_wxyz, points.body_rate)
+    vectors = zip(_VECTORS, (points.pos, points.vel, points.acc, points.jerk), strict=True)
     return {
-        "timestamp": np.round(found.time * 1e6).astype(np.uint64),
+        "timestamp": np.round(points.time * 1e6).astype(np.uint64),
         **{name: to_ned(np.asarray(vector, np.float32)) for name, vector in vectors},
         "yaw": to_ned_yaw(yaw).astype(np.float32),
         "yawspeed": (-yaw_rate).astype(np.float32),
@@ -39,7 +39,7 @@ def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarr
 
 
 def write_csv(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write the messages as rows, columns named as PX4's own tools name them."""
+    """Write the messages as rows, with the column names of PX4's own tools."""
     fields = trajectory_setpoints(plan, rate)
     header = [
         f"{name}[{axis}]" if values.ndim == 2 else name

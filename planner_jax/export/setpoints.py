@@ -1,6 +1,6 @@
 """Content of every format: the setpoints of a plan, or its polynomials, up to its end.
 
-The end of a plan with a recovery trajectory is the end of the latter.
+A recovery trajectory is part of the plan.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from planner_jax.robot.car import CarPlan, CarSetpoints
 from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-MOST = 100_000  # setpoints of a plan
+MOST = 100_000  # greatest number of setpoints of a plan
 DEFAULT_RATE = 100.0  # [Hz]
 
 Setpoints = QuadrotorSetpoints | CarSetpoints | ArmSetpoints
@@ -30,9 +30,9 @@ class Robot:
 
     name: str
     plan: type[Plan]
-    shapes: Mapping[str, tuple[int | str, ...]]  # of the leaves; a letter is one size throughout
-    case_field: str  # of the cases of its plans, and of no others
-    end: Callable[..., float]  # [s], of a plan
+    shapes: Mapping[str, tuple[int | str, ...]]  # of leaves; equal letters are equal sizes
+    case_field: str  # a field that only the cases of this robot have
+    end: Callable[..., float]  # returns the end [s] of a plan
 
 
 ROBOTS = (
@@ -61,15 +61,18 @@ ROBOTS = (
 
 
 def robot_of(plan: Plan) -> Robot:
-    """Return the robot of one plan that can be exported.
+    """Return the robot of one plan.
 
     Raises:
-        ArgumentError: it is no plan, a batch, of another robot, not solved, or not whole.
+        ArgumentError: the object is not a plan of a robot, is a batch, is not solved, has leaves of
+            a wrong shape, or takes no time.
     """
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
         names = ", ".join(robot.name for robot in ROBOTS)
-        raise ArgumentError("plan", f"that of a robot ({names})", shown=f"a {type(plan).__name__}")
+        raise ArgumentError(
+            "plan", f"the plan of a robot ({names})", shown=f"a {type(plan).__name__}"
+        )
     if np.ndim(plan.status) != 0:
         shown = f"a batch of shape {np.shape(plan.status)}"
         raise ArgumentError("plan", "one, as pj.take(plans, k) gives", shown=shown)
@@ -86,27 +89,27 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
     """Raise unless the leaves of one plan have the shapes of its robot."""
     sizes: dict[int | str, int] = {}
     leaves = leaves_by_name(plan)
-    for name, wanted in robot.shapes.items():
+    for name, expected in robot.shapes.items():
         shape = np.shape(leaves[name])
-        fits = len(shape) == len(wanted) and all(
-            size == (want if isinstance(want, int) else sizes.setdefault(want, size))
-            for want, size in zip(wanted, shape, strict=True)
+        fits = len(shape) == len(expected) and all(
+            size == (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
+            for axis, size in zip(expected, shape, strict=True)
         )
         if not fits or 0 in shape:
-            words = ", ".join(str(sizes.get(want, want)) for want in wanted)
-            raise ArgumentError("plan", f"{name} of the shape ({words})", shape, verb="have")
+            text = ", ".join(str(sizes.get(axis, axis)) for axis in expected)
+            raise ArgumentError("plan", f"{name} of the shape ({text})", shape, verb="have")
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
     """Return `plan.sample(rate)` of one plan.
 
     Args:
-        plan: of a robot of `ROBOTS`, solved.
+        plan: solved plan of a robot of `ROBOTS`.
         rate: [Hz].
 
     Raises:
-        ArgumentError: the plan cannot be exported, see `robot_of`, or is not finite; or the rate is
-            no number, or gives one setpoint only or more than `MOST`.
+        ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is
+            not a number, or results in fewer than two setpoints or more than `MOST`.
     """
     end = robot_of(plan).end(plan)
     low, high = 1.0 / end, (MOST - 1) / end
@@ -124,10 +127,10 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
 
 
 def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
-    """Return the polynomials of one plan, without pieces that take no time.
+    """Return the polynomials of one plan, without pieces of zero duration.
 
     Raises:
-        ArgumentError: the plan cannot be exported, see `robot_of`, or is not finite.
+        ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite.
     """
     robot_of(plan)
     path = jax.tree.map(np.asarray, plan.whole)
@@ -139,14 +142,14 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
 
 
 def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
-    """Load one plan of a file that `plan.save` wrote, without the fields that a task adds.
+    """Load one plan from a file that `plan.save` wrote, without the fields that a task adds.
 
     Args:
-        path: of the file.
+        path: path of the file.
         row: index in the batch of the file; None for a file of one plan.
 
     Raises:
-        PlanFileError: the file holds no plans of a quadrotor, a car or an arm.
+        PlanFileError: the file has no plans of a quadrotor, a car or an arm.
         ArgumentError: there is no such row.
     """
     plans: Plan = load_fitting(path, [robot.plan for robot in ROBOTS])

@@ -67,7 +67,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         solvers: tuple[Callable[..., PlanT], Callable[..., PlanT]],
     ) -> None:
         self.case: CaseT = jax.tree.map(np.asarray, case)
-        limits = self.case.limits.scaled(_SHARE, self.case.gravity)
+        limits = self.case.limits.scale(_SHARE, self.case.gravity)
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners

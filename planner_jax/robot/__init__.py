@@ -1,1 +1,1 @@
-"""Models of quadrotors, cars and arms: flatness, kinematics and limits."""
+"""Models of quadrotors, cars and arms: kinematics, limits, robots from files, and plans."""

@@ -1,7 +1,7 @@
 """A quadrotor: limits, differential flatness [Yu2023bat, eq. 1], bounds on reach, and plans.
 
-The body z axis follows the net thrust  tau = a + g e_3  (per unit mass). With the heading
-held at zero, the Hopf fibration gives the body rates from tau and the jerk alone [Watterson2020].
+The body z axis is along the net thrust  tau = a + g e_3  (per unit mass). At zero heading, the Hopf
+fibration determines the body rate by tau and the jerk alone [Watterson2020].
 """
 
 import dataclasses
@@ -16,76 +16,79 @@ from planner_jax.core.arithmetic import Components, at_least, components, invers
 from planner_jax.core.protocol import Plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
-# By how much limits may be exceeded here, far more than in any plan that is solved: how closely
-# peaks are looked at must not matter to a bound.
+# Factor on limits in bounds on reach. Solved plans exceed their limits by far less, so that the
+# bounds hold for plans whose peaks lie between the samples of a check.
 ALLOWED = 1.01
-_SHORTEST = 1e-3  # [s], so that a limit which is infinite is not multiplied by zero
+_SHORTEST = 1e-3  # [s]; prevents the product of an infinite limit and zero
 
 
 @struct.dataclass
 class RotorLimits:
-    """What every rotor can do, and what it has to carry."""
+    """Bounds of thrust of the rotors, and the body that they carry."""
 
     mass: Array  # () [kg]
     inertia: Array  # (3,) [kg m^2], principal, about the body's axes
     mixer: Array  # (4, 4), from total thrust [N] and torque [N m] to the rotors' thrusts [N]
-    min_thrust: Array  # () [N], of a rotor
-    max_thrust: Array  # () [N], of a rotor
+    min_thrust: Array  # () [N], of one rotor
+    max_thrust: Array  # () [N], of one rotor
 
 
 @struct.dataclass
 class QuadrotorLimits:
-    """What the quadrotor may not exceed; there is no limit where None stands.
+    """Limits of a quadrotor; None means no limit.
 
-    Another number compiles nothing anew, one in the place of None does.
+    New numbers reuse a compiled program; a number in the place of None does not.
     """
 
     speed: Array  # () [m/s]
     body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
     min_height: Array  # () [m], of the propeller plane
     acceleration: Array | None = None  # () [m/s^2]
-    min_thrust: Array | None = None  # () [m/s^2], per unit mass; there if `max_thrust` is
+    min_thrust: Array | None = None  # () [m/s^2], per unit mass; None if `max_thrust` is None
     max_thrust: Array | None = None  # () [m/s^2], per unit mass
     rotors: RotorLimits | None = None
 
     @property
     def thrust_bounds(self) -> tuple[Array, Array]:
-        """Least and greatest thrust [m/s^2]; zero and infinite where there is no limit."""
+        """Least and greatest thrust [m/s^2]; zero and infinity without limits."""
         none = jnp.zeros_like(self.speed)
         least = none if self.min_thrust is None else self.min_thrust
         return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
 
-    def scaled(self, factor: float, gravity: Array) -> "QuadrotorLimits":
-        """Scale speed, acceleration, body rate and the thrust's distance from hover by a factor."""
-        scaled = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
+    def scale(self, factor: float, gravity: Array) -> "QuadrotorLimits":
+        """Return limits with speed, acceleration, body rate and thrust scaled by a factor.
+
+        Of the thrust, the difference from `gravity` is scaled.
+        """
+        limits = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
         if self.acceleration is not None:
-            scaled["acceleration"] = factor * self.acceleration
+            limits["acceleration"] = factor * self.acceleration
         if self.min_thrust is not None and self.max_thrust is not None:
             least = jnp.maximum(gravity + factor * (self.min_thrust - gravity), 0.0)
-            scaled["min_thrust"] = least
-            scaled["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
-        return dataclasses.replace(self, **scaled)
+            limits["min_thrust"] = least
+            limits["max_thrust"] = gravity + factor * (self.max_thrust - gravity)
+        return dataclasses.replace(self, **limits)
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
-    """Return thrust per unit mass  a + g e_3  [m/s^2], shape (..., 3)."""
+    """Return the thrust per unit mass  a + g e_3  [m/s^2], (..., 3)."""
     return acc + gravity * jnp.array([0.0, 0.0, 1.0], acc.dtype)
 
 
 def body_z(acc: Array, gravity: Array) -> Array:
-    """Return unit vector along the net thrust, shape (..., 3); zero where there is no thrust."""
+    """Return the unit vector along the net thrust, (..., 3); zero without thrust."""
     thrust = net_thrust(acc, gravity)
-    size_squared = jnp.sum(thrust**2, axis=-1, keepdims=True)
-    pushing = size_squared > 0.0
-    return jnp.where(pushing, thrust / jnp.sqrt(jnp.where(pushing, size_squared, 1.0)), 0.0)
+    square = jnp.sum(thrust**2, axis=-1, keepdims=True)
+    has_thrust = square > 0.0
+    return jnp.where(has_thrust, thrust / jnp.sqrt(jnp.where(has_thrust, square, 1.0)), 0.0)
 
 
 def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Array:
-    """Return squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
+    """Return the squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
 
-    |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z' is the jerk across the thrust
-    over the thrust's size. Written without square roots, so that its gradient is finite
-    wherever the value is.
+    |omega|^2 = |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z' is the component of the
+    jerk perpendicular to the thrust, over the magnitude of the thrust. The computation has no
+    square root of the result, so that its gradient is finite wherever the value is.
 
     Args:
         acc: (..., 3) [m/s^2].
@@ -93,11 +96,11 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
         gravity: () [m/s^2].
 
     Returns:
-        (...,). Near free fall (no thrust) and upside down, where the attitude is not
-        defined, the value is large but finite.
+        (...,). Near free fall (no thrust) and upside down, where the attitude is undefined, the
+        value is large but finite.
     """
-    # Component by component, and each reciprocal once: sums over an axis of three and
-    # divisions are what a CPU spends most of a plan's time on.
+    # By components, and each reciprocal once: sums over an axis of three and divisions cost a CPU
+    # most of a plan's time.
     tx, ty, az = components(acc)
     tz = az + gravity
     jx, jy, jz = components(jerk)
@@ -106,16 +109,16 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
     inverse_squared = inverse_size * inverse_size
     along = tx * jx + ty * jy + tz * jz
     tilt_squared = (jx * jx + jy * jy + jz * jz - along * along * inverse_squared) * inverse_squared
-    # z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 : the part along tau drops out.
+    # z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 : the jerk along tau cancels.
     twist = (ty * jx - tx * jy) * inverse_size
     twist = twist * reciprocal(at_least(size_squared * inverse_size + tz, 1e-2))
     return tilt_squared + twist * twist
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Return components (...) of the body rate [rad/s] of the Hopf fibration, body frame.
+    """Return the components (...) of the body rate [rad/s] of the Hopf fibration, body frame.
 
-    The arguments are those of `body_rate_squared`.
+    See `body_rate_squared` for the arguments.
     """
     tx, ty, az = components(acc)
     tz = az + gravity
@@ -125,7 +128,7 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
     along = x * jx + y * jy + z * jz
     dx, dy, dz = ((j - along * n) * inverse_size for j, n in ((jx, x), (jy, y), (jz, z)))
     k = reciprocal(at_least(1.0 + z, 1e-2))
-    # The body's x axis is (1 - k x^2, -k x y, -x), its y axis (-k x y, 1 - k y^2, -y).
+    # The body's x axis is (1 - k x^2, -k x y, -x), the y axis (-k x y, 1 - k y^2, -y).
     sway = k * (x * dx + y * dy)
     return -(dy - y * sway - y * dz), dx - x * sway - x * dz, (y * dx - x * dy) * k
 
@@ -133,10 +136,9 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
 def rotor_thrusts(
     acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
 ) -> tuple[Array, ...]:
-    """Return thrust of each of the four rotors that a motion at zero heading takes [N], (...) each.
+    """Return the thrusts (...) [N] of the four rotors in a motion at zero heading.
 
-    The arguments are those of `body_rate_squared`, the snap (..., 3) [m/s^4], and the rotors with
-    the body that they carry.
+    The snap is (..., 3) [m/s^4]; see `body_rate_squared` for the other arguments.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
@@ -156,7 +158,7 @@ def rotor_thrusts(
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
     """Return the body x and y axes (3,) of the Hopf fibration at zero heading for a z axis (3,).
 
-    They are smooth except at straight down.
+    They are smooth in the z axis, except straight down.
     """
     x, y, z = components(normal)
     k = reciprocal(at_least(1.0 + z, 1e-6))
@@ -167,9 +169,9 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return rotation (3, 3), body to world, and body rate (3,) [rad/s] at zero heading.
+    """Return the rotation (3, 3), body to world, and body rate (3,) [rad/s] at zero heading.
 
-    Acceleration (3,) [m/s^2] and jerk (3,) [m/s^3] determine them by the Hopf fibration.
+    The Hopf fibration determines them by acceleration (3,) [m/s^2] and jerk (3,) [m/s^3].
     """
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
@@ -181,9 +183,9 @@ def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array
 
 
 def tilt_quaternion(normal: Array) -> Array:
-    """Return the attitude at zero heading of the Hopf fibration, of the body z axis, (4,) w x y z.
+    """Return the attitude (4,) w x y z of the Hopf fibration at zero heading for a z axis (3,).
 
-    The shortest turn from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
+    It is the shortest rotation from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
     """
     x, y, z = components(normal)
     w = jnp.sqrt(0.5 * at_least(1.0 + z, 1e-6))
@@ -191,7 +193,7 @@ def tilt_quaternion(normal: Array) -> Array:
 
 
 def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
-    """Return the greatest speed of the quadrotor, () [m/s]."""
+    """Return the bound () [m/s] on the speed from a state (4, 3): the limit or the first speed."""
     first = jnp.sqrt(jnp.sum(head_state[1] * head_state[1]))
     return jnp.maximum(ALLOWED * limits.speed, first)
 
@@ -199,22 +201,23 @@ def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
 def beyond_reach(
     places: Array, times: Array, head_state: Array, limits: QuadrotorLimits, gravity: Array
 ) -> Array:
-    """Return how far places lie beyond all that a quadrotor can reach by certain times, (K,) [m].
+    """Return lower bounds (K,) [m] on the distances from targets that a quadrotor cannot close.
 
-    A bound from below: zero or less says nothing. By the time t the quadrotor is in each of
+    Zero or less means that a target may be reached. At the time t the quadrotor is in each of
 
     - the ball around the start whose radius is the integral of the greatest speed, which rises
       with the greatest acceleration A up to its limit,
-    - the ball of radius A t^2 / 2 around where the first velocity alone takes it,
-    - the ball of radius T t^2 / 2 around where it falls freely, with the greatest thrust T,
+    - the ball of radius A t^2 / 2 around the position that the first velocity alone leads to,
+    - the ball of radius T t^2 / 2 around the position in free fall, with the greatest thrust T,
 
-    as far as there are such limits: the mean of accelerations lies in a ball that holds them all.
+    where such limits exist. The balls are exact bounds, since the mean of accelerations lies in a
+    ball that contains all of them.
 
     Args:
-        places: (K, 3) [m].
+        places: (K, 3) [m], positions of the targets at the times.
         times: (K,) [s], >= 0.
-        head_state: (4, 3) of the quadrotor at time 0.
-        limits: of the quadrotor.
+        head_state: (4, 3), state of the quadrotor at time 0.
+        limits: limits of the quadrotor.
         gravity: () [m/s^2], magnitude.
     """
     start, vel = head_state[0], head_state[1]
@@ -226,8 +229,8 @@ def beyond_reach(
     if acceleration is None:
         return _length(x, y, z) - most * times
     rise = (most - first) / acceleration
-    hurried = first * times + acceleration * half_square
-    reached = jnp.where(times < rise, hurried, most * times - 0.5 * (most - first) * rise)
+    rising = first * times + acceleration * half_square
+    reached = jnp.where(times < rise, rising, most * times - 0.5 * (most - first) * rise)
     beyond = _length(x, y, z) - reached
     x, y, z = x - vel[0] * times, y - vel[1] * times, z - vel[2] * times
     beyond = jnp.maximum(beyond, _length(x, y, z) - acceleration * half_square)
@@ -237,21 +240,21 @@ def beyond_reach(
 
 
 def _greatest_thrust(limits: QuadrotorLimits) -> Array | None:
-    """Return the greatest thrust of all rotors per unit mass, () [m/s^2]; None without a limit."""
-    found = [] if limits.max_thrust is None else [limits.max_thrust]
+    """Return the greatest total thrust per unit mass, () [m/s^2]; None without a limit."""
+    bounds = [] if limits.max_thrust is None else [limits.max_thrust]
     if limits.rotors is not None:
-        found.append(4.0 * limits.rotors.max_thrust / limits.rotors.mass)
-    return ALLOWED * jnp.min(jnp.stack(found)) if found else None
+        bounds.append(4.0 * limits.rotors.max_thrust / limits.rotors.mass)
+    return ALLOWED * jnp.min(jnp.stack(bounds)) if bounds else None
 
 
 def _greatest_acceleration(
     limits: QuadrotorLimits, thrust: Array | None, gravity: Array
 ) -> Array | None:
     """Return the greatest acceleration, () [m/s^2]; None without a limit."""
-    found = [] if limits.acceleration is None else [ALLOWED * limits.acceleration]
+    bounds = [] if limits.acceleration is None else [ALLOWED * limits.acceleration]
     if thrust is not None:
-        found.append(thrust + gravity)
-    return jnp.min(jnp.stack(found)) if found else None
+        bounds.append(thrust + gravity)
+    return jnp.min(jnp.stack(bounds)) if bounds else None
 
 
 def _length(x: Array, y: Array, z: Array) -> Array:
@@ -260,13 +263,13 @@ def _length(x: Array, y: Array, z: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorSetpoints:
-    """A plan at K equally spaced times; world frame, z up; body x forward, z along the thrust.
+    """Samples of a plan at K equally spaced times; world frame, z up; body x forward, z up.
 
-    Of a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    In a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
     """
 
-    time: np.ndarray  # (K,) [s] since the plan began
-    pos: np.ndarray  # (K, 3) [m], of the propeller plane's centre
+    time: np.ndarray  # (K,) [s] since the start of the plan
+    pos: np.ndarray  # (K, 3) [m], centre of the propeller plane
     vel: np.ndarray  # (K, 3) [m/s]
     acc: np.ndarray  # (K, 3) [m/s^2]
     jerk: np.ndarray  # (K, 3) [m/s^3]
@@ -277,11 +280,11 @@ class QuadrotorSetpoints:
 
 @struct.dataclass
 class QuadrotorPlan(Plan):
-    """A plan with the trajectory of a quadrotor's propeller plane."""
+    """A plan with the trajectory of the centre of a quadrotor's propeller plane."""
 
     trajectory: PiecewisePolynomial  # up to the last contact
-    gravity: Array  # () [m/s^2], magnitude, for which it was planned
-    # From there on to rest, where it was asked for.
+    gravity: Array  # () [m/s^2], magnitude
+    # From the last contact to standstill; None if it was not requested.
     recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
 
     @property
@@ -303,7 +306,10 @@ class QuadrotorPlan(Plan):
 
 
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return `QuadrotorSetpoints` but times, of a trajectory and its gravity at a time () [s]."""
+    """Return the fields of `QuadrotorSetpoints`, except `time`, of one plan at a time () [s].
+
+    The leaves are the trajectory and gravity.
+    """
     path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
     return {

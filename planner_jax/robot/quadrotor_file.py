@@ -17,6 +17,7 @@ import dataclasses
 import difflib
 import math
 import os
+import pkgutil
 import re
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
@@ -25,7 +26,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from planner_jax.core.errors import PlannerJaxError
+from planner_jax.core.errors import MissingExtra, PlannerJaxError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.quadrotor_model import (
     NET,
@@ -221,9 +222,11 @@ def _read_description(path: Path) -> dict[str, Value]:
     if len(text) > _LARGEST:
         raise RobotError(f"{path}: must be at most {_LARGEST} bytes")
     if path.suffix.lower() == ".xml":
-        from planner_jax.robot.quadrotor_mjcf import describe_mjcf
-
-        return describe_mjcf(path)
+        try:  # MuJoCo compiles the file
+            describe = pkgutil.resolve_name("planner_jax.sims.robots.quadrotor.mjcf:describe_mjcf")
+        except MissingExtra as error:
+            raise error.renamed({error.feature: path.name}) from None
+        return describe(path)
     try:
         fields = yaml.load(text, _Loader)
     except yaml.YAMLError as error:

@@ -1,4 +1,4 @@
-"""Setpoints of plans at equally spaced times, for every robot."""
+"""Samples of plans at equally spaced times, for every robot."""
 
 import functools
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from planner_jax.core.checks import require_number
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
-_MOST = 10**8  # setpoints of a batch
+_MOST = 10**8  # greatest number of setpoints of a batch
 TreeT = TypeVar("TreeT")
 
 
@@ -23,21 +23,20 @@ def sample_at_rate(
     leaves: TreeT,
     setpoint_at: Callable[[TreeT, Array], dict[str, Array]],
 ) -> dict[str, np.ndarray]:
-    """Sample a plan, or a batch of plans, at a rate [Hz] from the beginning up to the end.
+    """Sample a plan, or a batch of plans, at a rate from start to end.
 
     Args:
         rate: [Hz].
-        ends: () or (B,) [s], when each plan ends.
-        leaves: a pytree of the plans, with their batch shape.
-        setpoint_at: a function of a module that returns the setpoint of one plan at a time () [s],
-            by name; pure.
+        ends: () or (B,) [s], end of each plan.
+        leaves: arrays of the plans, a pytree with their batch shape.
+        setpoint_at: pure function of (leaves of one plan, time () [s]); returns a setpoint by name.
 
     Returns:
-        "time" (K,) [s] and the setpoints by name, (K, ...) of one plan, (B, K, ...) of a batch;
-        NaN past the end of each plan.
+        "time" (K,) [s], and setpoints by name: (K, ...) of one plan, (B, K, ...) of a batch; NaN
+        past the end of each plan.
 
     Raises:
-        TypeError: the rate is no number.
+        TypeError: the rate is not a number.
         ValueError: the rate is not positive, or there would be more than 1e8 setpoints.
     """
     require_number("rate", rate, POSITIVE)

@@ -1,4 +1,4 @@
-"""Blocks: an arm with a shield protects a box from thrown balls [Natarajan2024]."""
+"""Task block: an arm with a shield protects a box from thrown balls [Natarajan2024]."""
 
 import lazy_loader
 

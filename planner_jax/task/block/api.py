@@ -9,23 +9,22 @@ from planner_jax.task.block.spec import TASK
 
 
 def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:
-    """Return the block planner of a name, with some of its fields set.
+    """Return a block planner by its name.
 
     * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells
-      through which the ball comes.
-    * `adapt:FILE`: motions of that file warped to the very ball, then least squares from these.
-    * `online`: a straight motion of the joints if one is free, else end pose, time of contact and
-      motion together, by least squares from many starts.
-    * `brisk`: as `online`, but of motions from rest to rest the quickest; the arm then stands and
-      waits for the ball, at the price of torque.
-    * `direct`: all joints as fast as they may turn, to the end pose that is reached soonest of
-      those to which that touches nothing.
-    * `rrt-connect`, `epase`: ways by OMPL's RRT-Connect, or by a weighted A* over steps of the
-      joints, to one end pose after another, timed by TOPP-RA; on the host, with the extra
-      `arm-peers`.
-    * `insat`: that A* interleaved with B-splines, Algorithm 2 of [Natarajan2024]; on the host.
+      through which the ball enters the boxes.
+    * `adapt:FILE`: motions of that file, warped to the ball, then refined by least squares.
+    * `online`: a straight motion of the joints if one is free of collisions, else least squares
+      for end pose, time of contact and motion together, from several starts.
+    * `brisk`: the motions of `online` from rest to rest, as fast as limits allow; the arm waits for
+      the ball at standstill. Needs more torque.
+    * `direct`: each joint as fast as its limits allow, to the end pose that is reached soonest
+      without a collision.
+    * `rrt-connect`, `epase`: paths by OMPL's RRT-Connect, or by a weighted A* over steps of the
+      joints, to one end pose after another, timed by TOPP-RA; on the host, extra `arm-peers`.
+    * `insat`: that A* interleaved with B-splines [Natarajan2024, Algorithm 2]; on the host.
 
-    Arguments and errors are those of `pj.hit.planner`; the options are fields of `OnlineBlock`,
+    See `pj.hit.planner` for arguments and errors. The options are fields of `OnlineBlock`,
     `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
     """
     return TASK.make_planner(name, options)
@@ -34,6 +33,6 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
     """Judge one plan, or a batch, by kinematics and geometry alone.
 
-    Arguments, result and errors are those of `pj.hit.judge`; `referee_blocks` has the settings.
+    See `pj.hit.judge` for arguments, result and errors, and `referee_blocks` for the settings.
     """
     return judge_by(referee_blocks, cases, plans, (BlockCase, BlockPlan), settings)

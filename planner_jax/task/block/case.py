@@ -1,4 +1,4 @@
-"""One thrown ball, and the arm that is to block it."""
+"""Cases: one thrown ball, and the arm that has to block it."""
 
 from typing import ClassVar, TypeVar
 
@@ -27,7 +27,7 @@ from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene, paper_scene
 
-# What the numbers of a case must be.
+# Rules on the numbers of a case.
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
@@ -59,32 +59,33 @@ RULES: Table = (
 
 
 TreeT = TypeVar("TreeT")
-# How exactly a ball is to be met: greatest distance from the middle of the shield [m], and greatest
-# angle [rad] between the shield's normal and the way that the ball comes from.
+# Tolerances of a contact: greatest distance [m] of the ball from the shield's middle, and greatest
+# angle [rad] between the shield's normal and the direction against the ball's velocity.
 STRICT = (0.002, np.deg2rad(0.5))
 WIDE = (0.1, np.deg2rad(30.0))
-ANYWHERE = (0.25, np.deg2rad(90.0))  # beyond the shield's corners: on its face
+ANYWHERE = (0.25, np.deg2rad(90.0))  # everywhere on the face: its corners are nearer than 0.25 m
 
 
 @struct.dataclass
 class BlockCase:
-    """One case. Every number is a leaf: batch it, randomise it, differentiate by it.
+    """One case, or a batch; every number is a leaf and may be differentiated by.
 
-    Robot base frame, z up, SI units. Times count from the moment at which the ball is first seen.
+    Robot base frame, z up, SI units. Times count from the first observation of the ball.
     """
 
     rules: ClassVar[Table] = RULES
 
-    ball: BallState  # when it is first seen; it falls freely
+    ball: BallState  # at time 0; it falls freely
     gravity: Array  # () [m/s^2], magnitude
-    delay: Array  # () [s], until the arm may start
-    angles: Array  # (6,) [rad], of the arm until then
-    rates: Array  # (6,) [rad/s], of the joints then
+    delay: Array  # () [s], time at which the arm may start
+    angles: Array  # (6,) [rad], joint angles up to then
+    rates: Array  # (6,) [rad/s], joint rates at the start
     arm: Arm
     limits: ArmLimits
-    ends_at_rest: Array  # () bool, whether the arm must stand when it meets the ball
-    offset: Array  # () [m], greatest distance of the ball from the shield's middle then
-    tilt: Array  # () [rad], greatest angle between the shield's normal and the ball's way
+    ends_at_rest: Array  # () bool, whether the arm must be at rest at the contact
+    offset: Array  # () [m], greatest distance of the ball from the shield's middle at the contact
+    # () [rad], greatest angle between the shield's normal and the reversed velocity of the ball
+    tilt: Array
     scene: Scene
 
     @property
@@ -93,7 +94,7 @@ class BlockCase:
         return np.shape(self.gravity)
 
     def clearances(self, angles: Array) -> Array:
-        """Return the least distance (N,) [m] of the arm in poses (N, 6) from its obstacles."""
+        """Return the least distances (N,) [m] of the arm at angles (N, 6) from its obstacles."""
         return least_clearances(self.arm, self.scene, angles)
 
 
@@ -115,26 +116,26 @@ def case(
     """Return a case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
 
     Args:
-        ball_pos: (3,) or (B, 3) [m], where the ball is first seen.
+        ball_pos: (3,) or (B, 3) [m], position of the ball at time 0.
         ball_vel: (3,) or (B, 3) [m/s].
-        delay: () or (B,) [s], until the arm may start, >= 0. Delay, angles, rates and gravity are
-            one value, or one value a case.
-        regime: a key of `planner_jax.robot.arm.REGIMES`: "R1", the limits that the paper's
-            authors plan with, end velocity free; "R2", the data sheet's speeds and 30 rad/s^2,
-            from rest to rest; "R3", R1's limits from rest to rest.
-        wide: whether the ball may be 0.1 m off the shield's middle and 30 degrees off straight
-            on, and not 2 mm and half a degree.
-        anywhere: whether any place on the shield will do, at any angle, as with motions that were
-            not planned for the very ball.
-        scene: without the batch's axes; by default the paper's scene.
-        arm: without the batch's axes; by default an IRB 1600 with a shield.
+        delay: () or (B,) [s], time at which the arm may start, >= 0. Delay, angles, rates and
+            gravity are one value for all cases, or one value per case.
+        regime: a key of `planner_jax.robot.arm.REGIMES`. "R1": limits in the code of
+            [Natarajan2024], end velocity free. "R2": speeds of the data sheet and 30 rad/s^2, from
+            rest to rest. "R3": limits of R1, from rest to rest.
+        wide: whether a contact may be 0.1 m off the shield's middle and tilted by 30 degrees,
+            instead of 2 mm and half a degree.
+        anywhere: whether a contact may be everywhere on the shield, at any angle, as for motions
+            that were planned for another ball.
+        scene: without batch axes; by default the paper's scene.
+        arm: without batch axes; by default an IRB 1600 with a shield.
         angles: (6,) [rad], at the start; by default the arm's home.
         rates: (6,) [rad/s], at the start.
         gravity: [m/s^2], > 0.
         dtype: of every floating leaf.
 
     Raises:
-        ValueError: there is no such regime; or as of `pj.hit.case`, as all other errors.
+        ValueError: there is no such regime; see `pj.hit.case` for all other errors.
     """
     require_name(REGIMES, "regime", regime)
     require_switch("wide", wide)
@@ -153,28 +154,27 @@ def case(
     def leaf(name: str, value: ArrayLike, *trailing: int) -> Array:
         return array_of(name, value, batch, trailing, dtype)
 
-    def shared(tree: TreeT) -> TreeT:
-        def one(value: ArrayLike) -> Array:
+    def broadcast(tree: TreeT) -> TreeT:
+        def repeat(value: ArrayLike) -> Array:
             value = np.asarray(value)
             kind = np.dtype(dtype) if value.dtype.kind == "f" else value.dtype
             return jnp.asarray(np.broadcast_to(value, batch + value.shape), kind)
 
-        return jax.tree.map(one, tree)
+        return jax.tree.map(repeat, tree)
 
-    chosen = REGIMES[regime]
     offset, tilt = ANYWHERE if anywhere else WIDE if wide else STRICT
-    made = BlockCase(
+    cases = BlockCase(
         ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
         gravity=leaf("gravity", gravity),
         delay=leaf("delay", delay),
         angles=leaf("angles", angles, 6),
         rates=leaf("rates", rates, 6),
-        arm=shared(arm),
-        limits=shared(chosen.limits),
-        ends_at_rest=jnp.broadcast_to(jnp.asarray(chosen.ends_at_rest), batch),
+        arm=broadcast(arm),
+        limits=broadcast(REGIMES[regime].limits),
+        ends_at_rest=jnp.broadcast_to(jnp.asarray(REGIMES[regime].ends_at_rest), batch),
         offset=leaf("offset", offset),
         tilt=leaf("tilt", tilt),
-        scene=shared(scene),
+        scene=broadcast(scene),
     )
-    require_sound(made, {"ball.pos": "ball_pos", "ball.vel": "ball_vel"})
-    return made
+    require_sound(cases, {"ball.pos": "ball_pos", "ball.vel": "ball_vel"})
+    return cases

@@ -1,10 +1,10 @@
-"""How far an arm and its shield are from what stands around, and from themselves.
+"""Distances of an arm and its shield from obstacles, and between its own links.
 
-Capsules and the shield's face against a pole, the floor, beams, the base and each other. Links that
-are neighbours are left out, and so are links 5 and 6 against the shield that they carry. The shield
-is a plate of 0.01 m, its face the front one, with rounded edges.
+The bodies are capsules and the shield's face; the obstacles are a pole, the floor, beams, the base
+and other links. Neighbouring links are left out, and so are links 5 and 6 against the shield that
+they carry. The shield is a plate of 0.01 m with rounded edges, whose front side is the face.
 
-Functions take N poses of the arm at once, and arrays have these on their last axis: so a processor
+Functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
 """
 
@@ -31,56 +31,56 @@ from planner_jax.space.distances import (
 )
 from planner_jax.task.block.scene import Scene
 
-FAR = 10.0  # [m], how much farther a pole is taken to be that is not there
-# The forearm ends in a fork around the wrist, which a capsule would round off: towards the
-# shield it is no thicker than this share of the way from the wrist to the shield's face.
+FAR = 10.0  # [m], added to the distances from the pole in a scene without one
+# The forearm ends in a fork around the wrist, and its capsule reaches beyond the fork. Against the
+# shield, its radius is at most this share of the distance from the wrist to the shield's face.
 _FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
 _SHIELD_LINK = 5
 
 
 class _Poses(NamedTuple):
-    """Where everything of the arm is in N poses."""
+    """Positions of the parts of an arm in N poses, base frame."""
 
-    ends: Array  # (2, 3, C, N) [m], of the capsules' segments
-    middle: Array  # (3, N) [m], of the shield's plate
-    edges: Array  # (2, 3, N) [m], halves of its edges
+    ends: Array  # (2, 3, C, N) [m], ends of the capsules' axes
+    middle: Array  # (3, N) [m], middle of the shield's plate
+    edges: Array  # (2, 3, N) [m], half edges of the plate
     axes: Array  # (6, 3, N), directions of the joints
-    origins: Array  # (6, 3, N) [m], of the joints
+    origins: Array  # (6, 3, N) [m], positions of the joints
 
 
 class _Pairs(NamedTuple):
-    """P pairs of a body that moves and one that it must not touch."""
+    """P pairs of a moving body and a body that it must not touch."""
 
-    measure: Callable  # of `space.distances`
-    bodies: tuple[Array, ...]  # what it takes, with lanes (P or 1, N) on the last axes
-    thick: Array | float  # (P, 1) or () [m], what both bodies reach beyond that
-    link: np.ndarray | int  # (P,) or (), 0 to 5, that the one turns with
-    fixed: np.ndarray | int = -1  # likewise of the other body; -1 if it stands
-    first: bool = True  # whether the body that moves is the measure's first one
+    measure: Callable  # function of `space.distances`
+    bodies: tuple[Array, ...]  # its arguments; their last axes are (P or 1, N)
+    thick: Array | float  # (P, 1) or () [m], sum of the radii around both bodies
+    link: np.ndarray | int  # (P,) or (), 0 to 5, link of the moving body
+    fixed: np.ndarray | int = -1  # link of the other body; -1 if it does not move
+    first: bool = True  # whether the moving body is the first argument of the measure
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return distances (R, N) [m] of all pairs in N poses; overlapping capsules have negative ones.
+    """Return distances (R, N) [m] of all pairs at angles (N, 6); negative if capsules overlap.
 
-    The first `num_of_pole(arm)` are distances from the pole.
+    The first `num_of_pole(arm)` rows are distances from the pole.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least of `clearances` in each of N poses, (N,) [m]."""
+    """Return the least of the `clearances` at each of N poses, (N,) [m]."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
 def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return how `clearances` change with each joint, (R, 6, N) [m/rad].
+    """Return the derivatives of `clearances` by the joint angles, (R, 6, N) [m/rad].
 
-    A joint that turns both bodies of a pair leaves their distance as it is.
+    A joint that moves both bodies of a pair does not change their distance.
     """
     poses = _poses(arm, angles)
-    # A joint turns about its axis a through an origin o, and a . (o x n) is (a x o) . n.
+    # A joint turns about an axis a through a point o, and  a . (o x n) = (a x o) . n.
     axes, origins = (tuple(jnp.moveaxis(each, 1, 0)) for each in poses[3:])  # 3 times (6, N)
     arms = cross(axes, origins)
     joint = np.arange(6)[:, None]
@@ -96,49 +96,49 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def num_of_pole(arm: Arm) -> int:
-    """Return how many of the pairs are those with the pole: a capsule each, and the shield."""
+    """Return the number of pairs with the pole: the moving capsules and the shield."""
     return len(_from_link(arm, 1)) + 1
 
 
 def _from_link(arm: Arm, first: int) -> np.ndarray:
-    """Return places of the capsules of a link, 1 to 6, and of those behind it."""
+    """Return the indices of the capsules of link `first`, 1 to 6, and of all later links."""
     return np.flatnonzero(np.asarray(arm.capsule_link) >= first - 1)
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
-    """Return where the arm is at angles (N, 6)."""
-    # Held, since the loops over distances would each work them out anew.
+    """Return the positions of the arm's parts at angles (N, 6)."""
+    # Barriers: without them the compiler repeats this computation in the loop of every distance.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
     )
 
-    def turned(rotations: Array, vector: Array) -> Array:
-        """Return vectors (..., 3) of links in the base frame, (..., 3, N)."""
+    def rotate(rotations: Array, vector: Array) -> Array:
+        """Rotate vectors (..., 3) of links to the base frame, (..., 3, N)."""
         x, y, z = (rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
         return x + y + z
 
-    # The base is the last link, where -1 finds it.
+    # The base is the last link, where index -1 finds it.
     num = angles.shape[0]
     fixed = jnp.broadcast_to(jnp.eye(3, dtype=rotations.dtype)[None, :, :, None], (1, 3, 3, num))
     link = np.asarray(arm.capsule_link, np.int32)
     of_links = jnp.concatenate([rotations, fixed])[link]
-    places = jnp.concatenate([origins, jnp.zeros((1, 3, num), origins.dtype)])[link]
+    positions = jnp.concatenate([origins, jnp.zeros((1, 3, num), origins.dtype)])[link]
     shield = rotations[_SHIELD_LINK]
-    face = origins[_SHIELD_LINK] + turned(shield, jnp.asarray(arm.shield_centre))
-    ends = [turned(of_links, arm.capsule_ends[:, k]) + places for k in range(2)]
+    face = origins[_SHIELD_LINK] + rotate(shield, jnp.asarray(arm.shield_centre))
+    ends = [rotate(of_links, arm.capsule_ends[:, k]) + positions for k in range(2)]
     return lax.optimization_barrier(
         _Poses(
             ends=jnp.swapaxes(jnp.stack(ends), 1, 2),
             middle=face - _HALF_THICKNESS * shield[:, 0],
             edges=arm.shield_half * jnp.swapaxes(shield[:, 1:], 0, 1),
-            axes=turned(rotations, jnp.asarray(arm.axis)),
+            axes=rotate(rotations, jnp.asarray(arm.axis)),
             origins=origins,
         )
     )
 
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """Return all pairs, those with the pole first."""
+    """Return all pairs, pairs with the pole first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)
@@ -154,62 +154,37 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     beams = jnp.broadcast_to(beams, (*beams.shape[:3], poses.middle.shape[-1]))
     num_beams = beams.shape[2]
 
-    def with_beams(places: np.ndarray) -> Array:
-        """Return segments (2, 3, K, N) of capsules and of all beams."""
-        return jnp.concatenate([poses.ends[:, :, places], beams], axis=2)
+    def with_beams(index: np.ndarray) -> Array:
+        """Return the axes (2, 3, K, N) of some capsules and of all beams."""
+        return jnp.concatenate([poses.ends[:, :, index], beams], axis=2)
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
     thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
     near_radius = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
-    # Links against what is fixed to the trunk or to the ground; link 2 turns on the trunk itself.
+    # Links against link 1 (the trunk) and beams; link 2 turns on the trunk and is left out there.
     fixed = with_beams(trunk)
-    place, fixture = (
-        np.array(
-            [(k, j) for k in turning for j in range(fixed.shape[2]) if j >= len(trunk) or k in far]
-        )
-    ).T
+    every = ((k, j) for k in turning for j in range(fixed.shape[2]))
+    moving, fixture = np.array([(k, j) for k, j in every if j >= len(trunk) or k in far]).T
     against = fixed[:, :, fixture]
     fixed_radius = jnp.concatenate([radius[trunk], scene.beam_radius])
-    among_radius = radius[place] + fixed_radius[fixture]
+    among_radius = (radius[moving] + fixed_radius[fixture])[:, None]
     of_fixed = np.where(fixture < len(trunk), 0, -1)
     near, (lower, upper) = with_beams(before), jnp.asarray(arm.base_box)
     of_near = np.append(link[before], np.full(num_beams, -1))
     pole = jnp.where(scene.has_pole, scene.pole_radius, -FAR)
-    thick = radius[:, None]
+    thick, plate, shield = radius[:, None], (middle, edges), _SHIELD_LINK
+    to_pole = thick[turning] + pole
 
-    def ends(places: np.ndarray) -> Array:
-        return poses.ends[:, :, places]
+    def ends(index: np.ndarray) -> Array:
+        return poses.ends[:, :, index]
 
     return [
-        _Pairs(
-            segment_to_vertical_line,
-            (ends(turning), scene.pole),
-            thick[turning] + pole,
-            link[turning],
-        ),
-        _Pairs(
-            rectangle_to_vertical_line,
-            (middle, edges, scene.pole),
-            _HALF_THICKNESS + pole,
-            _SHIELD_LINK,
-        ),
-        _Pairs(
-            segment_to_segment,
-            (ends(place), against),
-            among_radius[:, None],
-            link[place],
-            of_fixed,
-        ),
-        _Pairs(
-            segment_to_rectangle,
-            (near, middle, edges),
-            near_radius,
-            _SHIELD_LINK,
-            of_near,
-            first=False,
-        ),
+        _Pairs(segment_to_vertical_line, (ends(turning), scene.pole), to_pole, link[turning]),
+        _Pairs(rectangle_to_vertical_line, (*plate, scene.pole), _HALF_THICKNESS + pole, shield),
+        _Pairs(segment_to_segment, (ends(moving), against), among_radius, link[moving], of_fixed),
+        _Pairs(segment_to_rectangle, (near, *plate), near_radius, shield, of_near, first=False),
         _Pairs(lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
-        _Pairs(lowest_of_rectangle, (middle, edges), _HALF_THICKNESS + scene.floor, _SHIELD_LINK),
+        _Pairs(lowest_of_rectangle, plate, _HALF_THICKNESS + scene.floor, shield),
         _Pairs(segment_to_box, (ends(swung), lower, upper), thick[swung], link[swung]),
-        _Pairs(segment_to_box, (outline, lower, upper), _HALF_THICKNESS, _SHIELD_LINK),
+        _Pairs(segment_to_box, (outline, lower, upper), _HALF_THICKNESS, shield),
     ]

@@ -1,11 +1,11 @@
 """The default planner: a straight motion of the joints if one is free, else least squares.
 
 The shield may meet a ball anywhere between the boxes, with the wrist and the elbow on either side.
-A straight motion of the joints, all of them in step, leads to each of these end poses. The planner
-takes the first straight motion that is in time and touches nothing. Where there is none, it
-optimises end pose, time of contact and motion together by Levenberg-Marquardt, from straight
-motions with a bump to one side, until one keeps every limit. [Natarajan2024] looks its motions up
-in a library instead; here only the bumps are stored.
+A straight motion turns all joints in proportion to one of these end poses. The planner returns the
+first straight motion that is in time and free of collisions. If there is none, Levenberg-Marquardt
+optimises end pose, time of contact and motion together. It starts from straight motions with an
+added bump, until one start leads to a plan that keeps every limit. [Natarajan2024] takes its
+motions from a library; this planner stores only the bumps.
 """
 
 import dataclasses
@@ -72,17 +72,17 @@ _HIGHEST = lax.Precision.HIGHEST
 class Search(Attempt):
     """An attempt: a number of straight motions, then least squares from some starts; static.
 
-    Two cases in three have a straight motion, nearly all of them among the first few.
+    Two cases in three have a straight motion, nearly always among the first few.
     """
 
     starts: int = 8
-    straight: int = 48  # straight motions that are checked
-    tries: int = 15  # starts of least squares
+    straight: int = 48  # number of straight motions
+    tries: int = 15  # number of starts of least squares
     first: int = 0  # index of the first of these starts
-    kept: int = 5  # of the tries, those that are continued after the solver's trial
-    # Whether a single lane refines each start to its end before the next, without a trial.
+    kept: int = 5  # number of starts that are continued after the solver's trial
+    # Whether a single case refines each start to its end before the next start, without a trial.
     in_turn: bool = True
-    # Of starts that led to a plan, hardly any ever cost more than the solver hopes for.
+    # `hope` exceeds the cost of nearly all starts that led to a plan.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -98,47 +98,51 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read where least squares begin: ranks (N,) of poses, and bumps (N, 6) [rad]."""
-    found = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
-    ranks = np.array([start["rank"] for start in found], np.int32)
-    return ranks, np.array([start["bump"] for start in found], np.float32)
+    """Read the starts of least squares: ranks (N,) of end poses, and bumps (N, 6) [rad]."""
+    starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
+    ranks = np.array([start["rank"] for start in starts], np.int32)
+    return ranks, np.array([start["bump"] for start in starts], np.float32)
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest excess over a limit; a centimetre too near counts as a whole limit."""
+    """Return the largest relative excess over a limit; 1 cm below the margin counts as 1."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
 def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
-    """Return the cost by which searches are ranked after their trial, -1 for settled ones."""
+    """Return the cost that ranks searches after their trial; -1 for searches that settled."""
     return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
 def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
-    """Return the indices (num,) of end poses of little effort, mixed so that they differ.
+    """Return the indices (num,) of end poses by rising effort, with noise that adds variety.
 
-    A pose with an effort above `most` is not reached in time.
+    A pose with an effort above `most` is not reached in time, and ranks far behind.
     """
     rng = np.random.default_rng(0)
-    mixed = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
+    noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
     late = jnp.where(poses.effort > most, 10.0 * poses.effort, 0.0)
-    return lax.top_k(-(poses.effort + mixed + late), num)[1]
+    return lax.top_k(-(poses.effort + noise + late), num)[1]
 
 
 def _lift_to_unknowns(
     lift: Array, drift: Array, grams: Array, pushes: Array, joints: JointTerms
 ) -> tuple[Array, Array]:
-    """Return the gradient (n,) and the curvature (n, n) by the unknowns.
+    """Return J^T r (n,) and J^T J (n, n) of all residuals r, by the n = 6 K + 1 unknowns.
 
-    `lift` (W, K) and `drift` (W, 6) are the slopes of the angles at W samples by the steps and by
-    the time of contact; `grams` (W, 7, 7) and `pushes` (W, 7) belong to angles and time.
+    Args:
+        lift: (W, K), derivatives of a joint's angle at W samples by its steps.
+        drift: (W, 6), derivatives of the angles at the samples by the time of contact.
+        grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
+        pushes: (W, 7), J^T r of these residuals.
+        joints: terms of the joints' limits and effort.
     """
     grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
-    carried = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
-    time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (carried + grams_t), axis=1))
+    moved = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
+    time_stiffness = jnp.sum(grams[:, 6, 6] + jnp.sum(drift * (moved + grams_t), axis=1))
     time_push = jnp.sum(pushes[:, 6] + jnp.sum(drift * pushes[:, :6], axis=1))
     stiffness = jnp.einsum("wk,wl,wij->kilj", lift, lift, grams_q, precision=_HIGHEST)
-    coupling = jnp.einsum("wk,wi->ki", lift, carried, precision=_HIGHEST)
+    coupling = jnp.einsum("wk,wi->ki", lift, moved, precision=_HIGHEST)
     steps_push = jnp.einsum("wk,wi->ki", lift, pushes[:, :6], precision=_HIGHEST)
     each = jnp.eye(6, dtype=lift.dtype)
     of_each = joints.curvature[:, :-1, :-1]
@@ -159,21 +163,21 @@ def _lift_to_unknowns(
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class OnlineBlock(Planner):
-    """A planner that meets a ball between the boxes; the cost of a plan is its duration [s]."""
+    """Planner of motions that meet a ball between the boxes; its cost is the duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
-    pieces: int = 10  # of rates
-    points: int = 48  # of the ball's path, with end poses
-    samples: int = 32  # of a motion, at which least squares compute distances
-    worst: int = 8  # samples of least distance, at which slopes are computed
-    checked: int = 96  # samples of the plan that is returned
+    pieces: int = 10  # pieces of the joints' rates
+    points: int = 48  # points of the ball's path with end poses
+    samples: int = 32  # samples of a motion at which least squares compute distances
+    worst: int = 8  # samples with the least distances, at which least squares compute derivatives
+    checked: int = 96  # samples of the returned plan at which limits are checked
     margin: float = 0.003  # [m], least distance from everything
-    pole_margin: float = 0.012  # [m], least distance from the pole, which samples may miss
-    slack: float = 0.004  # share of every limit that is kept free
-    # Whether motions from rest to rest are as quick as limits allow, and the quickest straight
-    # motion is taken: the arm then stands and waits for the ball. Otherwise the arm moves until
-    # the ball is there, which needs less torque.
+    pole_margin: float = 0.012  # [m], least distance from the pole; covers gaps between samples
+    slack: float = 0.004  # share of every limit that plans do not use
+    # Whether motions from rest to rest are as fast as limits allow, and the fastest straight motion
+    # is selected: the arm then waits for the ball at standstill. Otherwise the arm moves until the
+    # contact, which needs less torque.
     brisk: bool = False
     weights: Weights = Weights()
     searches: tuple[Search, ...] = _SEARCHES
@@ -183,7 +187,7 @@ class OnlineBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches, in order."""
+        """Searches in their order."""
         return self.searches
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -196,7 +200,7 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(case, poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch, all starts of all cases in step."""
+        """Return the plans of a batch; all starts of all cases are refined in step."""
 
         def solve_one(case: BlockCase) -> BlockPlan:
             flight, poses, plan, starts = self.propose(case, attempt)
@@ -212,10 +216,10 @@ class OnlineBlock(Planner):
         """Search the straight motions of one case, and choose the starts of least squares.
 
         Returns:
-            flight: of the ball.
+            flight: times at which the ball can be met.
             poses: end poses at which the shield meets the ball.
             plan: the best straight motion, solved or not.
-            starts: (N, n), unknowns, one row for each of the attempt's tries.
+            starts: (N, n), unknowns; a row for each of the attempt's tries.
         """
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
@@ -252,14 +256,14 @@ class OnlineBlock(Planner):
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
-        """Return the plan to which least squares lead from a start (n,)."""
+        """Return the plan that least squares find from a start (n,)."""
         end = least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def refine_in_turn(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Refine one start (N, n) after another until one leads to a plan."""
+        """Refine the starts (N, n) one by one until one leads to a plan."""
         tries = jnp.where(flight.comes, attempt.tries, 0)
         refine = lambda k: self.refine(case, flight, starts[k], attempt.solver)  # noqa: E731
         return first_solved(refine, tries, best)
@@ -267,21 +271,21 @@ class OnlineBlock(Planner):
     def refine_cheapest_first(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Try every start (N, n) for a few steps, then refine the cheapest until one is solved."""
+        """Try each start (N, n) for a few steps, then refine the cheapest until one is solved."""
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, attempt.tries
         total = jnp.where(flight.comes, tries + min(attempt.kept, tries), 0)
 
-        def next_one(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
+        def take_turn(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
             k, searches, costs, best = turn
             is_trial = k < tries
-            place = jnp.where(is_trial, k, jnp.argmin(costs))
+            index = jnp.where(is_trial, k, jnp.argmin(costs))
             most = jnp.where(is_trial, solver.trial, solver.max_steps)
             search = continue_search(
-                model, jax.tree.map(lambda leaf: leaf[place], searches), solver, most
+                model, jax.tree.map(lambda leaf: leaf[index], searches), solver, most
             )
-            searches = jax.tree.map(lambda old, new: old.at[place].set(new), searches, search)
-            costs = costs.at[place].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
+            searches = jax.tree.map(lambda old, new: old.at[index].set(new), searches, search)
+            costs = costs.at[index].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
             plan = lax.cond(
                 is_trial,
                 lambda search: best,
@@ -295,12 +299,12 @@ class OnlineBlock(Planner):
 
         searches = jax.vmap(lambda point: start_search(point, solver))(starts)
         turn = (jnp.zeros((), jnp.int32), searches, jnp.full(tries, jnp.inf, starts.dtype), best)
-        return lax.while_loop(is_open, next_one, turn)[-1]
+        return lax.while_loop(is_open, take_turn, turn)[-1]
 
     def refine_in_step(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Try all starts (N, n) for a few steps, then refine the cheapest ones, all in step."""
+        """Try all starts (N, n) for a few steps, then refine the cheapest, all in step."""
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver = attempt.solver
         begin = lambda point: start_search(point, solver)  # noqa: E731
@@ -314,28 +318,31 @@ class OnlineBlock(Planner):
         plan = jax.tree.map(lambda leaf: leaf[least], plans)
         return select(plan, best, ~is_solved(best.status))
 
-    def encode_straight(self, case: BlockCase, poses: EndPoses, place: Array) -> Array:
+    def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
         """Return the unknowns (n,) of the straight motion to a pose."""
-        time = poses.time[place]
+        time = poses.time[index]
         duration = jnp.maximum(time - case.delay, 1e-3)
-        turned = poses.angles[place] - coast(case, duration, self.pieces)
+        turned = poses.angles[index] - coast(case, duration, self.pieces)
         shapes = jnp.asarray(all_profiles(self.pieces)[0], turned.dtype)
-        steps = shapes[poses.profile[place]][:, None] * turned
+        steps = shapes[poses.profile[index]][:, None] * turned
         return jnp.append(steps.reshape(-1), time)
 
     def decode(self, case: BlockCase, point: Array) -> tuple[Array, Array, Array]:
-        """Return steps (K, 6), first rates times the duration (6,), and the duration () [s]."""
+        """Return the steps (K, 6), the first rates times the duration (6,), and the duration ()."""
         steps = point[:-1].reshape(self.pieces, 6)
         duration = jnp.maximum(point[-1] - case.delay, 1e-3)
         last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
         return steps.at[-1].set(last), case.rates * duration, duration
 
     def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return the sum of squares of contact, limits of joints, distances and effort."""
+        """Return the local model of the cost, the sum of the squared residuals.
+
+        Residuals: contact, limits of the joints, distances below their margins, and effort.
+        """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
         joints = joint_terms(case, steps, first, duration, self.weights, 1.0 - self.slack)
-        # Samples: the end, and those at which the arm comes nearest to something.
+        # Derivatives are computed at the end and at the samples with the least distances.
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = angles_at(case.angles, first, steps, shares)
         gaps = lax.optimization_barrier(clearances(case.arm, case.scene, angles))  # (R, S)
@@ -345,11 +352,11 @@ class OnlineBlock(Planner):
         slopes = clearance_slopes(case.arm, case.scene, angles[worst])  # (R, 6, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
-        # Held, since products would work them out anew for each of their terms.
+        # Barrier: without it the compiler repeats this computation in each term of the products.
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
-        # Distances do not depend on the time.
+        # Distances do not depend on the time of contact.
         grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
         rows, row_slopes, contact_excess = contact_terms(
             case, flight, angles[-1], point[-1], self.weights
@@ -363,8 +370,8 @@ class OnlineBlock(Planner):
         lift, drift = of_steps[chosen], of_first[chosen][:, None] * case.rates  # (W + 1, K), (., 6)
         gradient, curvature = _lift_to_unknowns(lift, drift, grams, pushes, joints)
         size = 6 * pieces
-        held = jnp.where(case.ends_at_rest, 0.0, 1.0)
-        free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(held)
+        ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
+        free = jnp.ones(size + 1, dtype).at[size - 6 : size].set(ends_free)
         too_near = near[0] - 0.3 * self.margin
         return Model(
             cost=joints.cost + jnp.sum(rows**2) + jnp.sum(short**2),
@@ -374,13 +381,16 @@ class OnlineBlock(Planner):
         )
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
-        """Return the plan of a point (n,) after steps of least squares, checked at more samples."""
+        """Return the plan of the unknowns (n,), with its limits checked at more samples.
+
+        `steps` is the number of steps of least squares that led to the unknowns.
+        """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
-        # Between knots, too, where a joint may turn back beyond its limit.
+        # Between knots, where a joint may exceed its position limit and turn back.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
         joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle) / half) - 1.0)
@@ -405,5 +415,5 @@ class OnlineBlock(Planner):
 
 
 def brisk(**fields: object) -> OnlineBlock:
-    """Return an `OnlineBlock` with motions that end as early as possible; the arm then waits."""
+    """Return an `OnlineBlock` whose motions end as early as possible; the arm then waits."""
     return OnlineBlock(**{"searches": _BRISK, "brisk": True, **fields})

@@ -1,4 +1,4 @@
-"""Poses at which the shield meets a ball, how well, and the straight motions that lead there."""
+"""End poses at which the shield meets a ball, their straight motions, and residuals of contacts."""
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,9 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import Weights, profiles, sums
 from planner_jax.task.block.scene import entry_time
 
-_PLANE = 1e-3  # [m], how far from the shield's plane the ball may be at the contact
-# Where on the shield balls are met, in shares of the greatest offset: along its two edges.
-_PLACES = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
+_PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
+# Offsets of the ball from the shield's middle along the two edges, over the greatest offset.
+_OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
 
 
 @struct.dataclass
@@ -23,22 +23,22 @@ class EndPoses:
     """C poses, and the effort of the straight motion to each."""
 
     angles: Array  # (C, 6) [rad]
-    time: Array  # (C,) [s], of the contact
-    effort: Array  # (C,), greatest share of a limit that the motion takes; infinite without a pose
-    profile: Array  # (C,) int32, place in `all_profiles`
+    time: Array  # (C,) [s], time of the contact
+    effort: Array  # (C,), greatest share of a limit that the motion uses; infinite without a pose
+    profile: Array  # (C,) int32, index in `all_profiles`
 
 
 @struct.dataclass
 class Flight:
-    """The times at which a ball can be met."""
+    """Times at which a ball can be met."""
 
-    earliest: Array  # () [s], when it gets into the outer box
-    latest: Array  # () [s], when it gets into the inner one
-    comes: Array  # () bool, whether it does both
+    earliest: Array  # () [s], entry of the ball into the outer box
+    latest: Array  # () [s], entry into the inner box
+    comes: Array  # () bool, whether the ball enters both
 
 
 def flight_of(case: BlockCase) -> Flight:
-    """Return when the ball of a case can be met."""
+    """Return the times at which the ball of a case can be met."""
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
     latest, hits = entry_time(scene.inner, case.ball, case.gravity)
@@ -46,13 +46,16 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the profiles (P, K) of `motion.profiles`, and which end at rest, (P,) bool."""
+    """Return all profiles (P, K) of `motion.profiles`, and whether each ends at rest, (P,) bool."""
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 
 
 def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return peak rates and accelerations of all profiles (P,) in 1 s, and which end at rest."""
+    """Return peak rates and peak accelerations (P,) of all profiles, and which end at rest.
+
+    The profiles turn a joint by 1 rad in 1 s.
+    """
     shapes, rests = all_profiles(pieces)
     rises = np.diff(shapes, axis=1, prepend=0.0) * pieces
     return np.max(np.abs(shapes), axis=1), np.max(np.abs(rises), axis=1), rests
@@ -61,23 +64,23 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def end_poses(
     case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
 ) -> EndPoses:
-    """Return eight poses at each of some points of the ball's path between the boxes.
+    """Return eight end poses for each of `points` points of the ball's path between the boxes.
 
-    The joint at the flange, whose turns leave the ball on the shield, stays as it is. Straight
-    motions of so many pieces have the profile of the least effort, or, from rest to rest, of the
-    least time if `quickest`.
+    Joint 6 turns the shield in its own plane and keeps its angle. The straight motion to a pose has
+    `pieces` pieces and the profile of least effort; with `quickest`, motions from rest to rest have
+    the profile of least time.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)
-    place = case.offset * jnp.asarray(_PLACES[np.arange(points) % len(_PLACES)], time.dtype)
+    offset = case.offset * jnp.asarray(_OFFSETS[np.arange(points) % len(_OFFSETS)], time.dtype)
 
-    def of_point(time: Array, place: Array) -> tuple[Array, Array]:
+    def solve_point(time: Array, offset: Array) -> tuple[Array, Array]:
         ball = drag_free_flight(case.ball, time, case.gravity)
         rotation = frame_of(face_ball(ball.vel))
-        shift = place[0] * rotation[:, 1] + place[1] * rotation[:, 2]
+        shift = offset[0] * rotation[:, 1] + offset[1] * rotation[:, 2]
         return inverse_kinematics(case.arm, rotation, ball.pos + shift)
 
-    angles, found = jax.vmap(of_point)(time, place)
+    angles, found = jax.vmap(solve_point)(time, offset)
     angles = angles.at[:, :, 5].set(case.angles[5]).reshape(-1, 6)
     time = jnp.repeat(time, 8)
     duration = jnp.maximum(time - case.delay, 1e-3)
@@ -87,35 +90,35 @@ def end_poses(
     of_rise = jnp.max(turned / case.limits.acceleration, axis=1) / duration**2
     of_rates, of_rises = of_rate[:, None] * rates, of_rise[:, None] * rises
     efforts = jnp.maximum(of_rates, of_rises)
-    is_one = rests | ~case.ends_at_rest
+    is_allowed = rests | ~case.ends_at_rest
     paces = efforts
     if quickest:
         paces = jnp.where(case.ends_at_rest, jnp.maximum(of_rates, jnp.sqrt(of_rises)), efforts)
-    profile = jnp.argmin(jnp.where(is_one, paces, jnp.inf), axis=1)
-    effort = jnp.min(jnp.where(is_one, efforts, jnp.inf), axis=1)
-    is_there = found.reshape(-1) & (time > case.delay) & flight.comes
+    profile = jnp.argmin(jnp.where(is_allowed, paces, jnp.inf), axis=1)
+    effort = jnp.min(jnp.where(is_allowed, efforts, jnp.inf), axis=1)
+    exists = found.reshape(-1) & (time > case.delay) & flight.comes
     return EndPoses(
         angles=angles,
         time=time,
-        effort=jnp.where(is_there, effort, jnp.inf),
+        effort=jnp.where(exists, effort, jnp.inf),
         profile=profile.astype(jnp.int32),
     )
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return where joints stop, (..., 6) [rad], if they brake evenly in the first piece."""
+    """Return the angles (..., 6) [rad] at which joints stop if they brake in the first piece."""
     of_first = sums(pieces, (1.0,))[0][0]
     return case.angles + of_first * duration[..., None] * case.rates
 
 
 def face_ball(velocity: Array) -> Array:
-    """Return the direction (3,) against a ball's velocity (3,)."""
+    """Return the unit vector (3,) against a ball's velocity (3,)."""
     square = jnp.maximum(jnp.sum(velocity**2), 1e-12)
     return -velocity / jnp.sqrt(square)
 
 
 def frame_of(normal: Array) -> Array:
-    """Return a rotation (3, 3) whose first column is a direction (3,) and second is horizontal."""
+    """Return a rotation (3, 3) whose first column is `normal` (3,) and second is horizontal."""
     flat = jnp.sqrt(jnp.maximum(normal[0] ** 2 + normal[1] ** 2, 1e-12))
     side = jnp.stack([-normal[1], normal[0], jnp.zeros_like(flat)]) / flat
     return jnp.stack([normal, side, jnp.cross(normal, side)], axis=1)
@@ -127,9 +130,10 @@ def contact_terms(
     """Return the residuals of a contact at angles (6,) [rad] and a time () [s].
 
     Returns:
-        rows: (7,): off the plane, off the middle, tilted, too early or late.
-        slopes: (7, 7), by the angles and the time.
-        excess: (), largest over a limit, relative, whatever the weights.
+        rows: (6,), weighted residuals: distance from the shield's plane, offset from its middle
+            (2), tilt (2), and time too early or too late.
+        slopes: (6, 7), derivatives of the rows by the angles and the time.
+        excess: (), largest relative excess over a limit, without weights.
     """
     rotation, middle = shield_pose(case.arm, angles)
     jacobian = shield_jacobian(case.arm, angles)
@@ -137,41 +141,41 @@ def contact_terms(
     velocity = ball.vel
     normal = rotation[:, 0]
     away = ball.pos - middle
-    turns = jacobian[3:].T  # (6, 3), the axes
+    turns = jacobian[3:].T  # (6, 3), joint axes
     moves = jacobian[:3].T
     by_normal = jnp.cross(turns, normal)
-    # Off the plane of the shield.
+    # Distance from the plane of the shield.
     off = jnp.sum(away * normal)
     off_slope = jnp.append(
         product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal)
     )
-    # Off its middle, within the plane.
+    # Offset from its middle, within the plane.
     beside = away - off * normal
     beside_slope = jnp.concatenate([-moves, velocity[None]])
     beside_slope -= jnp.sum(beside_slope * normal, axis=1)[:, None] * normal
     distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
     spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
     beside_share = jnp.maximum(1.0 - spare / distance, 0.0)
-    # Tilted against the ball's path.
-    wanted = face_ball(velocity)
-    tilt = jnp.cross(wanted, normal)
-    tilt_slope = jnp.cross(wanted, by_normal)
+    # Tilt against the ball's path.
+    facing = face_ball(velocity)
+    tilt = jnp.cross(facing, normal)
+    tilt_slope = jnp.cross(facing, by_normal)
     sine = jnp.sqrt(jnp.maximum(jnp.sum(tilt**2), 1e-12))
-    angle = jnp.arctan2(sine, jnp.sum(wanted * normal))
-    room = jnp.maximum(0.93 * case.tilt - np.deg2rad(0.5), 0.0)
-    tilt_share = jnp.maximum(1.0 - room / angle, 0.0) * angle / sine
-    frame = frame_of(wanted)[:, 1:]
+    angle = jnp.arctan2(sine, jnp.sum(facing * normal))
+    allowed = jnp.maximum(0.93 * case.tilt - np.deg2rad(0.5), 0.0)
+    tilt_share = jnp.maximum(1.0 - allowed / angle, 0.0) * angle / sine
+    frame = frame_of(facing)[:, 1:]
     early = jnp.maximum(flight.earliest + 2e-3 - time, 0.0)
     late = jnp.maximum(time - flight.latest + 2e-3, 0.0)
     edge = jnp.where(early > 0.0, -1.0, jnp.where(late > 0.0, 1.0, 0.0))
-    # A millisecond counts as much as a centimetre.
+    # 1 ms weighs as much as 1 cm.
     pace = 10.0 * weights.meeting
     across = rotation[:, 1:]
-    # The ball's path bends: its direction turns with the part of gravity across it.
-    pace_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
+    # The direction of flight turns with the component of gravity perpendicular to it.
+    speed_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
     pull = jnp.zeros(3, angles.dtype).at[2].set(case.gravity)
-    bent = (pull - wanted * jnp.sum(wanted * pull)) / jnp.sqrt(pace_squared)
-    by_time = jnp.cross(bent, normal)
+    turning = (pull - facing * jnp.sum(facing * pull)) / jnp.sqrt(speed_squared)
+    by_time = jnp.cross(turning, normal)
     rows = jnp.concatenate(
         [
             weights.meeting * off[None],

@@ -1,8 +1,9 @@
-"""Motions of joints whose rates change evenly between equal knots.
+"""Motions of joints whose rates are linear between equidistant knots.
 
-A motion is given by its steps (K, 6) [rad]: the rates at the knots 1 to K times the duration T, so
-that how far the joints turn does not depend on T. Angles are quadratic from knot to knot; rates are
-greatest at knots, and accelerations constant in between, so that limits at knots are exact.
+The parameters of a motion are its steps (K, 6) [rad]: the rates at the knots 1 to K times the
+duration T, so that the turned angles do not depend on T. Angles are quadratic between knots. Rates
+have their peaks at knots and accelerations are constant in between, so that checks at knots are
+exact.
 """
 
 import dataclasses
@@ -19,27 +20,27 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Factors of the residuals of least squares; static."""
+    """Weights of the residuals of least squares; static."""
 
     meeting: float = 100.0  # [1/m]
     tilt: float = 30.0  # [1/rad]
-    limits: float = 30.0  # of relative excesses
+    limits: float = 30.0  # of relative excesses over limits
     clearance: float = 100.0  # [1/m]
-    effort: float = 0.1  # of accelerations in shares of their limits
+    effort: float = 0.1  # of accelerations over their limits
 
 
 @functools.cache
 def sums(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights with which steps add up to angles at shares of the duration.
+    """Return the weights with which steps sum up to angles at shares of the duration.
 
     Returns:
-        first: (N,), of the rates at the beginning, times the duration.
-        steps: (N, K), of the steps.
+        first: (N,), weights of the rates at the start times the duration.
+        steps: (N, K), weights of the steps.
     """
-    place = np.asarray(shares)[:, None] * pieces
+    position = np.asarray(shares)[:, None] * pieces
     knots = np.arange(pieces + 1)
-    # The integral of a hat of height one around each knot, up to the place.
-    left, right = np.clip(place - knots + 1.0, 0.0, 1.0), np.clip(place - knots, 0.0, 1.0)
+    # Integral of the hat function of each knot, from the start to the position.
+    left, right = np.clip(position - knots + 1.0, 0.0, 1.0), np.clip(position - knots, 0.0, 1.0)
     weights = 0.5 * left**2 + right - 0.5 * right**2
     weights[:, 0] -= 0.5
     weights /= pieces
@@ -57,28 +58,31 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 
 
 class JointTerms(NamedTuple):
-    """Squared residuals of the joints' limits and effort, by each joint's K steps and the time."""
+    """Cost r . r of the joints' limits and effort; J derives the residuals r of each joint.
 
-    cost: Array  # ()
-    gradient: Array  # (6, K + 1)
-    curvature: Array  # (6, K + 1, K + 1)
-    excess: Array  # (), largest over a limit, relative
+    The unknowns are the K steps of the joint and the time of contact.
+    """
+
+    cost: Array  # (), r . r
+    gradient: Array  # (6, K + 1), J^T r
+    curvature: Array  # (6, K + 1, K + 1), J^T J
+    excess: Array  # (), largest relative excess over a limit
 
 
 def joint_terms(
     case: BlockCase, steps: Array, first: Array, duration: Array, weights: Weights, most: float
 ) -> JointTerms:
-    """Return the terms of limits and effort of the joints.
+    """Return the cost of the joints' limits and effort, with its derivatives.
 
-    Steps and first rates are as of `angles_at`; `most` is the usable share of every limit.
+    See `angles_at` for `steps` and `first`; `most` is the share of every limit that may be used.
     """
     pieces, dtype = steps.shape[0], steps.dtype
     knots = tuple(np.arange(1, pieces + 1) / pieces)
     of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, knots))
     rise = jnp.asarray(np.eye(pieces) - np.eye(pieces, k=-1), dtype)
     rates = steps / duration
-    risen = steps - jnp.concatenate([first[None], steps[:-1]])
-    accelerations = risen * (pieces / duration**2)
+    rises = steps - jnp.concatenate([first[None], steps[:-1]])
+    accelerations = rises * (pieces / duration**2)
     angles = angles_at(case.angles, first, steps, knots)
     middle = 0.5 * (case.arm.upper + case.arm.lower)
     half = 0.5 * (case.arm.upper - case.arm.lower)
@@ -86,12 +90,12 @@ def joint_terms(
     def row(
         value: Array, by_steps: Array, by_time: Array, slope: float | Array
     ) -> tuple[Array, Array]:
-        """Return residuals (6, K) and their slopes (6, K, K + 1)."""
+        """Return residuals (6, K) and their derivatives (6, K, K + 1)."""
         slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 
     def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
-        """Return the residuals of shares beyond `most`, and their slopes."""
+        """Return the residuals of shares above `most`, and their derivatives."""
         over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
         sign = weights.limits * jnp.sign(share) * (over > 0.0)
         return row(over, by_steps, by_time, sign)
@@ -100,9 +104,9 @@ def joint_terms(
     rate_shares = rates / case.limits.velocity
     of_rise = rise * (pieces / duration**2 / case.limits.acceleration[:, None, None])
     rise_shares = accelerations / case.limits.acceleration
-    # The first of the rises falls with the duration by half as much as the others.
-    carried = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
-    by_time = (-2.0 * rise_shares - carried / case.limits.acceleration) / duration
+    # The first rise contains `first`, which grows in proportion to the duration.
+    of_start = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
+    by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration) / duration
     angle_shares = (angles - middle) / half
     of_angle = of_steps / half[:, None, None]
     effort = weights.effort
@@ -124,13 +128,13 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return steps (K, 6) that turn joints by a height (6,) [rad] and back: a squared sine."""
+    """Return steps (K, 6) of a squared sine that turns joints by `height` (6,) [rad] and back."""
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height
 
 
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
-    """Return the motion as a piecewise polynomial: K pieces of degree 2."""
+    """Return a motion as a piecewise polynomial with K pieces of degree 2."""
     pieces = steps.shape[0]
     step = duration / pieces
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)
@@ -146,9 +150,11 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
 def speed_up(
     motion: PiecewisePolynomial, velocity: Array, acceleration: Array
 ) -> tuple[PiecewisePolynomial, Array]:
-    """Return a motion of degree 2 from rest to rest along its path as quick as limits (6,) allow.
+    """Accelerate a motion of degree 2 from rest to rest along its path as far as limits (6,) allow.
 
-    It is never slower. Also return the new duration over the old one, () in (0, 1].
+    Returns:
+        motion: as fast as the given one, or faster.
+        pace: () in (0, 1], new duration over the old one.
     """
     rates = motion.coeffs[:, 1] / velocity
     rises = 2.0 * motion.coeffs[:, 2] / acceleration
@@ -160,9 +166,9 @@ def speed_up(
 
 
 def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Return a motion, and after it all joints slowing down evenly to a stop at the same time.
+    """Append a piece in which all joints brake evenly and stop at the same time.
 
-    The piece that is added has no length where the motion has to end at rest.
+    The piece lasts 0 s if the case requires that the motion ends at rest.
     """
     end = jnp.sum(motion.durations)
     angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
@@ -178,17 +184,16 @@ def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePol
 
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Return shapes (P, K) of steps that turn a joint by 1 rad from rest, with even ramps.
+    """Return steps (P, K) that turn a joint by 1 rad from rest, with linear ramps of the rate.
 
-    Ramps take a whole number of pieces: from one up to half of them, and up to all of them where
-    the motion need not end at rest.
+    The ramps last 1 to K / 2 pieces, or 1 to K pieces if the motion need not end at rest.
     """
     knots = np.arange(1, pieces + 1)
-    found = []
+    shapes = []
     for ramp in range(1, (pieces // 2 if ends_at_rest else pieces) + 1):
         shape = np.minimum(knots / ramp, 1.0)
         if ends_at_rest:
             shape = np.minimum(shape, (pieces - knots) / ramp)
         rates = np.concatenate([[0.0], shape])
-        found.append(shape * pieces / np.sum(0.5 * (rates[1:] + rates[:-1])))
-    return np.array(found)
+        shapes.append(shape * pieces / np.sum(0.5 * (rates[1:] + rates[:-1])))
+    return np.array(shapes)

@@ -15,17 +15,16 @@ from planner_jax.task.block.motion import polynomial
 
 @struct.dataclass
 class BlockPlan(ArmPlan):
-    """One plan, or a batch of them with a leading axis on every leaf.
+    """One plan, or a batch with a leading axis on every leaf.
 
-    The motion begins when the arm may start, at the case's `delay`, and the arm stays where it
-    ends if it must be at rest there.
+    The motion starts at the case's `delay`. If it must end at rest, the arm stays at its end.
     """
 
-    contact_time: Array  # () [s], when the shield meets the ball, since the ball was first seen
+    contact_time: Array  # () [s], contact of shield and ball, since the ball was first seen
 
 
 def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
-    """Return the plan of a case without a solution: not solved, standing for a second."""
+    """Return an unsolved plan in which the arm stands for a second."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
     still = jnp.zeros((pieces, 6), case.angles.dtype)
     second = jnp.ones((), case.angles.dtype)
@@ -47,18 +46,17 @@ def has_nan(case: BlockCase) -> Array:
 
 
 def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
-    """Return the status () int32 of a plan, or the status that explains why there is none.
+    """Return the status () int32 of a plan; of an unsolved plan the status that explains why.
 
-    Without a plan the status is NON_FINITE if the case has a NaN; OUT_OF_REACH if the ball does not
-    get into both boxes, or the shield nowhere to it; and BLOCKED if the arm touches something where
-    it starts.
+    NON_FINITE: the case has a NaN. OUT_OF_REACH: the ball does not enter both boxes, or the shield
+    reaches it nowhere. BLOCKED: the arm touches something at the start.
     """
 
-    def reason() -> Array:
+    def explain() -> Array:
         nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
         why = jnp.where(nearest < 0.0, Status.BLOCKED, status)
         why = jnp.where(jnp.any(jnp.isfinite(poses.effort)), why, Status.OUT_OF_REACH)
         return jnp.where(has_nan(case), Status.NON_FINITE, why).astype(jnp.int32)
 
-    # One ball that is solved does not wait for it.
-    return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), reason)
+    # `cond` skips the check of a single case that is solved.
+    return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), explain)

@@ -1,8 +1,8 @@
-"""Re-planning of blocks: from the motion that is carried out, for what is now known of the ball.
+"""Re-planning of blocks: from the motion under way, for a new estimate of the ball.
 
-From one look at a ball to the next its believed flight moves by centimetres, and so does the best
-motion. What is left of the previous one, its contact moved along with the ball, is a start from
-which a few steps of least squares suffice; a search from scratch stays for what they do not mend.
+Between two observations the estimated flight changes by centimetres, and so does the best motion.
+The remainder of the previous motion, with its contact moved along with the ball, is a start from
+which a few steps of least squares suffice. Cases that these do not solve are planned from scratch.
 """
 
 import dataclasses
@@ -29,12 +29,12 @@ from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import evaluate
 
-_SHORTEST = 0.02  # [s], of a guess from a motion that has all but ended
+_SHORTEST = 0.02  # [s], least duration of the start from a motion that has nearly ended
 
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """An attempt: steps of least squares from what is left of the previous motion; static."""
+    """An attempt: least squares from the remainder of the previous motion; static."""
 
     solver: LevenbergConfig = LevenbergConfig(*(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0)
 
@@ -42,11 +42,11 @@ class Warm(Attempt):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WarmBlock(Planner):
-    """Motions bent from those that are carried out; of tasks as `ReplanBlock.begin` makes them."""
+    """Planner that refines the motion under way; its cases are results of `ReplanBlock.begin`."""
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
-    planner: OnlineBlock = OnlineBlock()  # whose unknowns, limits and weights these are
+    planner: OnlineBlock = OnlineBlock()  # has the unknowns, limits and weights
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
@@ -55,10 +55,10 @@ class WarmBlock(Planner):
         return planner.refine(case, flight_of(case), self.rest(task), attempt.solver)
 
     def rest(self, task: Replanning) -> Array:
-        """Return the unknowns of the remainder of the previous motion until the contact.
+        """Return the unknowns (n,) of the remainder of the previous motion until the contact.
 
-        The contact is moved to when the ball, as it is now known, is nearest to where the shield
-        was to meet it.
+        The contact is moved to the time at which the newly estimated ball is nearest to the
+        previous position of contact.
         """
         case, previous = task.case, task.previous
         ends = jnp.sum(previous.motion.durations)
@@ -78,20 +78,20 @@ class WarmBlock(Planner):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanBlock(Planner):
-    """Blocks re-planned from the motion that is carried out, as `pj.replan` asks for them.
+    """Planner for `pj.replan` that starts from the motion under way.
 
-    Times of cases and plans go on counting from when the ball was first seen; what moves on is the
-    delay, from which on the new motion is carried out.
+    Times of cases and plans count from the first observation of the ball in every round. The new
+    motion starts at the case's `delay`, which grows from round to round.
     """
 
     case_type: ClassVar[type] = Replanning
     plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
-    planner: OnlineBlock = OnlineBlock()  # for what the warm start does not solve
+    planner: OnlineBlock = OnlineBlock()  # for cases that the warm start does not solve
 
     @property
     def inner(self) -> OnlineBlock:
-        """The planner of the cases that are planned again."""
+        """Planner of the cases that are planned from scratch."""
         return self.planner
 
     def begin(
@@ -104,12 +104,12 @@ class ReplanBlock(Planner):
         angles: ArrayLike | None = None,
         rates: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remainder of a case, or of a batch, some time into its motion.
+        """Return the remainder of a case, or of a batch, `elapsed` seconds into its motion.
 
-        `pj.replan` describes cases, the previous plan, the elapsed time and the errors. `ball` is
-        the estimated ball at the time 0 of the cases, by default the cases' own. `angles` [rad] and
-        `rates` [rad/s] of the arm at the start of the new motion are (6,) or (B, 6), by default the
-        previous plan's, which brakes after its end.
+        See `pj.replan` for cases, the previous plan, the elapsed time and the errors. `ball` is the
+        estimated ball at time 0 of the cases, by default the ball of the cases. `angles` [rad] and
+        `rates` [rad/s] at the start of the new motion are (6,) or (B, 6). By default they are the
+        states of the previous plan, which brakes after its end.
         """
         elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
         if ball is not None:
@@ -130,7 +130,7 @@ class ReplanBlock(Planner):
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """Return the plans of one case or of a batch: warm, and from scratch where that fails."""
+        """Return the plans of one case or of a batch, from scratch where the warm start fails."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:
@@ -142,7 +142,7 @@ class ReplanBlock(Planner):
 
 @jax.jit
 def _state(case: BlockCase, plan: BlockPlan, elapsed: Array) -> tuple[Array, Array]:
-    """Return angles (6,) [rad] and rates (6,) [rad/s] some time [s] into the motion of a plan."""
+    """Return angles (6,) [rad] and rates (6,) [rad/s] at a time [s] since the motion's start."""
     motion = append_braking(case, plan.motion)
     is_over = elapsed >= jnp.sum(motion.durations)
     elapsed = jnp.minimum(elapsed, jnp.sum(motion.durations))

@@ -1,4 +1,4 @@
-"""What an arm protects, and what stands in its way [Natarajan2024, Sections IV-C and V-A].
+"""The box that an arm protects, and the obstacles [Natarajan2024, Sections IV-C and V-A].
 
 Robot base frame, z up, SI units.
 """
@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike
 from planner_jax.ball.flight import BallState, drag_free_fall_time
 from planner_jax.core.arithmetic import host_leaf
 
-INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], of the box that is protected
-OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], of the box in which a ball may be met
+INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], protected box
+OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], box in which a ball may be met
 POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m]
 FLOOR = -0.4826  # [m]
-RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], of the square of beams around the pedestal
-RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m]; a beam of 0.025 x 0.076 m lies within the radius
+RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], square of beams around the pedestal
+RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m]; the radius contains a beam of 0.025 x 0.076 m
 
 
 @struct.dataclass
 class Box:
-    """A box along the axes."""
+    """A box whose edges are parallel to the axes."""
 
     lower: Array  # (3,) [m]
     upper: Array  # (3,) [m]
@@ -30,24 +30,23 @@ class Box:
 
 @struct.dataclass
 class Scene:
-    """Two boxes, called domes by the paper, and obstacles."""
+    """Two boxes, which the paper calls domes, and obstacles."""
 
-    inner: Box  # is protected
-    outer: Box  # in it the shield may meet a ball
-    pole: Array  # (2,) [m], axis of a vertical pole, taller than what the arm reaches
+    inner: Box  # protected box
+    outer: Box  # box in which the shield may meet a ball
+    pole: Array  # (2,) [m], axis of a vertical pole without ends
     pole_radius: Array  # () [m]
     has_pole: Array  # () bool
     floor: Array  # () [m], height
-    beam_ends: Array  # (N, 2, 3) [m], capsules around beams
+    beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around beams
     beam_radius: Array  # (N,) [m]
 
 
 def paper_scene(*, has_pole: bool = True) -> Scene:
-    """Return the scene of the paper's simulation, NumPy float32 leaves.
+    """Return the scene of the paper's simulation [Natarajan2024, Fig. 5], NumPy float32 leaves.
 
-    The sizes are those of the authors' model (their repository of the planner); the paper shows
-    them in its Fig. 5. The box that keeps the arm from the camera is left out: the authors' own
-    home pose reaches into it.
+    The sizes are from the model in the authors' repository. Its box around the camera is left out,
+    since the authors' own home pose reaches into it.
     """
 
     def leaf(value: ArrayLike) -> Array:
@@ -76,13 +75,13 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
 
 
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
-    """Return when a ball that comes from outside gets into a box, through a side or the top.
+    """Return the time at which a ball enters a box through a side or the top.
 
-    By components, so that a compiled program of one ball has few loops.
+    The computation is by components, so that the compiled program of one ball has few loops.
 
     Returns:
         time: () [s].
-        enters: () bool; a ball that begins inside, or comes through the bottom, does not.
+        enters: () bool; false for a ball that starts inside, or comes through the bottom.
     """
     between = []
     for axis in range(2):
@@ -96,6 +95,6 @@ def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]
     def height(time: Array) -> Array:
         return ball.pos[2] + ball.vel[2] * time - 0.5 * gravity * time**2
 
-    beside = height(jnp.maximum(from_side, 0.0))
-    time = jnp.where(beside > box.upper[2], from_top, from_side)
+    at_side = height(jnp.maximum(from_side, 0.0))
+    time = jnp.where(at_side > box.upper[2], from_top, from_side)
     return time, (time > 0.0) & (time <= until) & (height(time) > box.lower[2])

@@ -1,4 +1,4 @@
-"""What the registry knows of blocks; imports no JAX."""
+"""Task specification of block for the registry; imports no JAX."""
 
 import dataclasses
 
@@ -10,14 +10,14 @@ class Suite:
     """One kind of throw."""
 
     description: str
-    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's axis to where it is thrown
+    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's axis to the launch
     has_pole: bool = True
 
 
-# The other ranges are those of `planner_jax.task.block.suites`.
+# `planner_jax.task.block.suites` has all other ranges.
 SUITES = {
     "pole": Suite("Throws from 6 to 12 m, a pole in front of the arm."),
-    "open": Suite("The same without a pole.", has_pole=False),
+    "open": Suite("Throws from 6 to 12 m, without a pole.", has_pole=False),
     "short": Suite("Throws from 6 to 8 m, a pole in front of the arm.", distance=(6.0, 8.0)),
 }
 

@@ -1,17 +1,17 @@
 """Named, seeded suites of thrown balls.
 
-[Natarajan2024] throws from 6 to 12 m and says that its 200 projectiles cross both boxes (Section
-V-A); it gives no other range. Those here and in `planner_jax.task.block.spec` are this library's,
-and part of each suite's name: a change of a range is another suite. All draws are uniform.
+The 200 throws of [Natarajan2024, Section V-A] start at 6 to 12 m and cross both boxes; the paper
+gives no other range. The ranges here and in `planner_jax.task.block.spec` belong to this library
+and to the suite's name: another range needs another name. All draws are uniform.
 
-| what | drawn from |
+| quantity | range |
 |---|---|
-| launch | -60 to 60 degrees about the x axis, the suite's distance, -0.48 to 1 m high |
-| aim | anywhere on those of the inner box's sides +x, +y and -y that face the launch |
-| flight time to it | the distance over 7 to 10 m/s |
+| launch | -60 to 60 degrees about the x axis, at the suite's distance, -0.48 to 1 m high |
+| aim | a point on a side +x, +y or -y of the inner box that faces the launch |
+| flight time to the aim | distance over 7 to 10 m/s |
 
-A throw is drawn anew unless the ball, of 0.05 m radius, gets into the outer box through a side or
-the top, from there into the inner box, and touches no pole before. Robot base frame, z up, SI.
+A throw is repeated until the ball, of 0.05 m radius, enters the outer box through a side or the
+top, and then the inner box, without touching the pole. Robot base frame, z up, SI units.
 """
 
 import jax.numpy as jnp
@@ -34,10 +34,10 @@ from planner_jax.task.block.spec import SUITES, TASK, Suite
 
 GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]
-AZIMUTH = np.deg2rad(60.0)  # [rad], greatest, either way
+AZIMUTH = np.deg2rad(60.0)  # [rad], greatest magnitude
 HEIGHT = (-0.48, 1.0)  # [m], of the launch
 SPEED = (7.0, 10.0)  # [m/s], distance over flight time
-_LOOK = 0.002  # [s], between two places of a ball that are looked at
+_STEP = 0.002  # [s], between two samples of a flight
 
 
 def draw(
@@ -52,20 +52,20 @@ def draw(
     delay: float = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Draw throws as a batch of cases in float64, and cast it.
+    """Draw a batch of throws in float64, cast to `dtype`.
 
-    The suite is "pole" by default, "open", "short", or one that another package offers. `regime`,
-    `wide`, `anywhere` and `delay` [s] are those of `case`; the other arguments and the errors are
-    those of `pj.hit.draw`.
+    The suite is "pole" (default), "open", "short", or a suite of another package. See `case` for
+    `regime`, `wide`, `anywhere` and `delay` [s], and `pj.hit.draw` for the other arguments and the
+    errors.
     """
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
     own, randoms = SUITES[suite], make_generators(suite, num, seed, first)
-    thrown = np.array([_throw(own, random) for random in randoms])
+    throws = np.array([_draw_throw(own, random) for random in randoms])
     return case(
-        thrown[:, 0],
-        thrown[:, 1],
+        throws[:, 0],
+        throws[:, 1],
         delay=delay,
         regime=regime,
         wide=wide,
@@ -75,8 +75,8 @@ def draw(
     )
 
 
-def _throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Return the first draw that counts: position [m] and velocity [m/s] at the launch, (2, 3)."""
+def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
+    """Draw until a throw is valid; return its launch position [m] and velocity [m/s], (2, 3)."""
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(
@@ -91,27 +91,28 @@ def _throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
         aim[2] = random.uniform(0.0, INNER_HEIGHT)
         vel = (aim - pos) / duration
         vel[2] += 0.5 * GRAVITY * duration
-        if _counts(suite, pos, vel, duration):
+        if _is_valid(suite, pos, vel, duration):
             return np.stack([pos, vel])
 
 
-def _counts(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Return whether a ball, in the inner box at a time [s], enters both boxes past the pole."""
-    times = np.linspace(0.0, duration, int(np.ceil(duration / _LOOK)) + 1)[:-1]
-    places = pos + vel * times[:, None]
-    places[:, 2] -= 0.5 * GRAVITY * times**2
+def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
+    """Return whether a ball that reaches the inner box after `duration` [s] makes a valid throw."""
+    times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
+    path = pos + vel * times[:, None]
+    path[:, 2] -= 0.5 * GRAVITY * times**2
     if suite.has_pole:
-        away = np.linalg.norm(places[:, :2] - POLE, axis=1)
+        away = np.linalg.norm(path[:, :2] - POLE, axis=1)
         if away.min() < POLE_RADIUS + BALL_RADIUS:
             return False
 
     def within(half: float, height: float) -> np.ndarray:
-        inside = (np.abs(places[:, :2]) < half).all(axis=1)
-        return inside & (places[:, 2] > 0.0) & (places[:, 2] < height)
+        inside = (np.abs(path[:, :2]) < half).all(axis=1)
+        return inside & (path[:, 2] > 0.0) & (path[:, 2] < height)
 
     outer = within(OUTER_HALF, OUTER_HEIGHT)
     if not outer.any() or within(INNER_HALF, INNER_HEIGHT).any():
         return False
     entered = int(outer.argmax())
-    # From there on it stays inside; what came from below was in the box's shadow just before.
-    return bool(outer[entered:].all()) and entered > 0 and places[entered - 1, 2] > 0.0
+    # The ball has to stay inside after its entry. If it came from below, the sample before the
+    # entry has a negative height.
+    return bool(outer[entered:].all()) and entered > 0 and path[entered - 1, 2] > 0.0

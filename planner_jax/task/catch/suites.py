@@ -158,7 +158,7 @@ def draw(
         optional=SUITES[suite].optional,
         dtype=dtype,
     )
-    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))
+    return dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:

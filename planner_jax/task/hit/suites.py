@@ -287,4 +287,4 @@ def to_cases(
         gravity=GRAVITY,
         dtype=dtype,
     )
-    return dataclasses.replace(cases, limits=cases.limits.scaled(limit_scale, cases.gravity))
+    return dataclasses.replace(cases, limits=cases.limits.scale(limit_scale, cases.gravity))

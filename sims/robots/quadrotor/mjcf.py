@@ -1,12 +1,11 @@
 """Reader of a quadrotor's body and rotors from MuJoCo's model format, MJCF, compiled by MuJoCo."""
 
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
+import mujoco
 import numpy as np
 
-from planner_jax.core.errors import MissingExtra
 from planner_jax.robot.quadrotor_file import RobotError, Value
 
 _Mj = Any  # a structure of MuJoCo, whose package has no types
@@ -23,12 +22,7 @@ def describe_mjcf(path: Path) -> dict[str, Value]:
 
     Raises:
         RobotError: the model is not of this kind; one line.
-        MissingExtra: MuJoCo is not installed.
     """
-    try:
-        import mujoco
-    except ModuleNotFoundError as error:
-        raise MissingExtra(path.name, error.name, "sims") from None
     try:
         model = mujoco.MjModel.from_xml_path(str(path))  # type: ignore[attr-defined]
     except ValueError as error:
@@ -48,7 +42,7 @@ def describe_mjcf(path: Path) -> dict[str, Value]:
         )
     of_site = mujoco.mjtTrn.mjTRN_SITE  # type: ignore[attr-defined]
     rotors = [
-        _rotor(path, mujoco, model, data, k, centre, turn)
+        _rotor(path, model, data, k, centre, turn)
         for k in range(model.nu)
         if model.actuator_trntype[k] == of_site
     ]
@@ -80,7 +74,6 @@ def _body(
 
 def _rotor(
     path: Path,
-    mujoco: ModuleType,
     model: _Mj,
     data: _Mj,
     k: int,
