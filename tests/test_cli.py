@@ -6,9 +6,9 @@ import sys
 import jax
 import pytest
 
-from planner_jax.cli.main import main
 from planner_jax.sweep import run as sweep_run
 from planner_jax.sweep.hit.sweep import HitSweep
+from tests.faults.commands import is_one_line, run
 
 HEADER = "number,serve position,serve velocity,landing position,target,hit,velocity,attitude"
 GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
@@ -22,22 +22,11 @@ def trial_file(folder, serve, name="1_1_1_p.csv"):
     return str(folder)
 
 
-def run(capsys, *arguments):
-    """Exit code and what went to the two streams."""
-    try:
-        code = main(arguments)
-    except SystemExit as stop:
-        code = stop.code
-    streams = capsys.readouterr()
-    return code, streams.out, streams.err
-
-
-def expect_one_line(capsys, arguments, *parts):
-    code, out, err = run(capsys, *arguments)
-    assert code == 2 and out == ""
-    assert err.startswith("planner-jax: error: ") and err.count("\n") == 1
+def expect_one_line(arguments, *parts):
+    ended = run(*arguments)
+    assert is_one_line(ended) and ended.code == 2, ended
     for part in parts:
-        assert part in err
+        assert part in ended.err
 
 
 @pytest.fixture
@@ -49,93 +38,24 @@ def elsewhere(tmp_path, monkeypatch):
     return folder
 
 
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        (["--num", "0"], ["--num must be >= 1", "got 0"]),
-        (["--num", "-4"], ["--num must be >= 1", "got -4"]),
-        (["--num", "ten"], ["--num", "ten"]),
-        (["--batch", "0"], ["--batch must be >= 1", "got 0"]),
-        (["--limit-scale", "0"], ["--limit-scale must be from 0.001 to 1000", "got 0"]),
-        (["--limit-scale", "-1"], ["--limit-scale must be from 0.001 to 1000", "got -1"]),
-        (["--delay", "-0.5"], ["--delay must be finite and >= 0", "got -0.5"]),
-        (["--delay", "3"], ["--delay must be shorter than each serve's flight", "got 3"]),
-        (["--planner", "nobody"], ["--planner must be one of", "exact", "got 'nobody'"]),
-        (["--suite", "throws"], ["--suite must be one of court, S.1", "got 'throws'"]),
-        (["--start", "1", "2"], ["--start must be three finite numbers", "got 1 2"]),
-        (["--start", "0", "nan", "1"], ["--start must be three finite numbers", "got 0 nan 1"]),
-        (["--serves", "nowhere"], ["--serves must be an existing folder", "nowhere"]),
-        (["--resume"], ["--out must name the folder to resume"]),
-        (["--resume", "--out", "nowhere"], ["--out must be the folder of a run", "nowhere"]),
-        (["--speed", "3"], ["unrecognized arguments", "--speed"]),
-    ],
-)
-def test_a_bad_argument_gets_one_line_and_leaves_nothing(capsys, elsewhere, arguments, parts):
-    expect_one_line(capsys, ["sweep", "hit", *arguments], *parts)
-    assert not list(elsewhere.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        (["--suite", "nowhere"], ["--suite must be one of throws, hard", "got 'nowhere'"]),
-        (["--planner", "bat"], ["--planner must be one of exact, catch, mpp", "got 'bat'"]),
-        (["--decide", "later"], ["--decide must be one of best, greedy, random", "got 'later'"]),
-        (["--net-test", "box"], ["--net-test must be one of plane, ball", "got 'box'"]),
-        (["--tolerance", "-1"], ["--tolerance must be finite and >= 0", "got -1"]),
-        (["--num", "0"], ["--num must be >= 1", "got 0"]),
-        (["--limit-scale", "0"], ["--limit-scale must be from 0.001 to 1000", "got 0"]),
-        (["--num", "1", "--out", "/proc/nowhere"], ["--out must be a folder that can be"]),
-        (["--resume"], ["--out must name the folder to resume"]),
-        (["--resume", "--out", "nowhere"], ["--out must be the folder of a run", "nowhere"]),
-        (["--delay", "1"], ["unrecognized arguments", "--delay"]),
-    ],
-)
-def test_a_bad_argument_of_a_catch_gets_one_line_and_leaves_nothing(
-    capsys, elsewhere, arguments, parts
-):
-    expect_one_line(capsys, ["sweep", "catch", *arguments], *parts)
-    assert not list(elsewhere.iterdir())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "parts"),
-    [
-        (["--task", "juggling"], ["--task", "juggling"]),
-        (["--planner", "mpp"], ["--planner must be one of exact, bat", "got 'mpp'"]),
-        (["--task", "catch", "--suite", "court"], ["--suite must be one of throws", "'court'"]),
-        (["--batch", "16", "0"], ["--batch must be >= 1, got 0"]),
-        (["--seed", "-1"], ["--seed must be >= 0, got -1"]),
-        (["--repeat", "0"], ["--repeat must be >= 1, got 0"]),
-    ],
-)
-def test_a_bad_argument_of_a_benchmark_gets_one_line_and_leaves_nothing(
-    capsys, elsewhere, arguments, parts
-):
-    expect_one_line(capsys, ["bench", "throughput", *arguments], *parts)
-    assert not list(elsewhere.iterdir())
-
-
-def test_a_throughput_is_measured_with_what_was_asked_for(capsys, elsewhere, monkeypatch):
+def test_a_throughput_is_measured_with_what_was_asked_for(elsewhere, monkeypatch):
     asked = {}
     monkeypatch.setattr("planner_jax.benchmarks.throughput.report", lambda **k: asked.update(k))
-    code, _, err = run(capsys, "bench", "throughput", "--task", "catch", "--batch", "4", "8")
+    code, _, err = run("bench", "throughput", "--task", "catch", "--batch", "4", "8")
     assert (code, err) == (0, "")
     assert asked == {"task": "catch", "batch": [4, 8], "out": None}
 
 
 @pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])
-def test_a_command_that_needs_no_flights_needs_no_extra_of_flights(
-    capsys, elsewhere, monkeypatch, command
-):
+def test_a_command_that_needs_no_flights_needs_no_extra_of_flights(elsewhere, monkeypatch, command):
     """Simulation without MuJoCo says so as soon as it is imported."""
     monkeypatch.setitem(sys.modules, "planner_jax.sims.settings", None)
-    expect_one_line(capsys, command)
+    expect_one_line(command)
     with pytest.raises(ModuleNotFoundError):
-        run(capsys, "fly", "hit")
+        run("fly", "hit")
 
 
-def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
+def test_bad_serves_are_named_by_file_and_line(elsewhere, tmp_path):
     nan = trial_file(tmp_path / "nan", "nan -0.3 2,-4.3 0.02 7.3")
     gone = trial_file(tmp_path / "gone", GONE)
     empty = trial_file(tmp_path / "empty", "")
@@ -145,20 +65,18 @@ def test_bad_serves_are_named_by_file_and_line(capsys, elsewhere, tmp_path):
         (gone, "1_1_1_p.csv:2: serve must land in the hitting half"),
         (empty, "1_1_1_p.csv: file must have a row of numbers"),
     ]:
-        expect_one_line(
-            capsys, ["sweep", "hit", "--serves", folder], "--serves must be sound", part
-        )
+        expect_one_line(["sweep", "hit", "--serves", folder], "--serves must be sound", part)
     assert not list(elsewhere.iterdir())
 
 
-def test_more_serves_than_the_folder_holds_are_refused(capsys, elsewhere, tmp_path):
+def test_more_serves_than_the_folder_holds_are_refused(elsewhere, tmp_path):
     folder = trial_file(tmp_path / "one", GOOD)
     arguments = ["sweep", "hit", "--serves", folder, "--num", "2"]
-    expect_one_line(capsys, arguments, "--num must be <= 1", "got 2")
+    expect_one_line(arguments, "--num must be <= 1", "got 2")
     assert not list(elsewhere.iterdir())
 
 
-def test_a_folder_in_use_or_out_of_reach_is_refused(capsys, elsewhere):
+def test_a_folder_in_use_or_out_of_reach_is_refused(elsewhere):
     (elsewhere / "used").mkdir()
     (elsewhere / "used" / "file").touch()
     before = sorted(elsewhere.rglob("*"))
@@ -168,7 +86,7 @@ def test_a_folder_in_use_or_out_of_reach_is_refused(capsys, elsewhere):
         ("used/file/below", "--out must be a folder that can be written"),
         ("/proc/nowhere", "--out must be a folder that can be written"),
     ]:
-        expect_one_line(capsys, ["sweep", "hit", "--num", "1", "--out", out], part, repr(out))
+        expect_one_line(["sweep", "hit", "--num", "1", "--out", out], part, repr(out))
     assert sorted(elsewhere.rglob("*")) == before
 
 
@@ -181,33 +99,33 @@ def test_a_folder_in_use_or_out_of_reach_is_refused(capsys, elsewhere):
     ],
 )
 def test_a_platform_that_does_not_work_gets_one_line_and_leaves_nothing(
-    capsys, elsewhere, monkeypatch, command, error, part
+    elsewhere, monkeypatch, command, error, part
 ):
     def default_backend():
         raise error
 
     monkeypatch.setattr(jax, "default_backend", default_backend)
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
-    expect_one_line(capsys, command, "JAX_PLATFORMS must name a platform that works here", part)
+    expect_one_line(command, "JAX_PLATFORMS must name a platform that works here", part)
     assert not list(elsewhere.iterdir())
 
 
-def test_a_report_needs_a_finished_run(capsys, elsewhere):
-    expect_one_line(capsys, ["report", "nowhere"], "RUN must be the folder of a run", "nowhere")
+def test_a_report_needs_a_finished_run(elsewhere):
+    expect_one_line(["report", "nowhere"], "RUN must be the folder of a run", "nowhere")
 
 
-def test_ctrl_c_says_how_to_resume(capsys, elsewhere, monkeypatch):
+def test_ctrl_c_says_how_to_resume(elsewhere, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(HitSweep, "plan", interrupted)
-    code, out, err = run(capsys, "sweep", "hit", "--num", "3", "--out", "a run")
+    code, out, err = run("sweep", "hit", "--num", "3", "--out", "a run")
     assert code == 130 and out == ""
     expected = "planner-jax: interrupted; finish with: planner-jax sweep hit --resume --out 'a run'"
     assert err.splitlines()[-1] == expected
 
 
-def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
+def test_a_sweep_prints_rate_and_speed_together(elsewhere, monkeypatch):
     asked = {}
 
     def sweep(task, settings, out, workers):
@@ -229,7 +147,7 @@ def test_a_sweep_prints_rate_and_speed_together(capsys, elsewhere, monkeypatch):
 
     monkeypatch.setattr(sweep_run, "start_sweep", sweep)
     arguments = ["--start", "uniform", "--delay", "0.3", "--drag-after-impact", "--seed", "5"]
-    code, out, err = run(capsys, "sweep", "hit", "--num", "10", *arguments)
+    code, out, err = run("sweep", "hit", "--num", "10", *arguments)
     assert code == 0 and err == ""
     assert "90.00 % success, 9 of 10" in out and "4,000 plans/s warm" in out
     assert asked["out"].startswith("runs/hit-exact-") and asked["out"] in out
@@ -261,6 +179,6 @@ def test_help_names_the_defaults_and_loads_no_jax(task, parts):
         assert part in said
 
 
-def test_the_version_is_printed(capsys):
-    code, out, _ = run(capsys, "--version")
+def test_the_version_is_printed():
+    code, out, _ = run("--version")
     assert code == 0 and out.startswith("planner-jax ")

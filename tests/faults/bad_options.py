@@ -4,28 +4,33 @@ A row is a command line, and words that the one line on the standard error strea
 names `pipe`, `folder`, `empty`, `junk` and `gone` stand for paths of those kinds.
 """
 
-FILES = ("pipe", "folder", "empty", "junk", "gone", "/dev/zero")
 TASKS = ("hit", "catch", "intercept", "block")
 HIT = "plan hit --vel -3 0.2 4 --target 4 0 0"
 CATCH = "plan catch --pos 3 0 1 --vel -3 0.2 4"
 
-# A line each: words of the command, what is wrong last, and what the message says.
+# A line each: words of the command, the wrong one last, and parts of the message between dots.
 _ROWS = """
 sweep hit --num 0                            | --num must be >= 1, got 0
 sweep catch --num 1000000000000000           | --num must be at most
 sweep block --num 99999999999999999999       | --num must be < 2**63
 sweep intercept --num 1000000 --batch 1000000000 | memory
 sweep hit --seed -1                          | --seed must be >= 0, got -1
-sweep catch --planner nobody                 | --planner must be one of exact, got 'nobody'
+sweep catch --planner nobody                 | --planner must be one of exact .. got 'nobody'
 sweep hit --planner exact:file               | --planner must be exact without a file
 sweep block --planner library                | --planner must name its file
-sweep block --planner adapt:                 | --planner file
+sweep block --planner adapt:                 | --planner .. file
 sweep intercept --suite nowhere              | --suite must be one of
 sweep hit --num 1 --out pipe                 | --out must be
 sweep catch --num 1 --out s3://bucket/x      | --out must be a folder of this machine
 sweep hit --num 1 --workers Ray              | --workers must be ray
 sweep hit --resume --out gone                | --out must be
-sweep hit stray                              | unrecognized stray
+sweep hit stray                              | unrecognized .. stray
+sweep hit --speed 3                          | unrecognized arguments .. --speed
+sweep hit --batch 0                          | --batch must be >= 1, got 0
+sweep hit --num 1 --out /proc/nowhere        | --out must be a folder that can be written
+sweep hit --resume                           | --out must name the folder to resume
+sweep hit --suite throws                     | --suite must be one of court, S.1 .. got 'throws'
+sweep hit --delay 3            | --delay must be shorter than each serve's flight .. got 3
 sweep hit --limit-scale 1e-300               | --limit-scale must be from 0.001 to 1000
 sweep catch --limit-scale nan                | --limit-scale must be from 0.001 to 1000
 sweep hit --effort more                      | --effort must be one of feasible
@@ -33,6 +38,8 @@ sweep catch --recovery land                    | --recovery must be one of none
 sweep hit --delay inf                        | --delay must be finite and >= 0
 sweep hit --start nan 0 1                    | --start must be
 sweep hit --start 1 2                        | --start must be
+sweep catch --planner bat      | --planner must be one of exact, catch, mpp .. got 'bat'
+sweep catch --decide later     | --decide must be one of best, greedy, random .. got 'later'
 sweep catch --decide best:x                  | --decide must be best without a file
 sweep catch --tolerance -1                   | --tolerance must be finite and >= 0
 sweep catch --net-test box                   | --net-test must be one of plane
@@ -54,7 +61,7 @@ plan hit --vel -3 0.2 4 --target 4 0 0 --pos 4 0 1 --out junk/below | --out must
 plan catch --horizon 1 --ball 1 2 3          | --ball
 plan block                                   | block
 compare junk junk --out x.txt                | --out must end in .csv
-export junk --row 0 --to cvs                 | --to must be one of csv did you mean 'csv'?
+export junk --row 0 --to cvs                 | --to must be one of csv .. did you mean 'csv'?
 export junk --row 0 --to csv --recovery land   | --recovery must be one of none
 serve hit --port 65536                       | --port must
 serve catch --deadline 0                     | --deadline must
@@ -64,6 +71,10 @@ library build new --home nan nan nan nan nan nan | --home must be finite
 library build new --layout x                 | --layout must be one of
 library repair junk --pole 1 --out new       | --pole
 library check junk --num 0                   | --num must be >= 1
+bench throughput --planner mpp               | --planner must be one of exact, bat .. got 'mpp'
+bench throughput --task catch --suite court  | --suite must be one of throws .. got 'court'
+bench throughput --seed -1                   | --seed must be >= 0, got -1
+bench throughput --repeat 0                  | --repeat must be >= 1, got 0
 bench throughput --task x                    | --task must
 bench throughput --devices 1000              | --devices must
 bench throughput --batch 16 0                | --batch must be >= 1
@@ -73,33 +84,19 @@ view folder --port x                         | --port must be a whole number, go
 report gone                                  | RUN must be
 nobody                                       | nobody
 doctor x                                     | unrecognized
+report pipe                                  | RUN must be
+view folder                                  | RUN must be
+compare empty empty                          | RUN must be
+export junk --row 0 --to csv                 | RUN must be
+library show gone                            | library must be
+sweep hit --serves /dev/zero                 | --serves must
+sweep catch --num 1 --decide policy:pipe     | checkpoint must be
+sweep block --num 1 --planner library:folder | library must be
 """
-# Commands that read a file or a folder, with what each of `FILES` is refused by.
-_READERS = """
-report @                                     | RUN must be
-view @                                       | RUN must be
-compare @ @                                  | RUN must be
-export @ --row 0 --to csv                    | RUN must be
-library show @                               | library must be
-sweep hit --serves @                         | --serves must
-sweep catch --num 1 --decide policy:@        | checkpoint must be
-sweep block --num 1 --planner library:@      | library must be
-"""
-
-
-def _rows() -> list:
-    rows = []
-    for line in _ROWS.strip().splitlines():
-        words, says = (part.strip() for part in line.split("|"))
-        rows.append((tuple(words.split()), tuple(says.split())))
-    for k, line in enumerate(_READERS.strip().splitlines()):
-        words, says = (part.strip() for part in line.split("|"))
-        file = FILES[k % len(FILES)]
-        rows.append((tuple(words.replace("@", file).split()), (says,)))
-    return rows
-
-
-ROWS = _rows()
+ROWS = [
+    (tuple(words.split()), says.strip().split(" .. "))
+    for words, says in (line.split("|") for line in _ROWS.strip().splitlines())
+]
 # Options that hold a number, or one of several words: what Hypothesis draws malformed values of.
 WHOLE = (
     *((f"sweep {task}", option) for task in TASKS for option in ("--num", "--batch", "--seed")),

@@ -1,15 +1,13 @@
 """Every malformed option or file gets one line, the code of whose fault it is, and no trace."""
 
-import contextlib
-import io
 import os
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from planner_jax.cli.main import main
 from tests.faults.bad_options import NUMBERS, ROWS, WHOLE, WORDS
+from tests.faults.commands import is_one_line, run
 
 
 @pytest.fixture(scope="module")
@@ -27,20 +25,12 @@ def files(tmp_path_factory):
 
 
 def refuse(arguments):
-    """The one line that refuses a command; nothing is printed besides, and nothing is left."""
+    """Return the one line that refuses a command; nothing else is printed, and nothing is left."""
     before = {name: os.lstat(name).st_mtime_ns for name in os.listdir()}
-    out, err = io.StringIO(), io.StringIO()
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        try:
-            code = main(arguments)
-        except SystemExit as stop:
-            code = stop.code
-    line = err.getvalue()
-    assert code in (1, 2), line
-    assert out.getvalue() == ""
-    assert line.startswith("planner-jax: error: ") and line.count("\n") == 1, line
+    ended = run(*arguments)
+    assert is_one_line(ended) and ended.code == 2, ended
     assert {name: os.lstat(name).st_mtime_ns for name in os.listdir()} == before
-    return line
+    return ended.err
 
 
 @pytest.mark.parametrize(("arguments", "words"), ROWS, ids=lambda each: " ".join(each)[:60])

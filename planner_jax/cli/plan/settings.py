@@ -56,7 +56,7 @@ class SingleSettings:
             for number in _numbers(value):
                 # Only a thrust may have no bound.
                 sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
-                require(sound, field.name, "finite", f"{number:g}")
+                require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
         """Return the same with the name of the task's planner filled in, or checked.
