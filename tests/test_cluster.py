@@ -22,7 +22,7 @@ from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, resume_sweep, start_sweep
 from tests.faults.commands import children_of
-from tests.faults.runs import quick_sweeps
+from tests.faults.quick import quick_sweeps
 from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")

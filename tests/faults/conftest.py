@@ -6,7 +6,8 @@ import pytest
 import typecheck
 from hypothesis.configuration import set_hypothesis_home_dir
 
-from tests.faults.runs import make_runs, quick_sweeps
+from tests.faults.quick import quick_sweeps
+from tests.faults.runs import make_runs
 
 set_hypothesis_home_dir(Path(__file__).resolve().parents[2] / ".cache" / "hypothesis")
 

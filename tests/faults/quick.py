@@ -3,8 +3,33 @@
 python -m tests.faults.quick sweep hit ...
 """
 
+import contextlib
+from collections.abc import Iterator
+
+import pytest
+
 from planner_jax import __main__ as command
 from planner_jax.host import signals
+
+
+@contextlib.contextmanager
+def quick_sweeps(is_reported: bool = False) -> Iterator[pytest.MonkeyPatch]:
+    """Plan hits and catches in one round, and draw nothing.
+
+    With `is_reported` one case is planned by another planner, and one figure is drawn.
+    """
+    from planner_jax.sweep.catch.sweep import CatchSweep
+    from planner_jax.sweep.hit.sweep import HitSweep
+    from planner_jax.sweep.sweep import Sweep
+    from tests.sweeps import quick_catch, quick_hit
+
+    with pytest.MonkeyPatch.context() as patch:
+        for kind, planner in ((HitSweep, quick_hit()), (CatchSweep, quick_catch())):
+            others = {"other": planner} if is_reported else {}
+            patch.setattr(kind, "planner", lambda *_, planner=planner: planner)
+            patch.setattr(kind, "other_planners", lambda *_, others=others: others)
+            patch.setattr(kind, "figures", Sweep.figures if is_reported else ())
+        yield patch
 
 
 def run() -> None:
@@ -15,8 +40,6 @@ def run() -> None:
     real = cli.main
 
     def main() -> int:
-        from tests.faults.runs import quick_sweeps
-
         with quick_sweeps(is_reported=True):
             return real()
 

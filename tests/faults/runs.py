@@ -4,7 +4,6 @@ import contextlib
 import dataclasses
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,35 +23,18 @@ from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sims.recording import FLIGHTS, read_recording, to_rows
 from planner_jax.sims.settings import CatchFly
-from planner_jax.sweep.catch.sweep import CatchSweep
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import SweepInterrupted, start_sweep
-from planner_jax.sweep.sweep import Sweep
 from planner_jax.task.hit.plan import HitPlan
 from tests.faults.commands import Ended, is_one_line, run
 from tests.faults.damage import damage
 from tests.recordings import recording
-from tests.sweeps import quick_catch, quick_hit, rows_of, stop_after
+from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")
 SETTINGS = HitSettings(num=40, batch=13, seed=3)  # by the program of tests/test_sweep.py
 IDENTICAL, REFUSED, MENDED = "identical", "refused", "mended"
-
-
-@contextlib.contextmanager
-def quick_sweeps(is_reported: bool = False) -> Iterator[pytest.MonkeyPatch]:
-    """Plan hits and catches in one round, and draw nothing.
-
-    With `is_reported` one case is planned by another planner, and one figure is drawn.
-    """
-    with pytest.MonkeyPatch.context() as patch:
-        for kind, planner in ((HitSweep, quick_hit()), (CatchSweep, quick_catch())):
-            others = {"other": planner} if is_reported else {}
-            patch.setattr(kind, "planner", lambda *_, planner=planner: planner)
-            patch.setattr(kind, "other_planners", lambda *_, others=others: others)
-            patch.setattr(kind, "figures", Sweep.figures if is_reported else ())
-        yield patch
 
 
 def make_runs(place: Path) -> None:

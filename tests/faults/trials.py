@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.faults.commands import children_of, finished, is_one_line, is_stopped, start
-from tests.faults.runs import TARGETS, make_runs, quick_sweeps, verdict
+from tests.faults.quick import quick_sweeps
+from tests.faults.runs import TARGETS, make_runs, verdict
 from tests.sweeps import rows_of
 
 QUICK = "tests.faults.quick"
