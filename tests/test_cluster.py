@@ -102,9 +102,13 @@ class StandIn:
         return found
 
 
+def start(out, settings=SETTINGS):
+    """Run the sweep by workers."""
+    return start_sweep(TASK, settings, out, progress=False, workers="ray")
+
+
 @pytest.fixture(autouse=True, scope="module")
 def quick():
-    """Sweeps of this process plan in one round and have no figures."""
     with quick_sweeps():
         yield
 
@@ -129,7 +133,7 @@ def ray(monkeypatch, request):
 
 def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, tmp_path, ray):
     out = tmp_path / "run"
-    manifest = start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    manifest = start(out)
     assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at first
     assert rows_of(out) == rows_of(finished[0])
     assert manifest["run"] == finished[1]["run"]
@@ -139,7 +143,7 @@ def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished,
 
 
 def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_path, ray):
-    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    start(tmp_path / "run")
     (how,) = ray.begun
     assert how["address"] == "local" and how["_node_ip_address"] == "127.0.0.1"
     assert how["include_dashboard"] is False
@@ -148,24 +152,21 @@ def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_p
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
 
 
-def test_a_cluster_with_an_address_is_joined(monkeypatch, tmp_path, ray):
-    monkeypatch.setenv("RAY_ADDRESS", "auto")
-    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
-    (how,) = ray.begun
-    assert how["address"] == "auto" and "num_cpus" not in how and ray.ended == 1
-
-
-def test_an_address_at_which_nothing_answers_is_named(monkeypatch, tmp_path, ray):
+def test_a_cluster_is_joined_by_its_address_where_something_answers(monkeypatch, tmp_path, ray):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(ArgumentError, match="RAY_ADDRESS must be .* got '127.0.0.1:1'"):
-        start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+        start(tmp_path / "run")
     assert not (tmp_path / "run").exists() and not ray.begun
+    monkeypatch.setenv("RAY_ADDRESS", "auto")
+    start(tmp_path / "run")
+    (how,) = ray.begun
+    assert how["address"] == "auto" and "num_cpus" not in how and ray.ended == 1
 
 
 def test_a_worker_that_dies_costs_nothing_but_time(finished, tmp_path, ray):
     ray.deaths = {1: 1, 4: 2}
     out = tmp_path / "run"
-    start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    start(out)
     assert rows_of(out) == rows_of(finished[0])
 
 
@@ -211,14 +212,14 @@ def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, r
     monkeypatch.setattr(cluster.Maker, "of", change)
     monkeypatch.setattr(run, "_maker_of", lambda sweep, settings: real(sweep, settings, BATCH))
     with pytest.raises(WorkersFailed, match=told):
-        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+        start(out)
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 
 
 def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(tmp_path, ray):
     late = HitSettings(num=40, batch=4, delay=1.56, seed=0)
     with pytest.raises(ArgumentError, match="delay must be"):
-        start_sweep(TASK, late, tmp_path / "run", progress=False, workers="ray")
+        start(tmp_path / "run", late)
     assert not (tmp_path / "run").exists() and ray.ended == 1
 
 
@@ -229,7 +230,7 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and install_line("cluster") in said
     with pytest.raises(MissingExtra, match="workers needs ray"):
-        start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+        start(out)
     assert not out.exists()
 
 
@@ -241,7 +242,7 @@ def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(
 ):
     if seen is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
-    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    start(tmp_path / "run")
     assert os.environ["CUDA_VISIBLE_DEVICES"] == first
 
 
@@ -261,7 +262,7 @@ def test_workers_share_gpus_their_memory_and_cores(
     finished, tmp_path, gpus, cores, num, shared, threads
 ):
     gpus.resources, out = {"CPU": cores, "GPU": num}, tmp_path / "run"
-    start_sweep(TASK, SETTINGS, out, progress=False, workers="ray")
+    start(out)
     assert rows_of(out) == rows_of(finished[0])
     assert gpus.options["num_gpus"] == 1.0 / shared and gpus.options["max_calls"] == 0
     assert os.environ["XLA_CLIENT_MEM_FRACTION"] == f"{0.6 / shared:.4f}"
@@ -273,22 +274,22 @@ def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
     monkeypatch, tmp_path, ray, threads
 ):
     monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: threads)
-    start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+    start(tmp_path / "run")
     assert os.environ["NPROC"] == os.environ["PJRT_NPROC"] == str(threads)
     assert ray.options == {"num_cpus": 1, "max_retries": 3}
 
 
-def test_a_run_on_a_gpu_is_refused_by_a_cluster_without(tmp_path, gpus):
-    gpus.resources = {"CPU": 64.0}
-    with pytest.raises(ArgumentError, match="workers must be of a cluster with GPUs"):
-        start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
-    assert not (tmp_path / "run").exists() and gpus.ended == 1
-
-
-def test_a_process_whose_jax_has_several_gpus_is_refused(tmp_path, monkeypatch, gpus):
-    monkeypatch.setattr(cluster.jax, "device_count", lambda: 2)
-    with pytest.raises(ArgumentError, match="workers must be asked for before JAX .* got 2"):
-        start_sweep(TASK, SETTINGS, tmp_path / "run", progress=False, workers="ray")
+@pytest.mark.parametrize(
+    ("own", "others", "rule"),
+    [(1, 0.0, "of a cluster with GPUs"), (2, 2.0, "asked for before JAX .* got 2")],
+)
+def test_gpus_here_and_not_there_or_several_here_are_refused(
+    tmp_path, monkeypatch, gpus, own, others, rule
+):
+    gpus.resources = {"CPU": 64.0, "GPU": others}
+    monkeypatch.setattr(cluster.jax, "device_count", lambda: own)
+    with pytest.raises(ArgumentError, match=f"workers must be {rule}"):
+        start(tmp_path / "run")
     assert not (tmp_path / "run").exists() and gpus.ended == 1
 
 
@@ -358,7 +359,7 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     machine.threads_of_a_computation.cache_clear()  # this process plans nothing itself
     try:
         settings = HitSettings(num=32, batch=2, planner="juggle")
-        start_sweep(TASK, settings, out, progress=False, workers="ray")
+        start(out, settings)
     finally:
         machine.threads_of_a_computation.cache_clear()
     assert rows_of(out) == rows_of(plain)
