@@ -23,6 +23,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
@@ -30,8 +32,15 @@ from planner_jax.baselines.block.library import build as building
 from planner_jax.baselines.block.library.cells import LAYOUTS, tunnels
 from planner_jax.baselines.block.library.coverage import check, coverage
 from planner_jax.baselines.block.library.file import load_library
-from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall
-from planner_jax.baselines.block.library.table import Answer, Library, Setting, Table, lookup
+from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.baselines.block.library.table import (
+    Answer,
+    Library,
+    Setting,
+    Table,
+    lookup,
+    unpack_rows,
+)
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
@@ -138,6 +147,46 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
                     refused=refused,
                 )
                 bench.count(verdict.success)
+
+
+class OneBall:
+    """Looks up one ball after another at the least latency, by a program compiled for the CPU.
+
+    A ball goes in as one vector and its answer comes back as one: every array that crosses into a
+    compiled program, or out of it, costs a microsecond. The motion is left as it is stored.
+    """
+
+    def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
+        """Compile the lookup of a library, for an arm that waits at one of its homes."""
+        own = library.table
+
+        def pack_rows(rows: Array, vector: Array) -> Array:
+            table = Table(
+                rows=rows, homes=own.homes, inner=own.inner, outer=own.outer, layout=own.layout
+            )
+            ball = BallState(pos=vector[:3], vel=vector[3:])
+            found = lookup(table, ball, jnp.asarray(gravity, vector.dtype), home)
+            numbers = (found.pair, found.stored, found.time, found.slack, *found.beside)
+            numbers = jnp.stack([jnp.asarray(x, vector.dtype) for x in (*numbers, found.cosine)])
+            return jnp.concatenate([rows[home, found.pair], numbers])
+
+        self._rows = jax.device_put(own.rows, jax.local_devices(backend="cpu")[0])
+        vector = jax.ShapeDtypeStruct((6,), np.float32)
+        self._lookup = jax.jit(pack_rows).lower(self._rows, vector).compile()
+
+    def answer(self, pos: ArrayLike, vel: ArrayLike) -> Answer:
+        """Look up a ball; return the answer in NumPy arrays and plain numbers.
+
+        Args:
+            pos: (3,) [m], when it is first seen.
+            vel: (3,) [m/s].
+        """
+        vector = np.empty(6, np.float32)
+        vector[:3], vector[3:] = pos, vel
+        found = np.asarray(self._lookup(self._rows, vector))
+        pair, stored, time, slack, along, across, cosine = found[-7:].tolist()
+        row = unpack_rows(found[:-7])
+        return Answer(row, int(pair), bool(stored), time, slack, (along, across), cosine)
 
 
 def single_queries(bench: Bench, library: Library, num: int) -> None:

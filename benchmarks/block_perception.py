@@ -47,17 +47,17 @@ from planner_jax.runs.timing import timed_warm
 from planner_jax.sims.segment import ball_look, noisy_depth, sighting
 from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import across_std, believed_at, error_across, fit_flight
+from planner_jax.studies.block.flight_fit import across_std, belief_at, error_across, fit_flight
 from planner_jax.studies.block.noise import StereoNoise, depth_std, information
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,
     eye,
     fit_errors,
-    fitted,
+    fit_until,
     frame_times,
     see,
-    watched,
+    watch,
 )
 from planner_jax.studies.block.receding import AIMS, decide
 from planner_jax.task.block.case import ANYWHERE
@@ -96,16 +96,13 @@ def errors_after(
         truth = drag_free_flight(ball, middle, gravity)
 
         def after(moment: Array) -> tuple[Array, Array]:
-            fit = fitted(eye, times, places, gravity, moment)
-            belief = believed_at(fit, middle, gravity)
+            fit = fit_until(eye, times, places, gravity, moment)
+            belief = belief_at(fit, middle, gravity)
             return error_across(belief, truth), across_std(belief)
 
         return jax.vmap(after)(moments)
 
     return jax.vmap(one)(cases.ball, cases.gravity, places, middle)
-
-
-watch = jax.jit(watched)
 
 
 @jax.jit
@@ -245,7 +242,7 @@ def report_times(
     @jax.jit
     def fit(times: Array, places: Array, gravity: Array) -> Any:
         weights = information(camera, noise, places)
-        return believed_at(fit_flight(times, places, weights, gravity), times[0], gravity)
+        return belief_at(fit_flight(times, places, weights, gravity), times[0], gravity)
 
     # Places one by one as a camera gives them: on the host, in a buffer of constant size.
     until, gravity = np.asarray(times), np.float32(9.81)

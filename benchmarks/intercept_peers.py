@@ -27,7 +27,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.baselines.intercept.paper import PaperIntercept, printed_speed
+from planner_jax.baselines.intercept.paper import PaperIntercept, paper_speed_step
 from planner_jax.baselines.intercept.path_then_speed import PathThenSpeed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.referee.intercept import InterceptVerdict
@@ -38,9 +38,7 @@ SOFT_END = 3.0 * 10.0**3 / 10.0  # w_2 T^3 / w_1 of the paper's weights, 3 and 1
 PAIRS = (
     ("spacetime", "em"),
     ("best", "lattice"),
-    ("best", "em-exact"),
     ("lattice, best path", "em"),
-    ("lattice, best path", "em-exact"),
     ("lattice, best path", "constant"),
     ("lattice", "em"),
     ("paper", "em"),
@@ -57,12 +55,11 @@ def planners() -> dict[str, Any]:
         "lattice": pj.intercept.planner("lattice"),
         "lattice, best path": pj.intercept.planner("lattice", tries=1),
         "em": pj.intercept.planner("em"),
-        "em-exact": pj.intercept.planner("em", kind="em-exact"),
         "constant": pj.intercept.planner("constant"),
     }
     if importlib.util.find_spec("numba") is not None:
         named["paper"] = pj.intercept.planner("paper")
-        named["paper, soft end"] = pj.intercept.planner("paper", step=printed_speed(SOFT_END))
+        named["paper, soft end"] = pj.intercept.planner("paper", step=paper_speed_step(SOFT_END))
     return named
 
 
@@ -94,7 +91,7 @@ def parts_of(planner: Any) -> dict[str, Callable]:
     if isinstance(planner, PaperIntercept):
         smooth = jax.jit(lambda case, way: (case, planner.path(case, way[0], way[1], way[2])))
         return {
-            "path": lambda case: smooth(case, planner.searched(case)),
+            "path": lambda case: smooth(case, planner.search_path(case)),
             "speed": jax.jit(
                 lambda found: planner.step.drive(
                     found[0], found[1], planner.step.problem(found[0], found[1])

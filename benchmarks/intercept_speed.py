@@ -21,18 +21,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from planner_jax.baselines.intercept.bezier import bernstein, hodograph
+from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodograph
 from planner_jax.baselines.intercept.qp import solve_qp
 from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
     SpeedPlanner,
-    constant_speed,
     plan_speed,
     speed_bounds,
     speed_matrices,
     speed_template,
 )
-from planner_jax.baselines.intercept.station_time import reference_line, stations_at_joints
+from planner_jax.baselines.intercept.station_time import StationTimeProblem, reference_line
 from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.benchmarks.speed_problems import speed_problems
@@ -44,11 +43,9 @@ OURS = "this library"
 # Each against what it shall be better than, on the problems where both are good.
 PAIRS = (
     ("trapezoid", "em"),
-    ("trapezoid-twice", "em"),
     ("trapezoid-edges", "em"),
     ("trapezoid", "trapezoid-edges"),
     ("trapezoid", "rectangle"),
-    ("trapezoid", "em-exact"),
 )
 
 
@@ -73,6 +70,12 @@ def planners() -> dict[str, SpeedPlanner]:
         for pieces in PIECES
         for name, planner in SPEED_PLANNERS.items()
     }
+
+
+def constant_speed(problem: StationTimeProblem, degree: int = 5) -> BezierCurve:
+    """Return the curve of constant speed, which ignores polygons and the initial speed."""
+    points = jnp.linspace(0.0, 1.0, degree + 1)[None] * problem.end_station
+    return BezierCurve(points=points, horizon=problem.horizon)
 
 
 def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
@@ -247,7 +250,7 @@ def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
 
 def solved_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
     """By solver which programs of a planner it solves, at what cost and in how many seconds."""
-    programs = jax.jit(jax.vmap(lambda problem: first_program(problem, planner)))(problems)
+    programs = jax.jit(jax.vmap(lambda problem: program_of(problem, planner)))(problems)
     template = speed_template(planner)
     solve = jax.jit(lambda *program: solve_qp(template, *program))
     results, seconds = in_turns({OURS: solve}, lanes_of(*programs))
@@ -269,12 +272,9 @@ def solved_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
     return rows
 
 
-def first_program(problem: Any, planner: SpeedPlanner) -> tuple:
-    """Right sides and bounds of the first round of a planner."""
-    reference = reference_line(problem, planner.grid)
-    ends = stations_at_joints(reference.station, planner.pieces)
-    slope = (ends[1:] - ends[:-1]) * planner.pieces / problem.horizon
-    return speed_bounds(problem, reference, planner, slope)
+def program_of(problem: Any, planner: SpeedPlanner) -> tuple:
+    """Return the right sides and bounds of a planner's program for one problem."""
+    return speed_bounds(problem, reference_line(problem, planner.grid), planner)
 
 
 def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
@@ -287,9 +287,9 @@ def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
         if not name.startswith("trapezoid,"):
             continue
         template = speed_template(planner)
-        programs = jax.jit(
-            jax.vmap(lambda problem, planner=planner: first_program(problem, planner))
-        )(many)
+        programs = jax.jit(jax.vmap(lambda problem, planner=planner: program_of(problem, planner)))(
+            many
+        )
         whole = jax.jit(jax.vmap(lambda problem, planner=planner: plan_speed(problem, planner)))
         alone = jax.jit(jax.vmap(lambda *program, t=template: solve_qp(t, *program)))
         rates = {}

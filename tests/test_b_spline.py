@@ -14,7 +14,7 @@ from planner_jax.trajectory.polynomial import evaluate
 
 SHARES = np.linspace(0.0, 1.0, 98)
 DURATION = 0.6
-# One span, which is a Bezier curve, and several; linear; the arm's cubics and beyond.
+# (degree, control points): one span, which is a Bezier curve, and several spans.
 SIZES = [(1, 4), (2, 3), (3, 4), (3, 7), (5, 9)]
 every_size = pytest.mark.parametrize("degree, num", SIZES)
 
@@ -23,15 +23,15 @@ def control_points(num):
     return np.random.default_rng(num).normal(size=(num, 6))
 
 
-def scipys(degree, points):
-    """The same curve by SciPy, over shares."""
+def scipy_curve(degree, points):
+    """Return the same curve by SciPy, as a function of the position from 0 to 1."""
     inner = np.linspace(0.0, 1.0, len(points) - degree + 1)
     return BSpline(np.r_[[0.0] * degree, inner, [1.0] * degree], points, degree)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
-def sampled(degree, points, duration, order):
-    """A derivative of the piecewise polynomial by the time, at SHARES of it."""
+def sample(degree, points, duration, order):
+    """Evaluate a time derivative of the piecewise polynomial at SHARES of its duration."""
     trajectory = b_spline(degree, points, duration)
     times = jnp.asarray(SHARES, points.dtype) * duration
     return jax.vmap(lambda time: evaluate(trajectory, time, order))(times)
@@ -40,7 +40,7 @@ def sampled(degree, points, duration, order):
 @every_size
 def test_the_basis_times_control_points_is_the_curve(degree, num):
     points = control_points(num)
-    expected = scipys(degree, points)(SHARES)
+    expected = scipy_curve(degree, points)(SHARES)
     np.testing.assert_allclose(basis(degree, num, SHARES) @ points, expected, atol=1e-12)
     # One share, or any array of them.
     np.testing.assert_allclose(
@@ -66,8 +66,8 @@ def test_a_derivative_is_the_spline_of_the_hodograph_between_whose_points_it_lie
     for order in range(1, degree + 1):
         of_derivative = hodograph(degree, order, num) @ points
         value = basis(degree - order, num - order, SHARES) @ of_derivative
-        # At the end SciPy has no derivative of a straight line, but that from the left.
-        expected = scipys(degree, points)(SHARES, order)[:-1]
+        # At the end SciPy returns only the left derivative, which is wrong for straight lines.
+        expected = scipy_curve(degree, points)(SHARES, order)[:-1]
         scale = np.abs(expected).max()
         np.testing.assert_allclose(value[:-1], expected, atol=1e-12 * scale)
         assert (value <= of_derivative.max(axis=0) + 1e-12 * scale).all()
@@ -77,8 +77,8 @@ def test_a_derivative_is_the_spline_of_the_hodograph_between_whose_points_it_lie
 @pytest.mark.parametrize("order", [0, 1, 2, 3])
 def test_as_a_piecewise_polynomial_it_is_the_same_curve_with_its_derivatives(order, float64):
     points = control_points(7)
-    value = sampled(3, points, DURATION, order)
-    expected = scipys(3, points)(SHARES, order) / DURATION**order
+    value = sample(3, points, DURATION, order)
+    expected = scipy_curve(3, points)(SHARES, order) / DURATION**order
     np.testing.assert_allclose(value, expected, atol=1e-10 * np.abs(expected).max())
 
 
@@ -91,8 +91,8 @@ def test_every_span_is_a_piece_of_equal_duration_and_of_the_type_of_the_points()
 
 def test_the_curve_is_exact_to_rounding_in_float32():
     points = control_points(7).astype(np.float32)
-    value = sampled(3, points, np.float32(DURATION), 0)
-    np.testing.assert_allclose(value, scipys(3, points)(SHARES), atol=2e-6)
+    value = sample(3, points, np.float32(DURATION), 0)
+    np.testing.assert_allclose(value, scipy_curve(3, points)(SHARES), atol=2e-6)
 
 
 def test_gradients_by_control_points_and_duration_are_those_of_differences(float64):
@@ -100,7 +100,7 @@ def test_gradients_by_control_points_and_duration_are_those_of_differences(float
 
     def total(point):
         return sum(
-            jnp.sum(weight * sampled(3, *point, order)) for order, weight in enumerate(weights)
+            jnp.sum(weight * sample(3, *point, order)) for order, weight in enumerate(weights)
         )
 
     assert_gradient_matches_differences(total, (control_points(7), DURATION))

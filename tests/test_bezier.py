@@ -22,7 +22,7 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def of_polynomial(polynomial):
-    """Points (K, n + 1) of a polynomial in the time, and the matrix behind them, by solving."""
+    """Solve for the control points (K, n + 1) of a polynomial in time."""
     shares = np.linspace(0.0, 1.0, DEGREE + 1)
     starts = np.arange(PIECES)[:, None]
     values = polynomial((starts + shares) * HORIZON / PIECES)
@@ -31,7 +31,7 @@ def of_polynomial(polynomial):
 
 @jax.jit
 def values(points, times):
-    """The curve and three derivatives at times (M,), and the slope of each by the time, (4, M)."""
+    """Return the curve and three derivatives at times (M,), and their slopes, (4, M) each."""
     curve = BezierCurve(points=points, horizon=jnp.asarray(HORIZON, points.dtype))
     both = [jax.vmap(jax.value_and_grad(lambda t, k=k: curve.at(t, k)))(times) for k in range(4)]
     return tuple(jnp.stack(each) for each in zip(*both, strict=True))

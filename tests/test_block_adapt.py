@@ -1,4 +1,4 @@
-"""Motions of a library that are warped to the very ball, and one ball planned after another."""
+"""Motions of a library that are warped to a given ball."""
 
 import dataclasses
 from typing import Any
@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_block_library import setting
 
 import planner_jax as pj
 from planner_jax.baselines.block.library import build as building
@@ -14,9 +15,8 @@ from planner_jax.baselines.block.library.adapt import AdaptBlock, Effort, adapt_
 from planner_jax.baselines.block.library.cells import Face, Layout, cell_of, cells_around
 from planner_jax.baselines.block.library.file import save_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
-from planner_jax.baselines.block.library.table import Row, Setting, library_of, packed
+from planner_jax.baselines.block.library.table import Row, library_of, pack_rows
 from planner_jax.core.errors import ArgumentError
-from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
@@ -29,14 +29,8 @@ EFFORT = Effort(neighbours=4, points=4, screened=6, samples=8, checks=3)
 BALL = ((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4))
 
 
-def setting(regime="R2", has_pole=True):
-    chosen: Any = REGIMES[regime]
-    at_rest: Any = np.asarray(chosen.ends_at_rest)
-    return Setting(irb1600(), chosen.limits, at_rest, paper_scene(has_pole=has_pole))
-
-
 def library(pieces=6, has_pole=True):
-    """For each pair a straight motion to some pose at which the shield meets one ball."""
+    """Build a library of straight motions to poses at which the shield meets one ball."""
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=has_pole))
     found = jax.jit(lambda case: end_poses(case, flight_of(case), 10, 6))(case)
     good = np.flatnonzero(np.asarray(found.effort) <= 0.99)
@@ -45,7 +39,9 @@ def library(pieces=6, has_pole=True):
     num = (1, LAYOUT.num_pairs)
     vectors = (np.broadcast_to(each, (*num, 3)) for each in np.eye(3))
     row: Any = Row(steps[None], np.full(num, 0.9), *vectors)  # type: ignore[arg-type]
-    return library_of(packed(row), irb1600().home[None], LAYOUT, setting(has_pole=has_pole))
+    return library_of(
+        pack_rows(row), irb1600().home[None], LAYOUT, setting(has_pole=np.asarray(has_pole))
+    )
 
 
 def planner(has_pole=True):
@@ -53,10 +49,10 @@ def planner(has_pole=True):
     return AdaptBlock(stored, online=ONLINE, efforts=(EFFORT,))
 
 
-def warped_by(own, case, effort):
+def warp(own, case, effort):
     flight = flight_of(case)
     poses = end_poses(case, flight, effort.points, own.online.pieces)
-    return own.warped(case, flight, jnp.asarray(0), poses, effort)
+    return own.warp(case, flight, jnp.asarray(0), poses, effort)
 
 
 def test_the_cells_around_a_point_are_the_nearest_of_its_face():
@@ -79,15 +75,15 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
 
 @pytest.mark.slow
 def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
-    """For another ball than that of the stored motions; limits at knots are exact."""
+    """The ball differs from the ball of the stored motions; limits at knots are exact."""
     own = planner(has_pole=False)
     scene = paper_scene(has_pole=False)
     case = pj.block.case((9.0, 0.45, 0.35), BALL[1], scene=scene)
 
     @jax.jit
-    def looked_at(case):
+    def evaluate(case):
         flight = flight_of(case)
-        warped = warped_by(own, case, EFFORT)
+        warped = warp(own, case, EFFORT)
 
         def one(point):
             steps, first, duration = ONLINE.decode(case, point)
@@ -99,8 +95,8 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
 
         return warped, *jax.vmap(one)(warped.points)
 
-    warped, contact, joints = looked_at(case)
-    there = np.isfinite(warped.promise)
+    warped, contact, joints = evaluate(case)
+    there = np.isfinite(warped.penalty)
     assert there.any() and np.asarray(warped.is_open).any()
     assert (np.asarray(contact)[there] < 0.0).all()
     assert (np.asarray(joints)[np.asarray(warped.is_open)] <= -ONLINE.slack + 1e-5).all()
@@ -108,21 +104,21 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
 
 @pytest.mark.slow
 def test_a_stored_motion_for_the_very_ball_is_not_warped():
-    """Then the plan is one of the stored straight motions, in the time that there is."""
+    """The plan is one of the stored straight motions, in the available time."""
     own = planner(has_pole=False)
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
     same = dataclasses.replace(EFFORT, points=10)
-    warped = jax.jit(lambda case: warped_by(own, case, same))(case)
+    warped = jax.jit(lambda case: warp(own, case, same))(case)
     shape = profiles(6, True)[0]
     steps = np.asarray(warped.points[:, :-1]).reshape(-1, 6, 6)
     turned = steps.sum(axis=1, keepdims=True) / shape.sum()
     np.testing.assert_allclose(steps, shape[:, None] * turned, atol=1e-4)
-    assert np.min(warped.promise) < 0.1
+    assert np.min(warped.penalty) < 0.1
 
 
 @pytest.fixture(scope="module")
 def planned():
-    """A planner, balls of which three can be blocked, and their plans."""
+    """Return a planner, a batch of balls, and their plans; three balls can be blocked."""
     own = planner(has_pole=False)
     rng = np.random.default_rng(2)
     num = 8
@@ -169,8 +165,8 @@ def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):
 
 
 @pytest.mark.slow
-def test_the_referee_confirms_what_is_warped_and_bent(tmp_path):
-    """Both efforts claim nothing that is not so, and the longer one blocks more."""
+def test_the_referee_confirms_warped_and_refined_motions(tmp_path):
+    """Both efforts make only true claims, and the longer one blocks more balls."""
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (3, 3)),))
     building.build(path, setting(), irb1600().home, layout, progress=False)

@@ -1,4 +1,4 @@
-"""Throws as a camera sees them, and what planner and referee make of that."""
+"""Camera observations of throws, and their effect on planner and referee."""
 
 import dataclasses
 
@@ -12,7 +12,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.studies.block.camera import in_view, looking_at
 from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import Sight, believed_at, error_across
+from planner_jax.studies.block.flight_fit import Sight, belief_at, error_across
 from planner_jax.studies.block.observation import cautious, eye, frame_times, mast_camera, see
 from planner_jax.task.block.end_poses import flight_of
 
@@ -27,7 +27,7 @@ def test_the_camera_on_the_mast_sees_all_throws_nearly_until_they_can_be_met(sui
 
 
 def test_one_fit_after_a_quarter_of_a_second_is_within_reach_of_the_shield():
-    """60 frames a second, 2 cm a coordinate, throws from 6 to 8 m: nine in ten within 0.1 m."""
+    """At 60 Hz with 2 cm noise per coordinate, nine of ten throws are within 0.1 m."""
     cases = pj.block.draw(1000, "short", seed=11)
     seen = see(cases, eye(std=0.02), 0.25)
     assert (seen.fits.num == 16).all() and (seen.fits.status == Sight.SEEN).all()
@@ -38,7 +38,7 @@ def test_one_fit_after_a_quarter_of_a_second_is_within_reach_of_the_shield():
         flight = flight_of(case)
         middle = 0.5 * (flight.earliest + flight.latest)
         truth = drag_free_flight(case.ball, middle, case.gravity)
-        return error_across(believed_at(fit, middle, case.gravity), truth)
+        return error_across(belief_at(fit, middle, case.gravity), truth)
 
     assert np.mean(off(cases, seen.fits) < 0.1) >= 0.9
 
@@ -55,7 +55,7 @@ def test_planners_get_the_fitted_ball_from_when_the_fit_is_there():
 
 
 def test_a_camera_that_never_sees_the_ball_is_a_status_all_the_way():
-    """Of the fit, then of the plan; and the referee refuses."""
+    """The fit and the plan carry a status, and the referee rejects the plan."""
     cases = pj.block.draw(6, seed=5, regime="R1", wide=True)
     away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
     seen = see(cases, eye(camera=away), 0.25)
@@ -80,7 +80,7 @@ def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
 
 
 def test_a_ball_that_comes_later_meets_a_braking_arm_that_was_there_in_time():
-    """By 10 ms, which moves the contact by about as much: the shield is met where it then is."""
+    """A ball 10 ms later moves the contact by about 10 ms, to the shield's position then."""
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
     near_middle = cautious(cases, offset=0.01)
     plans = pj.plan(SMALL, jax.tree.map(np.asarray, near_middle))

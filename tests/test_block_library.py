@@ -1,4 +1,4 @@
-"""Libraries of blocks: cells, lookups, files, what is built, gone on with and repaired."""
+"""Libraries of blocks: cells, lookups, files, builds, resumed builds and repairs."""
 
 import dataclasses
 from typing import Any
@@ -11,6 +11,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.baselines.block.library import build as building
+from planner_jax.baselines.block.library import command
 from planner_jax.baselines.block.library.cells import (
     GRAVITY,
     LAYOUTS,
@@ -23,16 +24,16 @@ from planner_jax.baselines.block.library.cells import (
 )
 from planner_jax.baselines.block.library.coverage import check, coverage
 from planner_jax.baselines.block.library.file import load_library, save_library
-from planner_jax.baselines.block.library.planner import LibraryBlock, OneBall
+from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import (
     Row,
     Setting,
     library_of,
     lookup,
-    packed,
-    unpacked,
+    pack_rows,
+    unpack_rows,
 )
-from planner_jax.cli import library as command
+from planner_jax.benchmarks.block_library import OneBall
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.robot.arm import REGIMES
@@ -50,8 +51,8 @@ def setting(regime="R2", **scene):
     return Setting(irb1600(), chosen.limits, at_rest, dataclasses.replace(paper_scene(), **scene))
 
 
-def made_up(layout=TINY, regime="R2", homes=1):
-    """Rows whose steps tell pair and home, with shields that face +x at x = 0.7 m."""
+def make_library(layout=TINY, regime="R2", homes=1):
+    """Build a library whose steps encode pair and home, with shields that face +x at x = 0.7 m."""
     num = layout.num_pairs
     shape = profiles(PIECES, True)[0]
     turn = 1e-4 * (1.0 + np.arange(homes)[:, None] * num + np.arange(num))
@@ -66,11 +67,11 @@ def made_up(layout=TINY, regime="R2", homes=1):
     middle, normal, edge = (0.7, 0.0, 0.9), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     values = map(lambda v: vectors(*v), (middle, normal, edge))
     row: Any = Row(steps, duration, *values)  # type: ignore[arg-type]
-    return library_of(packed(row), home, layout, setting(regime))
+    return library_of(pack_rows(row), home, layout, setting(regime))
 
 
 def ball_through(outer, inner, speed=8.0, before=0.6):
-    """A ball from one point to another, seen some time [s] before it is at the first."""
+    """Return a ball through two points, first seen `before` [s] ahead of the first point."""
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
     vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
@@ -98,7 +99,7 @@ def test_a_point_of_a_cell_is_in_that_cell(name):
 
 
 def _no_boxes():
-    """Boxes of which the inner one's back cuts nothing off the outer one's cells."""
+    """Return boxes such that the inner box's back does not cut the outer box's cells."""
     outer = paper_scene().outer
     behind: Any = np.array([3.0, 0.0, 0.0])
     return Box(behind, behind + 1.0), outer
@@ -107,9 +108,12 @@ def _no_boxes():
 def test_points_on_edges_are_in_one_cell_whichever_face_they_are_said_to_be_of():
     box = paper_scene().outer
     at = jax.jit(lambda point: cell_of(TINY.outer, box, tuple(point)))
-    assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the greater y
+    assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the one with greater y
     assert at(jnp.array([1.0, 0.0, 0.9250001])) == (3, True)
-    assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # an edge of two faces: that across x
+    assert at(jnp.array([1.0, 0.3, 1.85])) == (
+        3,
+        True,
+    )  # an edge: the face normal to x
     assert at(jnp.array([0.999, 0.3, 1.85])) == (5, True)
     assert at(jnp.array([1.0, 1.0, 0.1])) == (2, True)
     assert not at(jnp.array([0.3, 1.0, 0.1]))[1]  # no cells on +y
@@ -118,7 +122,7 @@ def test_points_on_edges_are_in_one_cell_whichever_face_they_are_said_to_be_of()
 
 
 def test_tunnels_are_cut_off_where_no_ball_can_come_from():
-    """Every point of what is left sees the inner cell from in front; nothing else does."""
+    """Every point of a tunnel sees the inner cell from in front, and no other point does."""
     layout, scene = LAYOUTS["full"], paper_scene()
     tunnel = tunnels(layout, scene.inner, scene.outer)
     assert len(tunnel.outer) == layout.num_pairs == 21504
@@ -138,7 +142,7 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
 
 
 def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
-    """Random balls come up to it and not beyond."""
+    """Random balls reach the farthest crossing and do not pass it."""
     scene, rng = paper_scene(), np.random.default_rng(1)
     tunnel = tunnels(LAYOUTS["D"], scene.inner, scene.outer)
     pair = rng.choice(np.flatnonzero(tunnel.is_centred))
@@ -167,8 +171,8 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
 
 
 def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
-    """From either home; at the moment, and the place on the shield, of the parabola."""
-    library = made_up(homes=2)
+    """From both homes; contact time and position follow the parabola."""
+    library = make_library(homes=2)
     scene = paper_scene()
     tunnel = tunnels(TINY, scene.inner, scene.outer)
     pairs = np.flatnonzero(tunnel.is_feasible)[:-1]
@@ -190,7 +194,7 @@ def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
 
 
 def test_one_ball_is_looked_up_as_many_are():
-    library = made_up(homes=2)
+    library = make_library(homes=2)
     cases = pj.block.draw(40, seed=2)
     of_many = jax.jit(jax.vmap(lookup, (None, 0, 0, None)))
     many = of_many(jax.device_put(library.table), cases.ball, cases.gravity, 1)
@@ -207,8 +211,8 @@ def test_one_ball_is_looked_up_as_many_are():
 
 
 def test_statuses_say_why_a_stored_motion_will_not_do():
-    library = made_up()
-    # From the middle of the cell y, z > 0 to that of the same on the inner box, and others.
+    library = make_library()
+    # Balls through the cell y, z > 0 of both boxes, and balls that fail.
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     shots = [
         good,
@@ -241,7 +245,7 @@ def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     for regime in ("R1", "R3"):
         case = pj.block.case(*good, regime=regime, delay=0.05, anywhere=True)
-        plan = pj.plan(LibraryBlock(made_up(regime=regime)), case)
+        plan = pj.plan(LibraryBlock(make_library(regime=regime)), case)
         waits = plan.contact_time - 0.05 - 0.4
         assert waits > 0.1
         np.testing.assert_allclose(
@@ -250,7 +254,7 @@ def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
 
 
 def test_a_library_of_other_cases_is_refused_with_both_hashes():
-    planner = LibraryBlock(made_up())
+    planner = LibraryBlock(make_library())
     planner.check(pj.block.draw(2))
     with pytest.raises(ArgumentError, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
         planner.check(pj.block.draw(1, regime="R3"))
@@ -264,7 +268,7 @@ def test_a_library_of_other_cases_is_refused_with_both_hashes():
 
 
 def test_a_file_holds_the_library_and_is_mapped(tmp_path):
-    library, path = made_up(homes=2), tmp_path / "a.lib"
+    library, path = make_library(homes=2), tmp_path / "a.lib"
     save_library(path, library)
     again = load_library(path)
     assert isinstance(again.table.rows, np.memmap)
@@ -279,25 +283,25 @@ def test_a_file_holds_the_library_and_is_mapped(tmp_path):
 def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path, monkeypatch):
     path = tmp_path / "a.lib"
 
-    def refused(says):
+    def rejects(says):
         with pytest.raises(ArgumentError, match=says) as caught:
             load_library(path)
         assert "\n" not in str(caught.value)
 
-    refused("^library must be a file, got .* `planner-jax library build .*a.lib` makes one$")
+    rejects("^library must be a file, got .* `planner-jax library build .*a.lib` makes one$")
     path.write_bytes(b"PK\x03\x04 something else\n")
-    refused("^library must be a file of a block library, got")
-    save_library(path, made_up())
+    rejects("^library must be a file of a block library, got")
+    save_library(path, make_library())
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])
-    refused(f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in")
+    rejects(f"^library must be a whole file of {len(whole)} bytes, got {len(whole) - 1} in")
     path.write_bytes(whole[:100])
-    refused("is cut off$")
+    rejects("is cut off$")
     path.write_bytes(whole.replace(b"library 1\n", b"library 9\n", 1))
-    refused("^library must be of version 1, got version 9 in")
+    rejects("^library must be of version 1, got version 9 in")
     at = whole.index(np.float32(0.806).tobytes())  # the pole
     path.write_bytes(whole[:at] + np.float32(0.7).tobytes() + whole[at + 4 :])
-    refused("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
+    rejects("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
 
 
 # Building.
@@ -305,7 +309,7 @@ def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path, monkeypatch):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Planning replaced by what tells pair, home and number of the call."""
+    """Replace planning by rows that encode pair, home and number of the call."""
     calls = []
 
     def plan_pairs(setting, home, tunnel, pairs, old=None):
@@ -366,7 +370,7 @@ def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkey
 
 
 def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
-    library = made_up(LAYOUTS["A"])
+    library = make_library(LAYOUTS["A"])
     pairs = np.arange(LAYOUTS["A"].num_pairs)
     hit = (pairs % 100 == 3) & library.found[0]
 
@@ -374,9 +378,9 @@ def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
         return ~hit[library.found[0]]
 
     monkeypatch.setattr(building, "_is_free", is_free)
-    rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # as long as those of the stub
+    rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # the row length of the stub
     library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
-    monkeypatch.setattr(type(library), "found", property(lambda self: _found(self, PIECES)))
+    monkeypatch.setattr(type(library), "found", property(lambda self: find_stored(self, PIECES)))
     scene = dataclasses.replace(paper_scene(), pole=np.array([0.806, -0.1], np.float32))
     fixed, touched = building.repair(library, scene, progress=False)
     np.testing.assert_array_equal(touched[0], hit)
@@ -390,7 +394,7 @@ def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
     np.testing.assert_array_equal(touched[0], hit | (feasible & ~library.found[0]))
 
 
-def _found(library, pieces):
+def find_stored(library, pieces):
     return np.isfinite(library.table.rows[..., 6 * pieces])
 
 
@@ -398,7 +402,7 @@ def test_a_repair_needs_the_same_boxes():
     scene = paper_scene()
     other = dataclasses.replace(scene, inner=Box(scene.inner.lower, 0.9 * scene.inner.upper))
     with pytest.raises(ValueError, match="^scene.inner must be the library's, got another box$"):
-        building.repair(made_up(), other)
+        building.repair(make_library(), other)
 
 
 def test_a_home_in_collision_is_refused(tmp_path):
@@ -408,7 +412,7 @@ def test_a_home_in_collision_is_refused(tmp_path):
         building.build(tmp_path / "a", setting(), home, TINY)
     pole: Any = np.array([0.806, 0.1], np.float32)  # where the forearm is at home
     with pytest.raises(ValueError, match="^homes must be free"):
-        building.repair(made_up(), dataclasses.replace(paper_scene(), pole=pole))
+        building.repair(make_library(), dataclasses.replace(paper_scene(), pole=pole))
 
 
 # The command.
@@ -430,7 +434,7 @@ def test_what_is_wrong_with_a_build_is_named(options, says, tmp_path):
 
 def test_a_library_is_shown_with_a_map(tmp_path, capsys):
     path, picture = tmp_path / "a.lib", tmp_path / "a.png"
-    save_library(path, made_up())
+    save_library(path, make_library())
     command.show_library(str(path), map=str(picture))
     told = capsys.readouterr().out
     assert "24 pairs of cells, outer +x 2x2 +z 1x2; inner +x 2x2" in told
@@ -443,7 +447,7 @@ def test_a_library_is_shown_with_a_map(tmp_path, capsys):
 
 def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, capsys):
     path = tmp_path / "a.lib"
-    save_library(path, made_up())
+    save_library(path, make_library())
     assert main(["library", "show", str(path)]) == 0
     assert "Setting " in capsys.readouterr().out
     for arguments in (
@@ -469,9 +473,9 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 @pytest.mark.slow
 @pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
 def test_the_referee_confirms_what_is_built(regime, starts, tmp_path, monkeypatch):
-    """Every pair has a motion, its shield blocks nearly all balls, and no claim is refused.
+    """Every pair has a motion, shields block nearly all balls, and all claims are true.
 
-    Whether starts are tried one after another, as on a CPU, or at once.
+    Starts are tried one after another, as on a CPU, or at once.
     """
     monkeypatch.setattr(building, "_ON_CPU", building.Portions(256, (16, 16), starts))
     path = tmp_path / "a.lib"
@@ -486,7 +490,7 @@ def test_the_referee_confirms_what_is_built(regime, starts, tmp_path, monkeypatc
     planner = pj.block.planner(f"library:{path}")
     plans = pj.plan(planner, found.cases)
     np.testing.assert_array_equal(pj.solved(plans), found.claimed)
-    # By 0.1 m, to where some of the motions pass and the arm is free at home.
+    # 0.1 m farther, where some of the motions pass and the arm at home is free.
     shifted: Any = np.array([0.8926, 0.05], np.float32)
     scene = dataclasses.replace(paper_scene(), pole=shifted)
     fixed, touched = building.repair(library, scene, progress=False)
@@ -495,4 +499,4 @@ def test_the_referee_confirms_what_is_built(regime, starts, tmp_path, monkeypatc
     np.testing.assert_array_equal(fixed.table.rows[same], library.table.rows[same])
     again = check(fixed, 200)
     assert not (again.claimed & ~again.verdict.success).any()
-    assert unpacked(fixed.table.rows).duration[fixed.found].max() < 3.0
+    assert unpack_rows(fixed.table.rows).duration[fixed.found].max() < 3.0

@@ -11,7 +11,7 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.baselines.block.free_space import FreeSpace
-from planner_jax.baselines.block.path_timing import PIECES, timed_way
+from planner_jax.baselines.block.path_timing import PIECES, time_path
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
 from planner_jax.benchmarks.block_peers import motion_torques
 from planner_jax.core.errors import MissingExtra, install_line
@@ -28,7 +28,7 @@ LIMITS = REGIMES["R2"].limits
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    """The motion with a duration of so many times the least, sampled, and the least times."""
+    """Return samples of the motion in `stretch` times the least duration, and the least times."""
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
@@ -39,7 +39,7 @@ def quickest(turn, rate, stretch):
 
 
 def test_joints_from_rest_take_the_times_of_closed_forms(float64):
-    """2 sqrt(d / a) below the greatest rate v, else d / v + v / a."""
+    """The time is 2 sqrt(d / a) below the velocity limit v, else d / v + v / a."""
     v, a = LIMITS.velocity.astype(float), LIMITS.acceleration.astype(float)
     turn = np.array([0.1, -0.2, 0.0, 1.5, -2.5, 4.0])
     times = quickest(turn, np.zeros(6), 1.0)[1]
@@ -51,7 +51,7 @@ def test_joints_from_rest_take_the_times_of_closed_forms(float64):
 
 @pytest.mark.parametrize("stretch", [1.0, 1.3, 3.0])
 def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
-    """From rest and in motion, towards the goal, away from it and too fast to stop before it."""
+    """Joints start at rest, towards the goal, away from it, or too fast to stop before it."""
     rng = np.random.default_rng(0)
     for scale in (0.0, 1.0):
         turn = rng.uniform(-1.5, 1.5, 6) * np.array([1, 1, 1, 1, 0.01, 0.0])
@@ -82,8 +82,8 @@ def test_an_arm_that_stands_exerts_what_gravity_asks(float64):
     np.testing.assert_allclose(torques(arm, still, 0.0).peak, 0.0, atol=1e-9)
 
 
-def test_torques_of_even_ramps_are_those_of_inertia(float64):
-    """Joint 1 alone, half of the time forwards and half back, without gravity."""
+def test_constant_acceleration_takes_the_torque_of_inertia(float64):
+    """Only joint 1 moves, half of the time forwards and half backwards, without gravity."""
     arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
     acceleration, half = 3.0, 0.2
     rows = np.zeros((2, 3, 6))
@@ -126,7 +126,7 @@ def test_edges_are_free_where_all_of_their_samples_are():
     lines = case.angles + np.linspace(0.0, 1.0, 401)[:, None, None] * (ends - case.angles)
     exact = free.is_free(lines.reshape(-1, 6)).reshape(401, 30).all(axis=0)
     assert found[0] and 3 < found.sum() < 27
-    assert (found == exact).sum() >= 29  # an edge may just touch between its samples
+    assert (found == exact).sum() >= 29  # an edge may touch an obstacle between its samples
     coeffs = np.stack([np.broadcast_to(case.angles, ends.shape), ends - case.angles], axis=1)
     for k in range(30):
         assert free.is_motion_free(coeffs[k : k + 1], np.ones(1)) == found[k]
@@ -142,7 +142,7 @@ def test_a_straight_way_takes_the_time_of_its_closed_form():
         hardest = (acceleration / np.abs(points[1])).min()
         ramps = min(fastest**2 / hardest, 1.0)
         expected = 2.0 * np.sqrt(ramps / hardest) + (1.0 - ramps) / fastest
-        motion = timed_way(points, velocity, acceleration)
+        motion = time_path(points, velocity, acceleration)
         assert motion is not None
         assert motion[1].sum() == pytest.approx(expected, rel=5e-3)
 
@@ -151,7 +151,7 @@ def test_ways_with_corners_are_timed_within_limits():
     pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
     points = np.cumsum(np.random.default_rng(1).normal(0.0, 0.4, (7, 6)), axis=0)
-    motion = timed_way(points, velocity, acceleration)
+    motion = time_path(points, velocity, acceleration)
     assert motion is not None
     coeffs, durations = motion
     assert len(durations) <= PIECES
@@ -172,12 +172,12 @@ def test_planners_on_the_host_say_why_there_is_no_plan():
     cases = jax.tree.map(np.array, pj.block.draw(5, "open", seed=8))
     cases.scene.floor[0] = 0.5  # above the shield
     cases.ball.vel[1, 0] *= -1.0  # flies away
-    cases.rates[2] = 0.1  # is moving already
+    cases.rates[2] = 0.1  # moves already
     cases.limits.acceleration[3] = 0.5
     cases.ball.pos[4] = np.nan
     plans = pj.plan(pj.block.planner("insat", **QUICK), jax.tree.map(jnp.asarray, cases))
-    wanted = ("BLOCKED", "OUT_OF_REACH", "INFEASIBLE", "INFEASIBLE", "BAD_INPUT")
-    assert [pj.Status(status).name for status in plans.status] == list(wanted)
+    expected = ("BLOCKED", "OUT_OF_REACH", "INFEASIBLE", "INFEASIBLE", "BAD_INPUT")
+    assert [pj.Status(status).name for status in plans.status] == list(expected)
     assert np.isinf(plans.violation).all()
     hurried = pj.block.planner("insat", points=6, budget=1e-9)
     plan = pj.plan(hurried, pj.take(pj.block.draw(5, "open", seed=8), 4))
@@ -199,12 +199,12 @@ def test_without_the_extra_the_error_says_what_to_install(name, package, monkeyp
     assert name not in others and {"direct", "insat"} <= others.keys()
 
 
-# Throws of an open scene, where the first way that is tried is free.
+# Throws of an open scene, in which the first tried path is free.
 QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
 
 
-def confirmed(name, regime, **options):
-    """Plans of two throws, which the referee must confirm, and the cases."""
+def plan_and_confirm(name, regime, **options):
+    """Return cases of two throws, plans that the referee confirms, and verdicts."""
     cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8, regime=regime))
     plans = pj.plan(pj.block.planner(name, **QUICK, **options), cases)
     verdict: Any = pj.block.judge(cases, plans)
@@ -219,7 +219,7 @@ def confirmed(name, regime, **options):
 def test_ways_that_are_timed_are_confirmed_by_the_referee(name, regime):
     for package in ("ompl", "toppra"):
         pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
-    _, plans, verdict = confirmed(name, regime)
+    _, plans, verdict = plan_and_confirm(name, regime)
     np.testing.assert_allclose(verdict.execution_time, plans.cost, rtol=1e-5)
     quickest = pj.plan(pj.block.planner("direct", points=6), pj.block.draw(2, "open", seed=8))
     assert regime == "R1" or (plans.cost > 0.99 * quickest.cost).all()
@@ -227,8 +227,8 @@ def test_ways_that_are_timed_are_confirmed_by_the_referee(name, regime):
 
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_splines_are_confirmed_by_the_referee(regime):
-    """At rest at the end if they have to be, else waiting until the ball is there."""
-    cases, plans, verdict = confirmed("insat", regime)
+    """They end at rest if required, else the arm waits and moves as late as possible."""
+    cases, plans, verdict = plan_and_confirm("insat", regime)
     rests = cases.ends_at_rest
     ends = jnp.sum(plans.motion.durations, axis=1)
     last = jax.jit(jax.vmap(lambda motion, time: evaluate(motion, time, 1)))(plans.motion, ends)

@@ -1,4 +1,4 @@
-"""The C++ program that the catch planners are measured beside solves the published problem."""
+"""The C++ program for comparison with the catch planners solves the published problem."""
 
 from pathlib import Path
 

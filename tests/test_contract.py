@@ -11,7 +11,7 @@ import pytest
 from flax import struct
 from jax import Array, lax
 from jaxpr import assert_full_precision
-from test_block_library import made_up
+from test_block_library import make_library
 
 import planner_jax as pj
 from planner_jax.baselines.block.library.planner import LibraryBlock
@@ -197,7 +197,7 @@ ENTRIES = {
     # Without a pole the first spline is found at once, long before the clock ends a search.
     "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
     "block library": Entry(
-        LibraryBlock(made_up(regime="R1")),
+        LibraryBlock(make_library(regime="R1")),
         lambda num: pj.block.draw(num, "pole", 8, regime="R1", anywhere=True),
         "ball.vel",
     ),

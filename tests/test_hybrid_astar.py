@@ -1,4 +1,4 @@
-"""Hybrid A*: its closed forms, its bound on the cost, traps, and what it says where no way is."""
+"""Hybrid A*: its closed forms, its cost bound, traps, and its results without a path."""
 
 import dataclasses
 import sys
@@ -23,11 +23,11 @@ def box(left, low, right, high):
     return [(left, low), (right, low), (right, high), (left, high)]
 
 
-# A dead end that is open to the start's side.
+# A dead end that opens towards the start.
 TRAP = [box(4.0, 2.5, 4.2, 5.5), box(2.6, 2.5, 4.0, 2.7), box(2.6, 5.3, 4.0, 5.5)]
 
 
-def found(meeting, polygons=(), end_heading=None, start=START, **settings):
+def find_path(meeting, polygons=(), end_heading=None, start=START, **settings):
     return hybrid_astar(
         start,
         meeting,
@@ -42,7 +42,7 @@ def found(meeting, polygons=(), end_heading=None, start=START, **settings):
 
 
 def rear(meeting, heading):
-    """The rear axle's pose where the body's middle is on a point."""
+    """Return the rear axle's pose that puts the body's centre on a point."""
     direction = np.array([np.cos(heading), np.sin(heading)])
     return np.append(meeting - MIDDLE * direction, heading)
 
@@ -54,20 +54,20 @@ def dubins_lengths(starts, goals):
 
 @jax.jit
 def gaps(poses, walls):
-    """How far the body is from walls (N, M) [m] at poses (M, 3)."""
+    """Return the distances of the body from walls, (N, M) [m], at poses (M, 3)."""
     x, y, heading = poses.T
     return separation(walls.vertices(0.0), walls.present, x[None], y[None], heading, BODY)
 
 
 def least_lengths(start, meeting):
-    """Dubins's lengths (720,) to every heading at a meeting."""
+    """Return the lengths (720,) of Dubins paths to every heading at a meeting point."""
     goals = np.stack([rear(meeting, heading) for heading in 2.0 * np.pi * np.arange(720) / 720])
     with jax.enable_x64(True):
         return np.asarray(dubins_lengths(np.broadcast_to(start, goals.shape), goals))
 
 
 def assert_drivable(path, meeting, polygons=(), start=START):
-    """It leads from the start to the meeting along arcs that are allowed, clear of polygons."""
+    """Assert that a path of allowed arcs leads to the meeting point clear of polygons."""
     assert path.found and not path.blocked
     x, y, heading = path.poses.T
     np.testing.assert_allclose(path.poses[0], start, atol=1e-12)
@@ -81,7 +81,7 @@ def assert_drivable(path, meeting, polygons=(), start=START):
     half = 0.5 * (heading[1:] + heading[:-1])
     aside = np.cos(half) * np.diff(y) - np.sin(half) * np.diff(x)
     assert (np.abs(aside) <= 0.25 * CURVATURE * spacing**2).all()
-    many = np.resize(np.float32(path.poses), (256, 3))  # from the beginning again: one program
+    many = np.resize(np.float32(path.poses), (256, 3))  # repeated to a fixed size, for one program
     assert len(x) <= 256 and gaps(many, obstacles(polygons, room=(4, 4))).min() > 0.0
     least = np.hypot(x[-1] - x[0], y[-1] - y[0])
     assert path.cost >= path.length >= least - 1e-9
@@ -107,7 +107,7 @@ def test_the_closed_form_to_a_pose_is_dubins_of_the_library(pairs):
 
 def test_the_closed_form_to_a_point_is_the_least_over_all_headings(pairs):
     lengths = np.empty((6, 3))
-    places = np.concatenate([pairs[1][:40, :2], 0.3 * pairs[1][40:80, :2]])  # and in the circles
+    places = np.concatenate([pairs[1][:40, :2], 0.3 * pairs[1][40:80, :2]])
     for place in places:
         goal = kernels.Goal(np.append(place, 0.0), False)
         ours = kernels.least_length(np.zeros(3), goal, 0.0, CURVATURE, lengths)
@@ -134,7 +134,7 @@ def test_distances_are_those_of_the_library_up_to_their_cap():
 def test_without_walls_the_way_is_the_shortest_to_within_a_primitive(end_heading):
     rng = np.random.default_rng(1)
     for meeting in rng.uniform(2.0, 6.0, (8, 2)):
-        path = found(meeting, (), end_heading)
+        path = find_path(meeting, (), end_heading)
         assert_drivable(path, meeting)
         if end_heading is None:
             least = least_lengths(START, meeting).min()
@@ -150,51 +150,51 @@ def test_without_walls_the_way_is_the_shortest_to_within_a_primitive(end_heading
 @pytest.mark.parametrize("end_heading", [None, 0.0])
 def test_the_search_leaves_the_trap(end_heading):
     meeting = np.array([6.5, 4.0])
-    path = found(meeting, TRAP, end_heading, slack=0.05)
+    path = find_path(meeting, TRAP, end_heading, slack=0.05)
     assert_drivable(path, meeting, TRAP)
     assert path.length > 1.05 * least_lengths(START, meeting).min()
 
 
 def test_more_slack_costs_more_and_no_more_than_allowed():
     meeting = np.array([6.5, 4.0])
-    exact, loose = (found(meeting, TRAP, slack=slack) for slack in (0.0, 0.5))
+    exact, loose = (find_path(meeting, TRAP, slack=slack) for slack in (0.0, 0.5))
     assert loose.expansions < exact.expansions
     assert loose.cost <= 1.5 * exact.cost
 
 
 def test_a_start_in_the_trap_finds_the_way_out():
     start, meeting = np.array([2.8, 3.9, 0.0]), np.array([6.5, 4.0])
-    path = found(meeting, TRAP, start=start)
+    path = find_path(meeting, TRAP, start=start)
     assert_drivable(path, meeting, TRAP, start)
 
 
 def test_walls_all_round_leave_no_way():
     ring = [box(5.0, 3.0, 7.0, 3.2), box(5.0, 4.8, 7.0, 5.0)]
     ring += [box(5.0, 3.2, 5.2, 4.8), box(6.8, 3.2, 7.0, 4.8)]
-    path = found((6.0, 4.0), ring, max_expansions=3000)
+    path = find_path((6.0, 4.0), ring, max_expansions=3000)
     assert not path.found and not path.blocked
     assert path.length == path.cost == np.inf
     assert path.poses.shape == (DEFAULT.poses, 3) and np.isnan(path.poses).all()
 
 
 def test_the_search_ends_after_so_many_expansions():
-    path = found((6.5, 4.0), TRAP, max_expansions=20)
+    path = find_path((6.5, 4.0), TRAP, max_expansions=20)
     assert path.expansions == 20 and not path.found
 
 
 @pytest.mark.parametrize("meeting", [(4.1, 4.0), (8.3, 4.0)])
 def test_a_goal_in_a_wall_or_off_the_map_is_blocked(meeting):
-    path = found(meeting, TRAP)
+    path = find_path(meeting, TRAP)
     assert path.blocked and not path.found and path.expansions == 0
 
 
 def test_the_case_turned_and_mirrored_has_the_mirrored_way():
-    """The grid is the same upside down, so that even the rounding of cells is."""
+    """The grid is symmetric, so that cells are rounded alike."""
     meeting = np.array([6.5, 4.4])
     flip = np.array([1.0, -1.0, -1.0])
-    path = found(meeting, TRAP[:2])
+    path = find_path(meeting, TRAP[:2])
     upside_down = [[(x, 8.0 - y) for x, y in polygon] for polygon in TRAP[:2]]
-    mirrored = found((6.5, 3.6), upside_down)
+    mirrored = find_path((6.5, 3.6), upside_down)
     assert mirrored.cost == pytest.approx(path.cost, rel=0.05)
     assert_drivable(mirrored, (6.5, 3.6), upside_down)
     if mirrored.cost == pytest.approx(path.cost, rel=1e-9):
@@ -226,4 +226,4 @@ def test_without_numba_the_error_says_what_to_install(monkeypatch):
     monkeypatch.delitem(sys.modules, "planner_jax.baselines.intercept.hybrid_astar_kernels")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install .*\[baselines\]'"):
-        found((6.0, 4.0))
+        find_path((6.0, 4.0))

@@ -1,4 +1,4 @@
-"""The oracle of the late and weak rows: what it finds is a hit, and it knows a hopeless case."""
+"""The oracle of the late and weak rows: its results are hits, and it detects hopeless cases."""
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,7 @@ def test_an_easy_serve_is_proven_feasible_by_a_trajectory_that_the_referee_passe
 
 
 def test_a_hopeless_serve_is_called_infeasible():
-    """At a fifth of the limits nobody arrives in time."""
+    """At a fifth of the limits no trajectory arrives in time."""
     finding = find_hit(serve(0.2), starting_points(4, 0))
     assert finding.verdict == "infeasible"
     assert finding.least_excess > 0.1

@@ -1,8 +1,8 @@
-"""The planner of [Yu2023catch] against the published C++ protocol: 240 throws, guess and optimum.
+"""The planner of [Yu2023catch] against the published C++ protocol: 240 throws.
 
-`data/catch_paper.csv` and `data/catch_hard.csv` hold the ball at the time of planning, the time
-T_p of the guess, its cost with 4 and with 8 pieces, and the optimum that a C++ implementation
-of the same problem converges to.
+`data/catch_paper.csv` and `data/catch_hard.csv` hold the ball at the time of planning, the time T_p
+of the initial guess, its cost with 4 and with 8 pieces, and the optimum of a C++ implementation of
+the same problem.
 """
 
 import csv
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.usefixtures("float64")
 
 
 def rows(name, num=None):
-    """The first rows of a file as cases, and its columns."""
+    """Return the first rows of a file as cases, and its columns."""
     path = Path(__file__).parent / "data" / f"catch_{name}.csv"
     with path.open(encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:num]
@@ -51,11 +51,11 @@ def rows(name, num=None):
     return cases.replace(times=columns["Tp"][:, None]), columns
 
 
-def converged():
-    """The planner with as many steps as every row takes.
+def run_longer():
+    """Return the planner with enough steps for every row.
 
-    With the stages before, the slowest of the 240 takes 181 to 217 steps, as the rounding of a
-    release of JAX has it, and the planner ends after 185. In float32 more bring nothing.
+    After the earlier stages the slowest of the 240 rows takes 181 to 217 steps, depending on the
+    rounding of the JAX release; the planner's own limit is 185. In float32 more steps gain nothing.
     """
     (full,) = PLANNER.rounds
     patient = dataclasses.replace(full.solver, max_steps=250)
@@ -63,7 +63,7 @@ def converged():
 
 
 def excess(num, planner=PLANNER):
-    """Costs reached on the first rows of both files, relative to the published optima, less 1."""
+    """Return relative excess over the published optima, time errors, cases and plans."""
     (easy, published), (hard, of_hard) = (rows(name, num) for name in NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
     plans = plan(planner, cases)
@@ -99,7 +99,7 @@ def test_converged_cost_is_the_published_optimum():
 
 @pytest.mark.slow
 def test_converged_costs_are_the_published_optima_on_every_row():
-    gap, late, _, _ = excess(None, converged())
+    gap, late, _, _ = excess(None, run_longer())
     np.testing.assert_allclose(gap, 0.0, atol=1e-4)
     np.testing.assert_allclose(late, 0.0, atol=1e-3)
     own = np.abs(excess(None)[0])
@@ -110,21 +110,21 @@ def test_objective_gradient_agrees_with_finite_differences():
     case = jax.tree.map(lambda leaf: leaf[0], rows("hard", 1)[0])
 
     def cost(shift):
-        """Of a point beside the guess."""
+        """Return the cost at a point next to the guess."""
         context = PLANNER.prepare(case)
         return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
 
     shift = 0.3 * np.random.default_rng(0).normal(size=len(PLANNER.scale))
     assert_gradient_matches_differences(cost, shift, step=1e-6, rtol=1e-6)
-    # The guess itself has no miss, where the net's distance has a corner.
+    # The guess has a miss of zero, where the net's distance is not differentiable.
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
 
 
 def test_energy_gradient_at_the_catch_is_the_papers():
-    """Eqs 19b-c, with the fourth derivatives that minimum snap needs, against the closed form.
+    """Eqs 19b-c, with the fourth derivatives of minimum snap, agree with the closed form.
 
-    The gradients by coefficients and durations are pulled back to the catching state, the
-    waypoints and the duration.
+    The gradients by coefficients and durations are pulled back to the catching state, the waypoints
+    and the duration.
     """
     maps = proportional_minco(4, (1.0,) * 4)
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""Smoothing of paths: slopes, a falling cost, ends that stay, and what is kept as it was."""
+"""Smoothing of paths: gradients, a decreasing cost, fixed ends, and paths returned unchanged."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from dubins import dubins, sample_dubins
 from planner_jax.baselines.intercept.path_smoothing import (
     Smoothing,
     control_points,
-    resampled,
+    resample,
     smooth_path,
     smooth_points,
     smoothing_cost,
@@ -29,7 +29,7 @@ def walls_of(polygons=WALLS):
 
 
 def paths(goals):
-    """Dubins's ways (B, NUM, 3) at eight tenths of the curvature, their curvatures and lengths."""
+    """Return Dubins paths (B, NUM, 3) at 0.8 of the curvature limit, curvatures and lengths."""
 
     def one(goal):
         path = dubins(jnp.asarray(START), goal, 0.8 * CURVATURE)
@@ -64,13 +64,13 @@ cost_and_slope = jax.jit(jax.value_and_grad(cost))
 
 
 @jax.jit
-def descended(points, walls):
+def descend(points, walls):
     return smooth_points(points, walls, CURVATURE, Smoothing(iterations=5))
 
 
 @jax.jit
 def gaps(poses, walls):
-    """How far the body is from walls (B, N, NUM) [m] along paths."""
+    """Return the distances of the body from walls, (B, N, NUM) [m], along paths."""
 
     def one(poses):
         x, y, heading = poses.T
@@ -84,14 +84,14 @@ all_smooth = jax.jit(jax.vmap(smooth, in_axes=(0, 0, 0, None)))
 
 @pytest.fixture(scope="module")
 def batch():
-    """Given paths, and smooth ones."""
+    """Return given paths and their smooth versions."""
     given = jax.jit(paths)(jnp.asarray(GOALS, jnp.float32))
     return jax.tree.map(np.asarray, (given, all_smooth(*given, walls_of())))
 
 
 @pytest.fixture
 def crooked():
-    """Points that come near a wall, and turn more than is allowed."""
+    """Return points close to a wall that exceed the curvature limit."""
     rng = np.random.default_rng(0)
     line = np.stack([np.linspace(0.5, 5.5, 24), np.full(24, 1.3)], axis=1)
     return line + rng.normal(0.0, 0.06, line.shape)
@@ -132,7 +132,7 @@ def test_smoothing_lowers_the_cost_and_holds_the_ends(crooked, float64):
     costs, moved = [cost_and_slope(crooked, unit, walls)[0]], crooked
     for times in (1, 11):
         for _ in range(times):
-            moved = descended(moved, walls)
+            moved = descend(moved, walls)
         np.testing.assert_array_equal(moved[:2], crooked[:2])
         np.testing.assert_array_equal(moved[-2:], crooked[-2:])
         costs.append(cost_and_slope(moved, unit, walls)[0])
@@ -141,7 +141,7 @@ def test_smoothing_lowers_the_cost_and_holds_the_ends(crooked, float64):
 
 def test_a_straight_path_far_from_walls_stays(float64):
     line = np.stack([np.linspace(1.0, 7.0, 24), np.full(24, 7.0)], axis=1)
-    np.testing.assert_allclose(descended(line, walls_of()), line, atol=1e-12)
+    np.testing.assert_allclose(descend(line, walls_of()), line, atol=1e-12)
 
 
 def test_the_spline_of_an_arc_is_that_arc(float64):
@@ -150,7 +150,7 @@ def test_the_spline_of_an_arc_is_that_arc(float64):
 
     @jax.jit
     def spline(poses):
-        return resampled(control_points(poses, jnp.ones(17)), 0.0, 2.0, 41)
+        return resample(control_points(poses, jnp.ones(17)), 0.0, 2.0, 41)
 
     poses, curvature, length = jax.tree.map(np.asarray, spline(given))
     even = np.linspace(0.0, 2.0, 41)
@@ -185,7 +185,7 @@ def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
 
 
 def test_a_path_that_cannot_be_made_smooth_is_kept_and_leaves_its_neighbours_alone(batch):
-    """One runs through a wall, one is not there at all."""
+    """One path runs through a wall, another one is NaN."""
     (poses, bends, length), found = batch
     poses, length = poses.copy(), length.copy()
     poses[1] = poses[0] + np.array([0.0, -1.4, 0.0])

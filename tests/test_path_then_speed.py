@@ -1,4 +1,4 @@
-"""Path, then speed: what movers block along a path, what is driven, and what cannot be solved."""
+"""Path, then speed: projected obstacles, drives along paths, and unsolvable cases."""
 
 import dataclasses
 import functools
@@ -20,12 +20,12 @@ from planner_jax.baselines.intercept.path_then_speed import (
 )
 from planner_jax.baselines.intercept.projection import (
     Projection,
-    blocked_by,
     overlap,
+    project_obstacles,
     speed_limits,
     station_time_problem,
 )
-from planner_jax.baselines.intercept.static_paths import turns_around
+from planner_jax.baselines.intercept.static_paths import count_turns
 from planner_jax.plane.obstacles import obstacles, separation
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
@@ -40,7 +40,7 @@ def still(x, y):
 
 
 def scene(target=(6.0, 4.0), movers=(), velocities: Any = 0.0, walls=(), **settings):
-    """A case with the room of drawn ones."""
+    """Return a case with the array sizes of drawn cases."""
     return pj.intercept.case(
         still(*target),
         walls=obstacles(walls, room=(12, 6)),
@@ -60,7 +60,7 @@ BENT = along(
 
 
 def crossing(rng, path, num):
-    """Movers that come to random points of a path at random times."""
+    """Return movers that reach random points of a path at random times."""
     at = np.asarray(path.pos)[rng.integers(10, len(path.pos), num)]
     time, angle = rng.uniform(1.0, 9.0, num), rng.uniform(0.0, 2.0 * np.pi, num)
     velocity = rng.uniform(0.1, 0.6, (num, 1)) * np.stack([np.cos(angle), np.sin(angle)], 1)
@@ -72,9 +72,9 @@ def crossing(rng, path, num):
 
 @jax.jit
 def least_distance(path, movers, times, stations):
-    """How far the body, just as it is, is from the nearest mover [m], (times, stations).
+    """Return the distance of the body from the nearest mover [m], (times, stations).
 
-    Negative where they overlap; by brute force. Between its points a path is interpolated.
+    It is negative in an overlap, by brute force. The path is interpolated between its points.
     """
     place = jnp.linspace(0.0, 1.0, len(path.heading)) * path.length
     x, y, heading = (jnp.interp(stations, place, each) for each in (*path.pos.T, path.heading))
@@ -88,7 +88,7 @@ def least_distance(path, movers, times, stations):
 
 
 def is_inside(blocked, times, stations):
-    """Whether a quadrangle holds points of the plane, (times, stations) bool."""
+    """Return whether a quadrangle contains points of the plane, (times, stations) bool."""
     blocked, (lower, upper) = jax.device_get((blocked, edges_at(blocked, times[:, None])))
     is_now = (blocked.start <= times[:, None]) & (times[:, None] <= blocked.end) & blocked.present
     s = stations[:, None]
@@ -97,7 +97,7 @@ def is_inside(blocked, times, stations):
 
 @functools.partial(jax.jit, static_argnames="projection")
 def project(path, movers, projection):
-    return blocked_by(path, movers, EMPTY.body, EMPTY.time, projection)
+    return project_obstacles(path, movers, EMPTY.body, EMPTY.time, projection)
 
 
 edges_at = jax.jit(lambda blocked, times: blocked.edges_at(times))
@@ -118,7 +118,7 @@ def test_quadrangles_hold_whatever_the_body_meets_and_little_else(path):
         held, exact = held + found.sum(), exact + (apart < 0.0).sum()
         near += (found & (apart < 0.1)).sum()
     assert exact > 2000
-    assert near > 0.85 * held  # what is beyond 0.1 m is what straight edges cost
+    assert near > 0.85 * held  # straight edges add little beyond 0.1 m
 
 
 def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_overlap():
@@ -126,7 +126,7 @@ def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_ov
     begin, finish = jax.device_get(overlaps(STRAIGHT, movers))
     x = np.asarray(STRAIGHT.pos)[:, 0]
     meets = (x + 0.35 > 2.8) & (x - 0.05 < 3.2)
-    # Their sides meet after 2 m less 0.2 m and half the width of 0.25 m, at 0.5 m/s.
+    # Their sides touch after 2 m minus 0.2 m minus half the width of 0.25 m, at 0.5 m/s.
     np.testing.assert_allclose(begin[0, meets], (2.0 - 0.325) / 0.5, rtol=1e-5)
     np.testing.assert_allclose(finish[0, meets], (2.0 + 0.325) / 0.5, rtol=1e-5)
     assert (begin[0, ~meets] >= finish[0, ~meets]).all()
@@ -135,14 +135,14 @@ def test_a_square_that_crosses_a_straight_path_blocks_it_just_as_long_as_they_ov
 @pytest.mark.slow
 def test_a_path_that_comes_back_is_blocked_in_two_runs():
     loop = along(np.zeros(3, np.float32), np.float32(5.0), np.full(129, 0.4 * np.pi, np.float32))
-    movers = obstacles([SQUARE], [0.0, 1e-3])  # stays at its beginning, which is its end
+    movers = obstacles([SQUARE], [0.0, 1e-3])  # stays at start and end of the loop
     found = project(loop, movers, Projection(runs=2, slabs=1))
     assert found.present.tolist() == [True, True]
     middle = np.asarray(edges_at(found, np.float32(5.0))).mean(axis=0)
     assert middle[0] < 1.0 and middle[1] > 4.0
     one = project(loop, movers, Projection(runs=1, slabs=1))
     low, high = jax.device_get(edges_at(one, np.float32(5.0)))
-    assert low[0] <= 0.0 and high[0] >= 5.0  # joined, they block all that lies between
+    assert low[0] <= 0.0 and high[0] >= 5.0  # one joined run blocks everything between
 
 
 def test_speed_is_limited_by_lateral_acceleration_and_by_the_steering_rate():
@@ -161,11 +161,11 @@ def test_the_way_of_a_drive_is_that_of_the_car():
     curvature = rng.uniform(-1.5, 1.5, 17).astype(np.float32)
 
     @jax.jit
-    def driven(*drive):
+    def drive_both(*drive):
         return path_of_drive(*drive, 129), pose_at(*drive, drive[1])
 
     start = np.float32([1.0, 2.0, 0.3])
-    path, end = jax.device_get(driven(start, np.float32(4.0), speed, curvature))
+    path, end = jax.device_get(drive_both(start, np.float32(4.0), speed, curvature))
     np.testing.assert_allclose(path.pos[-1], end[:2], atol=5e-3)
     np.testing.assert_allclose(path.heading[-1], end[2], atol=5e-3)
     np.testing.assert_allclose(
@@ -177,7 +177,7 @@ def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
 
     @jax.jit
     def beside(start, goal):
-        """The way of arcs, its curvature, and the path of a car beside it."""
+        """Return the path of arcs, its curvature, and the path of a car along it."""
         way = dubins(start, goal, jnp.asarray(1.6))
         poses = sample_dubins(way, 129)
         bends = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
@@ -203,8 +203,8 @@ def test_without_movers_a_straight_way_costs_what_the_least_acceleration_does():
     case = scene((6.0, 4.0))
     plan = drive(case, STRAIGHT)
     assert plan.status == pj.Status.CONVERGED
-    # Of least acceleration with a free end: 3 D^2 / T^3, D what is missing at constant speed; to
-    # begin without acceleration costs a little more.
+    # Least cost with a free end: 3 D^2 / T^3 with the distance D missing at constant speed. The
+    # initial acceleration of zero costs a little more.
     least = 3.0 * (5.05 - 0.5 * 10.0) ** 2 / 10.0**3
     assert least <= plan.cost <= 1.1 * least
     far = drive(scene((6.0, 4.0), time=6.0), STRAIGHT)
@@ -231,7 +231,7 @@ def test_a_drive_follows_its_path_and_ends_where_it_ends():
 
 
 @jax.jit
-def ramped(path, times):
+def ramp_along(path, times):
     problem = station_time_problem(
         path, EMPTY.movers, EMPTY.body, EMPTY.limits, EMPTY.time, EMPTY.speed
     )
@@ -242,7 +242,7 @@ def ramped(path, times):
 def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length):
     times = np.linspace(0.0, 10.0, 1001, dtype=np.float32)
     path = dataclasses.replace(STRAIGHT, length=np.float32(length))
-    station, speed = jax.device_get(ramped(path, times))
+    station, speed = jax.device_get(ramp_along(path, times))
     np.testing.assert_allclose(station[-1], length, rtol=1e-5)
     np.testing.assert_allclose(np.gradient(station, times)[1:-1], speed[1:-1], atol=6e-3)
     rise = np.diff(speed) * 100.0
@@ -252,7 +252,7 @@ def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length)
 def test_ways_on_either_side_of_a_wall_differ_by_a_turn_and_others_by_none():
     walls = obstacles([SQUARE + [4.0, 4.0], SQUARE + [4.0, 1.0]])
     start, goal = np.float32([1.0, 4.0]), np.float32([7.0, 4.1])
-    turning = jax.jit(turns_around)
+    turning = jax.jit(count_turns)
     x = np.linspace(1.2, 6.8, 30)
     bend = np.sin((x - 1.0) / 6.0 * np.pi)
 
@@ -266,7 +266,7 @@ def test_ways_on_either_side_of_a_wall_differ_by_a_turn_and_others_by_none():
 
 
 PLANNER = lattice(source=PathSource(drawn=6), searches=(Search(4, lattice=Lattice(layers=22)),))
-# As long as the map is wide, and parked across it or only just moving.
+# A barrier across the whole map.
 BARRIER = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
 NEAR = (6.0, 4.0)
 SCENES = {

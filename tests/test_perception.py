@@ -22,12 +22,12 @@ from planner_jax.studies.block.camera import back_project, in_view, looking_at, 
 from planner_jax.studies.block.flight_fit import (
     Sight,
     across_std,
-    believed_at,
+    belief_at,
     error_across,
     fit_flight,
 )
 from planner_jax.studies.block.noise import (
-    RoundNoise,
+    IsotropicNoise,
     depth_std,
     information,
     sightings,
@@ -47,14 +47,14 @@ CAMERA = looking_at(
 paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
 fit_one = jax.jit(fit_flight)
 fit_many = jax.jit(jax.vmap(fit_flight, (0, 0, 0, None)))
-believed = jax.jit(believed_at)
+believed = jax.jit(belief_at)
 sighting_one = jax.jit(sighting)
 
 
 @jax.jit
 def errors(fits, truth):
     """What many fits say of the ball `AHEAD` [s] after the first look, and how far they are off."""
-    beliefs = jax.vmap(believed_at, (0, None, None))(fits, AHEAD, GRAVITY)
+    beliefs = jax.vmap(belief_at, (0, None, None))(fits, AHEAD, GRAVITY)
     stds = jax.vmap(across_std)(beliefs)
     return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
 
@@ -192,7 +192,7 @@ def test_gradients_of_a_fit_are_finite_with_and_without_a_ball():
 
     def across(places):
         fit = fit_flight(TIMES, places, 1.0, GRAVITY)
-        return across_std(believed_at(fit, AHEAD, GRAVITY)) + jnp.sum(fit.ball.pos)
+        return across_std(belief_at(fit, AHEAD, GRAVITY)) + jnp.sum(fit.ball.pos)
 
     slope = jax.jit(jax.grad(across))
     found = slope(holes)
@@ -265,7 +265,7 @@ def test_the_information_of_a_sighting_is_the_inverse_of_its_covariance():
 
 
 def test_round_noise_is_alike_in_every_direction():
-    noise, place = RoundNoise(std=jnp.asarray(0.02)), jnp.array([4.0, 1.0, 1.5])
+    noise, place = IsotropicNoise(std=jnp.asarray(0.02)), jnp.array([4.0, 1.0, 1.5])
     many = jax.jit(sightings)(jax.random.key(0), CAMERA, noise, jnp.broadcast_to(place, (9000, 3)))
     np.testing.assert_allclose(np.cov(many.T), 4e-4 * np.eye(3), atol=2e-5)
     np.testing.assert_allclose(information(CAMERA, noise, place), 2500.0 * np.eye(3), rtol=1e-5)

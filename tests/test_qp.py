@@ -21,8 +21,8 @@ BOTH = np.concatenate([EQUALITIES, ZEROS])
 float64 = pytest.mark.usefixtures("float64")
 
 
-def drawn(lanes=LANES):
-    """Right sides and bounds of programs that have a solution; of some bounds one or both are."""
+def draw_programs(lanes=LANES):
+    """Draw right sides and bounds of programs with a solution; some bounds are infinite."""
     point = RNG.normal(size=(lanes, UNKNOWNS))
     point -= point @ ZEROS.T @ ZEROS / np.sum(ZEROS**2)
     value, width = point @ MATRIX.T, RNG.exponential(0.5, (2, lanes, ROWS))
@@ -30,7 +30,7 @@ def drawn(lanes=LANES):
     return point @ EQUALITIES.T, value - width[0], value + width[1]
 
 
-PROGRAMS = drawn()
+PROGRAMS = draw_programs()
 one = jax.jit(lambda *program: solve_qp(TEMPLATE, *program))
 many = jax.jit(jax.vmap(lambda *program: solve_qp(TEMPLATE, *program)))
 
@@ -50,7 +50,7 @@ def test_solutions_meet_the_optimality_conditions(solved):
     assert (value >= lower - 1e-9).all() and (value <= upper + 1e-9).all()
     np.testing.assert_allclose(value[pressure > 0], lower[pressure > 0], atol=1e-8)
     np.testing.assert_allclose(value[pressure < 0], upper[pressure < 0], atol=1e-8)
-    # What the multipliers leave of the slope is at right angles to all that equalities permit.
+    # The gradient less the multipliers is orthogonal to the null space of the equalities.
     slope = solved.point @ HESSIAN - pressure @ MATRIX
     rest = slope - slope @ np.linalg.pinv(BOTH) @ BOTH
     np.testing.assert_allclose(rest, 0.0, atol=1e-8)
@@ -112,14 +112,14 @@ def test_multipliers_are_slopes_of_the_cost_and_gradients_those_of_differences(s
     np.testing.assert_allclose(slopes[1][0], np.maximum(pressure, 0.0), atol=1e-8)
     np.testing.assert_allclose(slopes[2][0], np.minimum(pressure, 0.0), atol=1e-8)
     for _ in range(3):
-        way = [RNG.normal(size=each.shape) for each in given]
+        direction = [RNG.normal(size=each.shape) for each in given]
         ends = [
-            one(*(each + h * step for each, step in zip(given, way, strict=True)))
+            one(*(each + h * step for each, step in zip(given, direction, strict=True)))
             for h in (1e-6, -1e-6)
         ]
         found = [np.stack([end.cost, end.point @ weights]) for end in ends]
         expected = (found[0] - found[1]) / 2e-6
-        actual = sum(slope @ step for slope, step in zip(slopes, way, strict=True))
+        actual = sum(slope @ step for slope, step in zip(slopes, direction, strict=True))
         np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-7)
 
 

@@ -9,7 +9,7 @@ from closed_forms import region_of
 
 import planner_jax as pj
 from planner_jax.ball import flight
-from planner_jax.baselines.hit.published import published_rates
+from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.task.hit import court
 from planner_jax.task.hit.case import GRAVITY
@@ -83,7 +83,7 @@ def test_the_court_has_36_scenarios_without_mirror_images():
 
 
 def test_published_rates_have_the_known_means():
-    rates = published_rates()
+    rates = read_published_rates()
     np.testing.assert_allclose(rates.paper.mean(axis=0), [12.66, 47.86, 77.91], atol=5e-3)
     np.testing.assert_allclose(rates.trials.mean(axis=0), [9.42, 46.57, 85.38], atol=5e-3)
     np.testing.assert_allclose(rates.paper[court.SCENARIOS.index("FLR")], [0.3, 60.6, 85.4])
@@ -198,7 +198,7 @@ def test_the_published_serves_are_read_with_their_rates():
     np.testing.assert_allclose(serves.target, court.target_of(serves.scenario))
     # 250 of the 1,000 trials of each scenario: the means are near, not equal.
     rates = 100.0 * serves.published.mean(axis=0)
-    np.testing.assert_allclose(rates, published_rates().trials.mean(axis=0), atol=1.0)
+    np.testing.assert_allclose(rates, read_published_rates().trials.mean(axis=0), atol=1.0)
 
 
 # Flight on the host.

@@ -16,7 +16,7 @@ from planner_jax.sims.board import calibrated, show_board
 from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
 from planner_jax.sims.segment import ball_look, sighting
 from planner_jax.studies.block.camera import project
-from planner_jax.studies.block.flight_fit import believed_at, error_across, fit_flight
+from planner_jax.studies.block.flight_fit import belief_at, error_across, fit_flight
 from planner_jax.studies.block.noise import information, stereo_noise
 from planner_jax.studies.block.observation import mast_camera
 from planner_jax.task.block.scene import paper_scene
@@ -80,7 +80,7 @@ def test_a_flight_through_images_is_found_as_well_as_it_is_believed(scene):
     assert np.isfinite(seen).all(axis=1).sum() >= 8
     fit = jax.jit(fit_flight)(times, seen, information(CAMERA, noise, jnp.asarray(seen)), GRAVITY)
     truth = drag_free_flight(ball, times[-1], GRAVITY)
-    belief = believed_at(fit, times[-1], GRAVITY)
+    belief = belief_at(fit, times[-1], GRAVITY)
     assert error_across(belief, truth) < 0.05
     assert 0.4 < fit.misfit < 1.8
 

@@ -12,7 +12,6 @@ from planner_jax.baselines.intercept.bezier import BezierCurve, bernstein, hodog
 from planner_jax.baselines.intercept.speed import (
     SPEED_PLANNERS,
     SpeedPlanner,
-    constant_speed,
     plan_speed,
     speed_bounds,
     speed_matrices,
@@ -104,13 +103,6 @@ def test_without_a_line_or_with_broken_numbers_a_plan_says_so_and_others_stay_th
     np.testing.assert_array_equal(found.curve.points[6:], plans.curve.points[6:])
 
 
-def test_constant_speed_arrives_in_time_without_acceleration():
-    curve = constant_speed(jax.tree.map(lambda leaf: leaf[0], PROBLEMS))
-    points = np.asarray(curve.points)[None]
-    np.testing.assert_allclose(dense(points, 10.0, 0, TIMES)[0], 0.6 * TIMES, atol=1e-6)
-    np.testing.assert_allclose(dense(points, 10.0, 2, TIMES), 0.0, atol=1e-5)
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
 def test_the_gradient_of_the_cost_is_that_of_differences():
@@ -140,9 +132,8 @@ def test_the_first_problems_are_the_same_whatever_their_number_and_others_by_ano
 def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
     pytest.importorskip("clarabel", reason="the extra `peers` is not installed")
     solve = clarabel_solver(speed_matrices(TRAPEZOID))
-    bounds = jax.jit(jax.vmap(lambda *given: speed_bounds(*given[:2], TRAPEZOID, given[2])))
-    slopes = np.diff(plans.reference.station[:, ::2], axis=1)
-    programs = map(np.asarray, bounds(PROBLEMS, plans.reference, slopes))
+    bounds = jax.jit(jax.vmap(lambda *given: speed_bounds(*given, TRAPEZOID)))
+    programs = map(np.asarray, bounds(PROBLEMS, plans.reference))
     peers = [solve(*program) for program in zip(*programs, strict=True)]
     solved = np.array([peer.solved for peer in peers])
     np.testing.assert_array_equal(solved, plans.status == Status.CONVERGED)
@@ -152,20 +143,19 @@ def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
 
 @pytest.mark.slow
 def test_every_planner_of_the_table_keeps_its_promise():
-    """Bounds on points are clear everywhere, exact bounds at samples are not; tilted is best."""
+    """Bounds on points are clear everywhere; tilted lines cost least."""
     problems = speed_problems(64)
     planned = {}
     for name, planner in SPEED_PLANNERS.items():
         found = jax.jit(jax.vmap(lambda p, planner=planner: plan_speed(p, planner)))(problems)
         away = clearance(problems, dense(np.asarray(found.curve.points), 10.0, 0, TIMES))
         planned[name] = np.asarray(found.status == Status.CONVERGED), away, np.asarray(found.cost)
-    for name in ("trapezoid", "trapezoid-twice", "trapezoid-edges", "rectangle"):
+    for name in ("trapezoid", "trapezoid-edges", "rectangle"):
         solved, away, _ = planned[name]
         assert (away[solved] > 0.0).all()
-    assert (planned["em-exact"][1] < 0.0).mean() > 0.3
     everywhere = np.all([planned[name][0] for name in planned], axis=0)
     mean = {name: cost[everywhere].mean() for name, (_, _, cost) in planned.items()}
-    order = ["em-exact", "trapezoid-twice", "trapezoid", "trapezoid-edges", "em", "rectangle"]
+    order = ["trapezoid", "trapezoid-edges", "em", "rectangle"]
     assert sorted(mean, key=mean.__getitem__) == order
     assert planned["trapezoid"][0].mean() > planned["trapezoid-edges"][0].mean()
 

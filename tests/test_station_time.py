@@ -1,4 +1,4 @@
-"""The graph of station and time: the line through it, free intervals and corridors beside it."""
+"""The graph of station and time: the line through it, and corridors beside it."""
 
 import itertools
 
@@ -20,7 +20,7 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def problem(polygons=(), speed_limit=9.0, initial_speed=0.5, acceleration_limit=9.0):
-    """6 m in 10 s, and of each polygon start, end, lower edge (2,) and upper edge (2,)."""
+    """Return a problem of 6 m in 10 s; a polygon is (start, end, lower edge, upper edge)."""
     unused = (20.0, 21.0, (0.0, 0.0), (1.0, 1.0))
     rows = [*polygons, *[unused] * (POLYGONS - len(polygons))]
     start, end, lower, upper = (np.array(each, float) for each in zip(*rows, strict=True))
@@ -36,8 +36,8 @@ def problem(polygons=(), speed_limit=9.0, initial_speed=0.5, acceleration_limit=
     )
 
 
-def drawn(num, seed=0):
-    """Problems with two random parallelograms, a slow middle third and a tight acceleration."""
+def draw_problems(num, seed=0):
+    """Draw problems with two parallelograms, a slow middle third and a tight acceleration."""
     rng = np.random.default_rng(seed)
     problems = []
     for _ in range(num):
@@ -55,8 +55,8 @@ coarse = jax.jit(jax.vmap(lambda p: reference_line(p, GRID)))
 BATCH = 48
 
 
-def padded(*problems):
-    """A batch of the one size that is compiled."""
+def pad(*problems):
+    """Pad problems to the batch size of the compiled program."""
     rows = [*problems, *[problems[-1]] * (BATCH - len(problems))]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
 
@@ -64,12 +64,12 @@ def padded(*problems):
 @pytest.fixture(scope="module")
 def lines():
     with jax.enable_x64(True):
-        problems = drawn(BATCH)
+        problems = draw_problems(BATCH)
         return problems, jax.tree.map(np.asarray, coarse(problems))
 
 
 def depth(problems, k, times, station):
-    """How deep stations (M,) at times (M,) are inside of the polygons of problem k at most."""
+    """Return the depth of stations (M,) at times (M,) inside the polygons of problem k."""
     blocked = jax.tree.map(lambda leaf: leaf[k], problems.blocked)
     deepest = np.full(np.shape(times), -np.inf)
     for p in np.flatnonzero(blocked.present):
@@ -84,7 +84,7 @@ def depth(problems, k, times, station):
 
 
 def best_by_trying(problems, k):
-    """The least cost of all sequences of jumps that are allowed, looking every millisecond."""
+    """Return the least cost of all allowed sequences of jumps, checked every millisecond."""
     limits = problems.speed_limit[k]
     times = np.linspace(0.0, 10.0, 10001)
     least = np.inf
@@ -112,17 +112,12 @@ def test_the_line_is_the_best_of_all_on_the_grid(lines):
     np.testing.assert_allclose(found.cost, expected, rtol=1e-9)
 
 
-def test_the_line_meets_no_polygon_and_the_free_interval_around_it_ends_where_one_begins(lines):
+def test_the_line_meets_no_polygon(lines):
     problems, found = lines
     times = np.linspace(0.0, 10.0, 2001)
     for k in np.flatnonzero(found.found):
         station = np.interp(times, np.arange(6) * 2.0, found.station[k])
         assert depth(problems, k, times, station).max() < 1e-3
-        inside = np.linspace(found.lower[k] + 1e-6, found.upper[k] - 1e-6, 7)
-        assert depth(problems, k, np.arange(6) * 2.0, inside).max() <= 0.0
-        just_out = np.stack([found.lower[k] - 1e-6, found.upper[k] + 1e-6])
-        is_edge = np.stack([found.lower[k] > 0.0, found.upper[k] < 6.0])
-        assert (depth(problems, k, np.arange(6) * 2.0, just_out)[is_edge] > 0.0).all()
 
 
 @float64
@@ -130,8 +125,8 @@ def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     free = problem(initial_speed=0.6)
     wall = problem([(3.0, 4.0, (-1.0, -1.0), (7.0, 7.0))])
     fast = problem(speed_limit=(9.0, 0.2, 9.0))
-    cases = padded(free, wall, fast)
-    # Straight is not on this grid, 6 stations in 5 steps, but on one whose step divides it.
+    cases = pad(free, wall, fast)
+    # This grid, 6 stations in 5 steps, lacks the straight line; a finer grid has it.
     straight = jax.jit(lambda p: reference_line(p, StationTimeGrid(10, 5, 3)))(free)
     np.testing.assert_allclose(straight.station, np.linspace(0.0, 6.0, 6), atol=1e-12)
     np.testing.assert_allclose(straight.cost, 0.0, atol=1e-12)
@@ -155,7 +150,7 @@ SHARES = np.linspace(0.0, 1.0, 9)
 @jax.jit
 @jax.vmap
 def around(problem, station):
-    """By the kind of lines the corridor of five pieces and its bounds (5, 9) at SHARES."""
+    """Return corridors of five pieces and their bounds (5, 9) at SHARES, by kind of lines."""
     kinds = {kind: corridor(problem, station, 5, kind) for kind in ("tilted", "edges", "flat")}
     return {kind: (found, found.bounds(SHARES)) for kind, found in kinds.items()}
 
@@ -170,7 +165,7 @@ def corridors(lines):
 @pytest.mark.parametrize("kind", ["tilted", "edges", "flat"])
 def test_nothing_between_the_lines_of_a_corridor_is_inside_of_a_polygon(lines, corridors, kind):
     problems, found = lines
-    # Straight lines between bounds at shares are within the bounds.
+    # Bounds are convex: linear interpolation between SHARES stays within them.
     fine = np.linspace(0.0, 1.0, 401)
     grid = np.array([np.interp(fine, SHARES, unit) for unit in np.eye(9)])
     lower, upper = (np.clip(bound, 0.0, 6.0) @ grid for bound in corridors[kind][1])
@@ -203,7 +198,7 @@ def test_flat_corridors_are_rectangles_and_edges_have_the_slope_of_the_polygon()
     case = problem([(start, 8.0, (1.0, 1.0 + 5.0 * slope), (2.0, 2.0 + 5.0 * slope))])
     above = np.linspace(0.0, 6.0, 6) + np.array([0.0, 2.0, 2.0, 1.5, 1.0, 0.0])
     with jax.enable_x64(True):
-        found = around(padded(case), np.tile(above, (BATCH, 1)))
+        found = around(pad(case), np.tile(above, (BATCH, 1)))
     kinds = [jax.tree.map(lambda leaf: leaf[0], found[kind][0]) for kind in ("edges", "flat")]
     edges, flat = (np.asarray(kind.lower_rise[:, 0]) for kind in kinds)
     np.testing.assert_allclose(edges, [0.0, *[2.0 * slope] * 3, 0.0], atol=1e-12)
@@ -219,7 +214,7 @@ def test_pieces_have_the_speed_limit_of_the_parts_they_pass_and_keep_off_slower_
     case = problem(speed_limit=(1.0, 0.4, 0.7))
     station = np.array([0.0, 1.0, 2.0, 2.5, 4.0, 6.0])
     with jax.enable_x64(True):
-        found = around(padded(case), np.tile(station, (BATCH, 1)))["tilted"][0]
+        found = around(pad(case), np.tile(station, (BATCH, 1)))["tilted"][0]
     np.testing.assert_allclose(found.speed[0], [1.0, 1.0, 0.4, 0.4, 0.7])
     np.testing.assert_allclose(found.ceiling[0], [2.0, 2.0, np.inf, np.inf, np.inf])
     np.testing.assert_allclose(found.floor[0], [*[-np.inf] * 4, 4.0])

@@ -13,7 +13,7 @@ from scipy.stats import binomtest
 from sweeps import RunTests, columns, quick_hit, stop_after
 
 import planner_jax as pj
-from planner_jax.baselines.hit.published import published_rates
+from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.errors import ArgumentError
 from planner_jax.planning.plan import plan
 from planner_jax.planning.programs import solve_on_devices
@@ -259,7 +259,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
 
 def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
     _, manifest = finished
-    table, rates = HitSweep(TASK).table(manifest), published_rates()
+    table, rates = HitSweep(TASK).table(manifest), read_published_rates()
     assert [row[0] for row in table.rows] == [*court.SCENARIOS, "all"]
     assert table.header[-2:] == ["bat, paper %", "bat, trial files %"]
     column = court.PLANNERS.index("bat")

@@ -1,6 +1,6 @@
 """Clamped uniform B-splines of any degree: smooth curves between control points.
 
-With m control points p_i and a degree k, over shares s from 0 to 1 of the duration,
+With m control points p_i and a degree k, over positions s from 0 to 1 of the duration,
 
     q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    [Natarajan2024, eq. 3],
 
@@ -10,15 +10,15 @@ and the basis N by the recursion of Cox and de Boor (eq. 2) over knots s_0 .. s_
     N_{i,k}(s) = (s - s_i) / (s_{i+k} - s_i) N_{i,k-1}(s)
                  + (s_{i+k+1} - s) / (s_{i+k+1} - s_{i+1}) N_{i+1,k-1}(s),
 
-with 0 / 0 = 0. In print eq. 2 has s_{i+k-1} and s_{i+k} for s_{i+k} and s_{i+k+1}: that is right
-if k is the order, degree + 1, while the text calls it the degree; and eq. 3 sums m + 1 of m
-points. The knots are not printed: clamped means that the first and the last stand k + 1 times, so
-that the curve begins and ends at its first and last point; uniform, that the m - k spans between
-the others are equally long.
+with 0 / 0 = 0. As printed, eq. 2 has s_{i+k-1} and s_{i+k} instead of s_{i+k} and s_{i+k+1}, which
+is right if k is the order, degree + 1, while the text calls k the degree; and eq. 3 sums m + 1 of m
+points. The paper does not list the knots. Clamped means that the first and the last knot have
+multiplicity k + 1, so that the curve starts and ends at its first and last control point. Uniform
+means that the m - k spans between distinct knots have equal lengths.
 
-A curve lies between its control points, and so do its derivatives: a bound on the points of
-`hodograph` bounds them everywhere. Everything that is linear in the points is a constant matrix,
-a NumPy array in double precision.
+A curve lies in the convex hull of its control points, and so do its derivatives: a bound on the
+points of `hodograph` bounds the derivative everywhere. Everything that is linear in the points is a
+constant matrix, a NumPy array in double precision.
 """
 
 import math
@@ -33,15 +33,15 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
-    """Return the basis at shares (...) of the duration: times control points the curve, (..., num).
+    """Return the matrix (..., num) from control points to the curve at positions (...).
 
     Args:
         degree: k >= 0.
-        num: of control points, more than the degree.
-        shares: from 0 to 1.
+        num: number of control points, more than the degree.
+        shares: positions from 0 to 1 of the duration.
 
     Raises:
-        ValueError: there are too few control points, or a share is outside; one line that says so.
+        ArgumentError: there are too few control points, or a position is outside.
     """
     shares = np.asarray(shares, float)
     if not ((shares >= 0.0) & (shares <= 1.0)).all():
@@ -51,20 +51,19 @@ def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
 
 
 def hodograph(degree: int, order: int, num: int) -> np.ndarray:
-    """Return the matrix (num - order, num) from control points to those of a derivative by share.
+    """Return the matrix (num - order, num) from control points to a derivative's control points.
 
-    The derivative is a B-spline again, of a degree less by the order, over the same spans. A point
-    of the first one is the difference of two neighbours, times the degree, over the share between
-    the knots where their common part of the basis begins and ends. Divided by the duration to the
-    power of the order it is the derivative by the time.
+    A derivative is a B-spline over the same spans, with a degree reduced by the order. A control
+    point of the first derivative is degree (p_{i+1} - p_i) / (s_{i+k+1} - s_{i+1}). Divided by the
+    duration to the power of the order, the derivative by position becomes the derivative by time.
 
     Args:
         degree: k.
         order: of the derivative, 0 to k.
-        num: of control points, more than the degree.
+        num: number of control points, more than the degree.
 
     Raises:
-        ValueError: there are no more control points than the degree.
+        ArgumentError: there are not more control points than the degree.
     """
     spans = _spans(degree, num)
     points = np.eye(num)
@@ -76,18 +75,18 @@ def hodograph(degree: int, order: int, num: int) -> np.ndarray:
 
 
 def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePolynomial:
-    """Return the B-spline of some control points as a piecewise polynomial, a piece for each span.
+    """Return the B-spline of control points as a piecewise polynomial, one piece per span.
 
     Args:
         degree: k.
-        points: (m, D), m > k, of which the first is where the curve begins and the last its end.
+        points: (m, D), m > k, control points; the curve starts at the first and ends at the last.
         duration: () [s], > 0.
 
     Returns:
         m - k pieces of equal duration, with coefficients (m - k, k + 1, D).
 
     Raises:
-        ValueError: there are no more control points than the degree.
+        ArgumentError: there are not more control points than the degree.
     """
     points = jnp.asarray(points)
     num = points.shape[0]
@@ -114,20 +113,20 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """Return the knots (spans + 2 degree + 1,), in spans: whole numbers."""
+    """Return the knots (spans + 2 degree + 1,) in units of spans, whole numbers."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
-def _basis(degree: int, num: int, places: np.ndarray) -> np.ndarray:
-    """Return the basis (..., num) at places (...) in spans, from 0 to their number."""
+def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
+    """Return the basis (..., num) at positions `place` (...) in units of spans."""
     spans = num - degree
     knots = _knots(degree, spans)
-    span = np.minimum(np.floor(places), spans - 1)  # the last one holds its end too
+    span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end
     is_in = np.arange(spans) == span[..., None]
-    values = np.zeros((*places.shape, spans + 2 * degree))
+    values = np.zeros((*place.shape, spans + 2 * degree))
     values[..., degree : degree + spans] = is_in
     for k in range(1, degree + 1):
-        rises = (places[..., None] - knots[: -k - 1]) / np.maximum(knots[k:-1] - knots[: -k - 1], 1)
-        falls = (knots[k + 1 :] - places[..., None]) / np.maximum(knots[k + 1 :] - knots[1:-k], 1)
+        rises = (place[..., None] - knots[: -k - 1]) / np.maximum(knots[k:-1] - knots[: -k - 1], 1)
+        falls = (knots[k + 1 :] - place[..., None]) / np.maximum(knots[k + 1 :] - knots[1:-k], 1)
         values = rises * values[..., :-1] + falls * values[..., 1:]
     return values

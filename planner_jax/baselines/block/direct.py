@@ -1,8 +1,8 @@
-"""The baseline `direct`: all joints as fast as they may turn, straight to an end pose, and stand.
+"""The baseline `direct`: bang-bang motions of all joints straight to an end pose, then standstill.
 
-No way is planned around anything: end poses are taken in the order in which the arm can be there,
-and the first one that is in time and whose motion touches nothing is the plan. With `tries` of 1
-only the pose is looked at that is reached soonest: no motion from rest to rest takes less time.
+The planner does not avoid obstacles. It evaluates end poses in the order of their arrival times,
+and the first motion that is in time and touches nothing is the plan. With `tries` of 1 it evaluates
+only the pose with the earliest arrival: no motion from rest to rest takes less time.
 """
 
 import dataclasses
@@ -22,20 +22,20 @@ from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 from planner_jax.trajectory.polynomial import evaluate
 
-_BANG_BANG_PIECES = 13  # of the motions of six joints
-_PIECES = 10  # of the straight motions by which `end_poses` tells which poses there are
+_BANG_BANG_PIECES = 13  # pieces of a motion of six joints
+_PIECES = 10  # pieces of the straight motions by which `end_poses` rejects poses
 
 
 def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
-    """End poses, and how long the joints take at least to be there.
+    """Return end poses and the least times in which the joints reach them.
 
     Args:
         case: one case.
-        points: of the ball's way, where poses are looked at; eight each.
+        points: number of points of the ball's trajectory with eight poses each.
 
     Returns:
-        The poses, and times (C,) [s] from the delay on, infinite where the arm would come after
-        the ball or there is no pose.
+        The poses, and times (C,) [s] counted from the delay, infinite if the arm would arrive after
+        the ball or the pose does not exist.
     """
     poses = end_poses(case, flight_of(case), points, _PIECES)
     limits = case.limits
@@ -53,10 +53,10 @@ class DirectBlock(Planner):
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    points: int = 48  # of the ball's way, where end poses are looked at
-    tries: int = 384  # end poses whose motions are looked at, the soonest first
-    samples: int = 96  # of a motion, where distances are looked at
-    margin: float = 0.003  # [m], kept from everything
+    points: int = 48  # points of the ball's trajectory with end poses
+    tries: int = 384  # greatest number of evaluated end poses, earliest arrival first
+    samples: int = 96  # samples of a motion at which distances are computed
+    margin: float = 0.003  # [m], least distance from obstacles and from the arm itself
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -68,8 +68,8 @@ class DirectBlock(Planner):
         num = jnp.minimum(jnp.sum(jnp.isfinite(times)), self.tries)
 
         def plan_of(k: Array) -> BlockPlan:
-            place = order[k]
-            return self.plan_to(case, poses.angles[place], poses.time[place], times[place])
+            index = order[k]
+            return self.plan_to(case, poses.angles[index], poses.time[index], times[index])
 
         best = first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
         return dataclasses.replace(best, status=explain_status(case, poses, best.status))
@@ -80,7 +80,7 @@ class DirectBlock(Planner):
         Args:
             case: one case.
             goal: (6,) [rad].
-            contact: () [s], when the ball is there.
+            contact: () [s], when the ball arrives there.
             duration: () [s], of the motion.
         """
         turn = goal - case.angles
@@ -88,9 +88,9 @@ class DirectBlock(Planner):
         shares = np.arange(1, self.samples + 1) / self.samples
         angles = jax.vmap(lambda share: evaluate(motion, share * duration))(shares)
         gaps = least_clearances(case.arm, case.scene, angles)
-        # A joint that is moving at the start may have to go beyond its goal before it comes back.
+        # A joint that moves at the start may overshoot its goal and a position limit.
         beyond = jnp.max(jnp.maximum(angles - case.arm.upper, case.arm.lower - angles))
-        # A centimetre too near counts as much as a whole limit.
+        # 1 cm below the margin counts as a relative violation of 1.
         violation = jnp.maximum(100.0 * (self.margin - jnp.min(gaps)), beyond)
         return BlockPlan(
             motion=motion,

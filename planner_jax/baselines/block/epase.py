@@ -1,13 +1,13 @@
 """The baseline `epase` of [Natarajan2024]: weighted A* over joint steps, timed by TOPP-RA.
 
-The steps are those of the code behind the paper: 7 degrees of joints 1 to 4 and 4 degrees of each
-joint, either way, and straight to the goal, which is tried first. States within a cell of 0.05 rad
-count as one state. The heuristic is the distance to the goal in the space of the joints, the cost
-the length of the path there.
+The steps follow the code behind the paper: 7 degrees of joints 1 to 4 and 4 degrees of each joint,
+in both directions, and a straight edge to the goal, which is tried first. States within a cell of
+0.05 rad count as one state. The heuristic is the distance to the goal in joint space, and the cost
+is the length of the path from the start.
 
-ePA*SE [Mukherjee2022] evaluates edges in parallel, on 64 cores in the paper;
-without its threads it is this search. Here all edges of a state are evaluated in one batch, by one
-thread. Where the paper's code stops within 0.1 rad of the goal, a path here ends at the goal.
+ePA*SE [Mukherjee2022] evaluates edges in parallel, on 64 cores in the paper. Without its threads it
+is this search. Here all edges of a state are evaluated in one batch, by one thread. The paper's
+code stops within 0.1 rad of the goal; here a path ends at the goal.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import itertools
 import numpy as np
 
 from planner_jax.baselines.block.free_space import FreeSpace
-from planner_jax.baselines.block.pose_by_pose import Clock, Goal, WayThenTime
+from planner_jax.baselines.block.pose_by_pose import Clock, Goal, PathThenTime
 from planner_jax.task.block.case import BlockCase
 
 CELL = 0.05  # [rad]
@@ -35,9 +35,9 @@ class State:
     """A state that a search has reached."""
 
     angles: np.ndarray  # (6,) [rad]
-    length: float  # [rad], of the path there
+    length: float  # [rad], of the path from the start
     parent: "State | None" = None
-    spline: np.ndarray | None = None  # (S, 6) [rad], samples from the start, where there is one
+    spline: np.ndarray | None = None  # (S, 6) [rad], samples from the start, if it has a spline
 
     def path(self) -> list["State"]:
         """Return the states from this one back to the start."""
@@ -45,11 +45,11 @@ class State:
 
 
 class OpenStates:
-    """The states that a search has not expanded, by length plus weighted distance to the goal."""
+    """The states that a search has not expanded, sorted by length + weight * distance to goal."""
 
     def __init__(self, start: State, goal: np.ndarray, weight: float) -> None:
         self._goal, self._weight = goal, weight
-        self._number = itertools.count()  # equal states are expanded in the order of their pushes
+        self._number = itertools.count()  # orders states of equal cost by insertion
         self._states = [(0.0, next(self._number), start)]
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
@@ -63,12 +63,12 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one step away in open cells, where no shorter path leads."""
-        there = state.angles + STEPS
-        lengths = state.length + np.linalg.norm(there - state.angles, axis=1)
+        """Return the states one step away in open cells that are reached by a shorter path."""
+        neighbours = state.angles + STEPS
+        lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
             State(angles, length, state)
-            for angles, length in zip(there, lengths, strict=True)
+            for angles, length in zip(neighbours, lengths, strict=True)
             if (cell := _cell_of(angles)) not in self._closed
             and length < self._lengths.get(cell, np.inf)
         ]
@@ -87,25 +87,25 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 
 
 @dataclasses.dataclass(frozen=True)
-class EpaseBlock(WayThenTime):
+class EpaseBlock(PathThenTime):
     """A planner that tries end poses one after another; it needs the extra `arm-peers`."""
 
-    longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
-    weight: float = 10.0  # of the heuristic
+    longest: float = 0.05  # [s] per pose; few longer searches succeed
+    weight: float = 10.0  # weight of the heuristic
 
-    def way_to(
+    def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
         """Return points (N, 6) [rad] of a free path, or None."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:
-            news = states.steps_from(state)
-            ends = np.stack([end, *(new.angles for new in news)])
+            neighbours = states.steps_from(state)
+            ends = np.stack([end, *(new.angles for new in neighbours)])
             is_goal_free, *are_free = free.are_edges_free(state.angles, ends)
             if is_goal_free:
                 return np.stack([*(each.angles for each in state.path()[::-1]), end])
-            for new, is_free in zip(news, are_free, strict=True):
+            for new, is_free in zip(neighbours, are_free, strict=True):
                 if is_free:
                     states.push(new)
         return None

@@ -1,7 +1,7 @@
-"""Which angles of an arm touch nothing: distances of batches of them, asked for by the host.
+"""Collision checks of arm angles in batches, called from the host.
 
-Searches on the host ask for a few angles at a time. These are filled up to one of a few fixed
-numbers, for each of which there is one compiled program.
+Searches on the host check a few angles at a time. Batches are padded to one of a few fixed sizes,
+each with one compiled program.
 """
 
 import functools
@@ -16,8 +16,8 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene
 
-RESOLUTION = 0.05 / 3.0  # [rad], of all joints together: between samples of an edge, as in [1]
-_BATCHES = (1, 64, 256, 1024)  # angles of a program
+RESOLUTION = 0.05 / 3.0  # [rad], joint-space distance between samples of an edge, as in [1]
+_BATCHES = (1, 64, 256, 1024)  # batch sizes of the compiled programs
 
 # [1] The planners' code behind [Natarajan2024], github.com/sbpl/parallel_search.
 
@@ -30,7 +30,7 @@ def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 @functools.cache
 def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
-    """Compile all programs, which must not count as time of a search.
+    """Compile all programs, since compilation must not count as search time.
 
     Args:
         tree: structure of (arm, scene).
@@ -43,10 +43,15 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
 
 
 class FreeSpace:
-    """The angles within the position limits of one case's arm at which it touches nothing."""
+    """The collision-free angles of one case's arm within its position limits."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
-        """Of a case with NumPy leaves; `margin` [m] is kept from everything."""
+        """Compile the programs for a case.
+
+        Args:
+            case: one case with NumPy leaves.
+            margin: [m], least distance from obstacles and from the arm itself.
+        """
         self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
         self._dtype = np.asarray(case.angles).dtype
         self._arm, self._scene = jax.device_put((case.arm, case.scene))
@@ -55,7 +60,7 @@ class FreeSpace:
         _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
 
     def is_free(self, angles: np.ndarray) -> np.ndarray:
-        """Return whether each of angles (N, 6) [rad] is, (N,) bool."""
+        """Return whether each of angles (N, 6) [rad] is collision-free, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
             size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
@@ -68,10 +73,10 @@ class FreeSpace:
         return is_within & (np.concatenate(gaps) >= self._margin)
 
     def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
-        """Return which straight motions of the joints are free, (N,) bool; their ends count too.
+        """Return which straight joint motions are collision-free, ends included, (N,) bool.
 
         Args:
-            begins: (N, 6) [rad], or (6,) of all.
+            begins: (N, 6) [rad], or (6,) for all.
             ends: (N, 6) [rad].
         """
         begins = np.broadcast_to(begins, ends.shape)
@@ -81,7 +86,7 @@ class FreeSpace:
         number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
         share = (number / counts[edge])[:, None]
         angles = begins[edge] + share * (ends - begins)[edge]
-        # Ends and every eighth sample first: that is where most edges fail.
+        # Ends and every eighth sample first: they reject most edges that collide.
         is_first = (number % 8 == 0) | (number == counts[edge])
         found = np.ones(len(ends), bool)
         for some in (is_first, ~is_first):
@@ -91,20 +96,22 @@ class FreeSpace:
         return found
 
     def is_motion_free(self, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-        """Return whether a piecewise polynomial of the joints is, at samples no farther apart.
+        """Return whether a piecewise polynomial of the joints is collision-free.
+
+        It is checked at samples at most `RESOLUTION` apart.
 
         Args:
-            coeffs: (M, D + 1, 6), rising powers of the time [s] since the piece began.
+            coeffs: (M, D + 1, 6), rising powers of the time [s] since the start of the piece.
             durations: (M,) [s].
         """
-        rough = _sampled(coeffs, durations, np.full(len(durations), 8))
+        rough = _sample_pieces(coeffs, durations, np.full(len(durations), 8))
         lengths = np.linalg.norm(np.diff(rough.reshape(-1, 9, 6), axis=1), axis=2).sum(axis=1)
         counts = np.maximum(np.ceil(1.1 * lengths / RESOLUTION), 1.0).astype(int)
-        return bool(self.is_free(_sampled(coeffs, durations, counts)).all())
+        return bool(self.is_free(_sample_pieces(coeffs, durations, counts)).all())
 
 
-def _sampled(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Return angles (N, 6) of all pieces, each at both ends and between in a number of steps."""
+def _sample_pieces(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
+    """Sample angles (N, 6) of all pieces, each at both ends and at equal steps between."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]

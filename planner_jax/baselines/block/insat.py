@@ -1,26 +1,26 @@
 """The planner `insat` of [Natarajan2024]: a search over joint steps, interleaved with splines.
 
-Algorithm 2 of the paper. The search is that of `epase`. A state that it comes to is lifted: the
-spline of each of its ancestors goes on straight to the state, control points are fitted to that,
-and the splines of all ancestors are optimised at once; the one that costs least of those that touch
-nothing is the state's. The goal is tried from every state, first of all from the start.
+Algorithm 2 of the paper. The search is the search of `epase`. An expanded state is lifted: the
+spline of each of its ancestors is extended straight to the state, control points are fitted to each
+extension, and all these splines are optimised at once. The cheapest collision-free one becomes the
+state's spline. The goal is tried from every state, first from the start.
 
-A spline is clamped, of degree 3 (order 4), with 7 control points: the paper's code has 4 to 7, and
-the fewer there are, the longer a motion has to take to hold bounds at the control points of its
-derivatives, with 4 from rest to rest twice as long as it need. What is minimised is (4a),
+A spline is clamped, of degree 3 (order 4), with 7 control points. The paper's code has 4 to 7.
+With fewer control points the bounds on the derivatives' control points force longer motions: with
+4 of them a motion from rest to rest takes twice the necessary time. The objective is (4a),
 
     w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
 
-over the control points and t_f, with (4d) and bounds on accelerations held by the control points of
-the derivatives, the arm at rest at the start, and at the goal if the case asks for that. For given
-control points the least t_f that keeps these bounds is a maximum in closed form, so that they hold
-at every iterate; for the gradient it is smoothed. Obstacles (4c) are no part of it: they are looked
-at afterwards, at every iterate, and the last one that touches nothing is kept.
+over the control points and t_f. (4d) and bounds on accelerations are imposed on the control points
+of the derivatives. The arm is at rest at the start, and at the goal if the case requires it. For
+given control points the least t_f that keeps these bounds is a maximum in closed form, so that
+every iterate keeps them; the maximum is smoothed for the gradient. Obstacles (4c) are not in the
+optimisation: every iterate is checked afterwards, and the last collision-free one is used.
 
-What the code behind the paper has beyond it is left out: bounds on jerk, to which it gives those of
-accelerations, and the pull at the last control points. States are lifted when they are expanded,
-and not when they are found, as its edges are. Everything is done by one thread, where PINSAT has
-many; compiled programs may use more.
+Parts of the published code that are not in the paper are left out: bounds on jerk, which it sets to
+the acceleration bounds, and attraction to the last control points. States are lifted when they are
+expanded; its edges are lifted when they are found. One thread does everything, while PINSAT has
+many threads; compiled programs may use more.
 """
 
 import dataclasses
@@ -43,19 +43,19 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 
 DEGREE = 3
-CONTROL_POINTS = 7  # of a spline
-ANCESTORS = 8  # that are looked at at once: the first, and the nearest
+CONTROL_POINTS = 7  # number of control points of a spline
+ANCESTORS = 8  # ancestors optimised at once: the first one, and the nearest ones
 TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]
-LEAST_TIME = 0.1  # [s], of a spline; the greatest is the time there is
-_SHARES = np.linspace(0.0, 1.0, 33)  # of a spline's duration, where it is sampled
+LEAST_TIME = 0.1  # [s], of a spline; the greatest is the available time
+_SHARES = np.linspace(0.0, 1.0, 33)  # sample positions in a spline, from 0 to 1
 _OUTSIDE = 100.0  # [1/rad^2], weight of control points beyond the position limits
-_NORM = 16  # of the smoothed maximum
-_UNIT = 0.3  # [rad], of the optimiser's variables
+_NORM = 16  # p of the p-norm that smooths the maximum
+_UNIT = 0.3  # [rad], unit of the optimiser's variables
 
 
 @struct.dataclass
 class Bounds:
-    """What a spline has to keep."""
+    """Limits of a spline."""
 
     lower: Array  # (6,) [rad]
     upper: Array  # (6,) [rad]
@@ -69,18 +69,18 @@ class Splines:
 
     points: Array  # (A, K, m, 6) [rad]
     time: Array  # (A, K) [s], t_f
-    length: Array  # (A, K) [rad], of the way of the joints
+    length: Array  # (A, K) [rad], of the path in joint space
     angles: Array  # (A, K, S, 6) [rad], samples
 
 
 @dataclasses.dataclass(frozen=True)
 class InsatBlock(PoseByPose):
-    """Tries end poses one after another; motions end at rest only if the case asks for that."""
+    """A planner that tries end poses; motions end at rest only if the case requires it."""
 
-    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # the first one to wait
+    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # one more piece to wait
     degree: ClassVar[int] = DEGREE
-    longest: float = 0.05  # [s]; past this few searches end, while other poses are easy
-    weight: float = 10.0  # of the heuristic
+    longest: float = 0.05  # [s] per pose; few longer searches succeed
+    weight: float = 10.0  # weight of the heuristic
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
@@ -91,7 +91,7 @@ class InsatBlock(PoseByPose):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the motion along the first spline found; one that ends in motion waits first."""
+        """Return the motion along the first spline found, after a wait if it ends in motion."""
         start = np.asarray(case.angles, float)
         first = State(start, 0.0, spline=start[None])
         states = OpenStates(first, np.asarray(goal.angles, float), self.weight)
@@ -102,10 +102,10 @@ class InsatBlock(PoseByPose):
             found = self.best_spline(case, free, goal, end, bool(case.ends_at_rest))
             if found is not None:
                 return _motion(case, goal, *found[:2])
-            news = states.steps_from(state)
-            ends = np.stack([new.angles for new in news]) if news else np.zeros((0, 6))
-            for k in np.flatnonzero(free.are_edges_free(state.angles, ends)) if news else ():
-                states.push(news[k])
+            neighbours = states.steps_from(state)
+            ends = np.stack([new.angles for new in neighbours]) if neighbours else np.zeros((0, 6))
+            for k in np.flatnonzero(free.are_edges_free(state.angles, ends)) if neighbours else ():
+                states.push(neighbours[k])
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
@@ -119,19 +119,19 @@ class InsatBlock(PoseByPose):
     def best_spline(
         self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
-        """Return the cheapest spline to a state from an ancestor that is free and in time.
+        """Return the cheapest spline from an ancestor to a state that is free and in time, or None.
 
         Returns:
-            Its control points (m, 6), duration, length and samples (S, 6), or None.
+            Its control points (m, 6), duration, length and samples (S, 6).
         """
         before = [each.spline for each in state.path()[1:] if each.spline is not None]
         dtype = case.angles.dtype
         before = before[: ANCESTORS - 1] + before[ANCESTORS - 1 :][-1:]
-        guesses = np.stack([_fitted(way, state.angles, rests) for way in before])
+        guesses = np.stack([_fit_points(path, state.angles, rests) for path in before])
         filled = np.concatenate([guesses, np.repeat(guesses[:1], ANCESTORS - len(before), axis=0)])
         splines = jax.tree.map(
             lambda leaf: np.asarray(leaf)[: len(before)],
-            _optimised(
+            _optimise(
                 case.angles,
                 state.angles.astype(dtype),
                 filled.astype(dtype),
@@ -143,7 +143,7 @@ class InsatBlock(PoseByPose):
             ),
         )
         good = splines.time <= goal.available
-        # Every eighth sample first: that is where most iterates fail.
+        # Every eighth sample first: these reject most iterates that collide.
         is_first = np.arange(len(_SHARES)) % 8 == 0
         for some in (is_first, ~is_first):
             if good.any():
@@ -163,37 +163,37 @@ class InsatBlock(PoseByPose):
 
 @functools.cache
 def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
-    """Have the programs compiled, which must not count as time of a search."""
+    """Compile the programs, since compilation must not count as search time."""
     joints = host_leaf(np.zeros(6, dtype))
     guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
     bounds = Bounds(joints, joints, joints + 1, joints + 1)
-    _optimised(joints, joints, host_leaf(guesses), host_leaf(False), bounds, config)
+    _optimise(joints, joints, host_leaf(guesses), host_leaf(False), bounds, config)
     _pieces(guesses[0], 1.0)
 
 
-def _fitted(way: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Fit control points (m, 6) to a path (N, 6) and the straight line on to an end (6,)."""
-    straight = way[-1] + _SHARES[1:, None] * (end - way[-1])
-    curve = np.concatenate([way, straight])
+def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
+    """Fit control points (m, 6) to a path (N, 6) and a straight extension to an end (6,)."""
+    straight = path[-1] + _SHARES[1:, None] * (end - path[-1])
+    curve = np.concatenate([path, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
     places = _SHARES * lengths[-1]
-    wanted = np.stack([np.interp(places, lengths, joint) for joint in curve.T], axis=1)
-    points = np.stack([way[0]] * 2 + [end] * (CONTROL_POINTS - 2))
+    samples = np.stack([np.interp(places, lengths, joint) for joint in curve.T], axis=1)
+    points = np.stack([path[0]] * 2 + [end] * (CONTROL_POINTS - 2))
     free = slice(2, CONTROL_POINTS - (2 if rests else 1))
-    of_points, of_free = _fit(free.stop)
-    points[free] += of_free @ (wanted - of_points @ points)
+    of_points, of_free = _fit_matrices(free.stop)
+    points[free] += of_free @ (samples - of_points @ points)
     return points
 
 
 @functools.cache
-def _fit(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the basis (S, m), and least squares by its columns from 2 to `stop`."""
+def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the basis (S, m), and the least-squares solver for its columns from 2 to `stop`."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 
 
 @functools.partial(jax.jit, static_argnames="config")
-def _optimised(
+def _optimise(
     start: Array,
     end: Array,
     guesses: Array,
@@ -201,7 +201,7 @@ def _optimised(
     bounds: Bounds,
     config: lbfgs.LbfgsConfig,
 ) -> Splines:
-    """Return the iterates of splines, the first of which are guesses.
+    """Optimise splines and return their iterates, starting with the guesses.
 
     Args:
         start: (6,) [rad].
@@ -223,8 +223,8 @@ def _optimised(
         before = jnp.where(rests, end, moved[-1])
         return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
 
-    def shares_of(points: Array) -> Array:
-        """Return squares of the durations that bounds ask for."""
+    def squares_of(points: Array) -> Array:
+        """Return the squared durations that each bound requires."""
         rates = (product(first, points) / bounds.velocity) ** 2
         rises = jnp.abs(product(second, points)) / bounds.acceleration
         return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)
@@ -236,7 +236,7 @@ def _optimised(
 
     def objective(x: Array) -> lbfgs.Evaluation:
         points = points_of(x)
-        squares = shares_of(points)
+        squares = squares_of(points)
         most = lax.stop_gradient(jnp.max(squares))
         total = jnp.sum((squares / most) ** (_NORM // 2))
         time = jnp.sqrt(most) * total ** (1.0 / _NORM)
@@ -254,7 +254,7 @@ def _optimised(
         _, later = lax.scan(next_one, lbfgs.init(x, config), length=config.max_steps)
         points = jax.vmap(points_of)(jnp.concatenate([x[None], later]))
         angles, length = jax.vmap(length_of)(points)
-        time = jax.vmap(lambda points: jnp.sqrt(jnp.max(shares_of(points))))(points)
+        time = jax.vmap(lambda points: jnp.sqrt(jnp.max(squares_of(points))))(points)
         return Splines(points=points, time=time, length=length, angles=angles)
 
     return jax.vmap(of_one)(guesses)
@@ -270,7 +270,7 @@ def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
-    """Return the motion along a spline; one that does not end at rest begins as late as it may."""
+    """Return the motion along a spline; one that ends in motion starts as late as possible."""
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:
         wait = np.zeros((1, DEGREE + 1, 6))

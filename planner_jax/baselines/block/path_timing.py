@@ -1,7 +1,7 @@
-"""The quickest motion of the joints along a way, by TOPP-RA.
+"""Time-optimal motion of the joints along a path, by TOPP-RA.
 
-The method of [Pham2018], by the package `toppra`: [Natarajan2024] times the ways of its baselines
-with it. A cubic spline leads through the way's points, and the arm begins and ends at rest.
+The method of [Pham2018], by the package `toppra`: [Natarajan2024] times the paths of its baselines
+with it. A cubic spline interpolates the points of the path, and the arm starts and ends at rest.
 """
 
 import importlib
@@ -11,14 +11,14 @@ import numpy as np
 
 from planner_jax.core.errors import MissingExtra
 
-PIECES = 128  # of a timed motion, at most
-DEGREE = 6  # a cubic of a quadratic
-_INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # shares of pieces, where limits are looked at
-_SPARE = 2e-4  # share of the limits that is kept free
+PIECES = 128  # greatest number of pieces of a timed motion
+DEGREE = 6  # a cubic in a quadratic function of time
+_INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # where limits of a piece are evaluated
+_SPARE = 2e-4  # fraction of the limits that stays unused
 
 
-def required(name: str) -> ModuleType:
-    """Return a module of the extra `arm-peers`.
+def import_extra(name: str) -> ModuleType:
+    """Import a module of the extra `arm-peers`.
 
     Raises:
         MissingExtra: its package is not installed.
@@ -32,16 +32,16 @@ def required(name: str) -> ModuleType:
         raise MissingExtra("rrt-connect or epase", package, "arm-peers") from None
 
 
-def timed_way(
+def time_path(
     points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the quickest motion from rest to rest along a spline through points, or None.
 
-    TOPP-RA keeps the limits at points of a grid; what exceeds them in between is slowed down with
-    all the rest.
+    TOPP-RA keeps the limits at the points of a grid. If a limit is exceeded between grid points,
+    the whole motion is slowed down.
 
     Args:
-        points: (N, 6) [rad], two or more, no two neighbours the same, at most half of `PIECES`.
+        points: (N, 6) [rad], two or more, neighbours differ, at most half of `PIECES`.
         velocity: (6,) [rad/s], > 0.
         acceleration: (6,) [rad/s^2], > 0.
 
@@ -51,7 +51,7 @@ def timed_way(
     Raises:
         MissingExtra: toppra is not installed.
     """
-    toppra = required("toppra")
+    toppra = import_extra("toppra")
     constraint = importlib.import_module("toppra.constraint")
     algorithm = importlib.import_module("toppra.algorithm")
     toppra.setup_logging("ERROR")
@@ -77,7 +77,7 @@ def timed_way(
     rises = 0.5 * (speeds[1:] - speeds[:-1]) / durations
     spline = np.stack([path(grid[:-1], k) for k in range(3)], axis=1)
     third = (path(grid[1:], 2) - path(grid[:-1], 2)) / steps[:, None]
-    coeffs = _composed(
+    coeffs = _compose(
         np.concatenate([spline, third[:, None]], axis=1) / [[[1.0], [1.0], [2.0], [6.0]]],
         speeds[:-1, None],
         rises[:, None],
@@ -87,9 +87,9 @@ def timed_way(
 
 
 def _grid(knots: np.ndarray) -> np.ndarray:
-    """Return up to `PIECES` + 1 points along a path, about equally spaced, knots included.
+    """Return up to `PIECES` + 1 points along a path, knots included, about equally spaced.
 
-    Each span between knots is cut into equal parts, in proportion to its length.
+    Each span between knots is divided into equal parts, in proportion to its length.
     """
     spans = np.diff(knots)
     parts = 1 + np.floor((PIECES - len(spans)) * spans / spans.sum()).astype(int)
@@ -97,7 +97,7 @@ def _grid(knots: np.ndarray) -> np.ndarray:
     return np.append(np.concatenate(cut), knots[-1])
 
 
-def _composed(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
+def _compose(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
     """Return coefficients (M, 7, 6) in time of cubics (M, 4, 6) in p = speed t + rise t^2."""
     none, one, two, three = np.moveaxis(cubic, 1, 0)
     return np.stack(
@@ -117,7 +117,7 @@ def _composed(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndar
 def _excess(
     coeffs: np.ndarray, durations: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> float:
-    """Return how many times longer a motion has to take to keep its limits, >= 1."""
+    """Return the factor >= 1 by which a motion has to be slowed down to keep its limits."""
     powers = np.arange(coeffs.shape[1])
     times = (_INSIDE * durations[:, None])[..., None]  # (M, S, 1)
     rates = np.where(powers > 0, times ** np.maximum(powers - 1, 0), 0.0) * powers

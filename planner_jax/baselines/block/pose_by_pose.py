@@ -1,11 +1,11 @@
 """Planners on the host that try one end pose after another [Natarajan2024, Section IV-C].
 
-Its goals are poses at equidistant points of a tunnel, "sequentially until it succeeds". Here they
-are at points of the ball's own way, each with the eight branches of inverse kinematics; poses at
-which the arm would touch something or be too late whatever its way are left out, and those come
-first to which a bang-bang motion takes the least share of the time there is. A motion that comes
-too late ends the search only if the planner is not `patient`. In the paper it must have: there
-RRT-Connect takes 18 ms of 2 s, and less than half of the motions that it finds are in time.
+The paper's goals are poses at equidistant points of a tunnel, tried "sequentially until it
+succeeds". Here the goals are at points of the ball's own trajectory, each with the eight branches
+of inverse kinematics. Poses that collide, or that no motion reaches in time, are left out. Poses
+are tried in the order of (duration of a bang-bang motion) / (available time). A motion that arrives
+too late ends the search only if the planner is not `patient`. The paper's planners must have
+stopped there: RRT-Connect takes 18 ms of 2 s, and less than half of its motions are in time.
 """
 
 import abc
@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from planner_jax.baselines.block.direct import poses_in_time
 from planner_jax.baselines.block.free_space import FreeSpace
-from planner_jax.baselines.block.path_timing import DEGREE, PIECES, required, timed_way
+from planner_jax.baselines.block.path_timing import DEGREE, PIECES, import_extra, time_path
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
@@ -32,44 +32,44 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-Clock = Callable[[], float]  # seconds that are left
+Clock = Callable[[], float]  # returns the remaining seconds
 
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """An end pose that is tried."""
+    """An end pose to plan a motion to."""
 
     angles: np.ndarray  # (6,) [rad]
-    available: float  # [s], from the delay until the ball is there
+    available: float  # [s], from the delay until the ball arrives
 
 
 @dataclasses.dataclass(frozen=True)
 class HostMotion:
-    """A motion of the joints from the delay on; no more pieces than its planner's."""
+    """A motion of the joints that starts at the delay, with at most the pieces of its planner."""
 
     coeffs: np.ndarray  # (M, D + 1, 6) [rad/s^k]
     durations: np.ndarray  # (M,) [s]
-    execution: float  # [s], how long the arm moves; before that it may wait
+    execution: float  # [s], duration of the motion without an initial wait
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseByPose(Planner, abc.ABC):
-    """What such planners share; the cost of a plan is how long its motion takes [s].
+    """Base of planners that try end poses; the cost of a plan is the duration of its motion [s].
 
-    A plan's `violation` is by how much the motion is longer than the time there is, relative, and
-    infinite if no motion was found; `iterations` are the poses that were tried. Motions begin at
-    rest: an arm that is moving at the start is given none.
+    A plan's `violation` is (duration / available time) - 1, infinite if no motion was found;
+    `iterations` is the number of tried poses. Motions start at rest: an arm that moves at the start
+    gets no motion.
     """
 
     case_type: ClassVar[type] = BlockCase
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     pieces: ClassVar[int]
     degree: ClassVar[int]
-    points: int = 12  # of the ball's way, where end poses are looked at
-    budget: float = 2.0  # [s], of the search of each case; the paper's
-    longest: float = 0.25  # [s] of it, for one pose; twice as much whenever all were tried
-    patient: bool = True  # whether poses are tried on until a motion is in time, not only found
-    margin: float = 0.003  # [m], kept from everything
+    points: int = 12  # points of the ball's trajectory with end poses
+    budget: float = 2.0  # [s], search time of each case, as in the paper
+    longest: float = 0.25  # [s], search time of one pose; doubled after each pass over all poses
+    patient: bool = True  # whether the search continues after a motion that arrives too late
+    margin: float = 0.003  # [m], least distance from obstacles and from the arm itself
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -82,7 +82,7 @@ class PoseByPose(Planner, abc.ABC):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return a motion to one end pose that touches nothing, or None if time runs out."""
+        """Return a collision-free motion to one end pose, or None if time runs out."""
 
     def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plans of a batch, one case after another."""
@@ -91,7 +91,7 @@ class PoseByPose(Planner, abc.ABC):
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
         """Return the plan of one case with NumPy leaves."""
-        hopeless, angles, contacts, shares = (np.asarray(x) for x in _goals(case, self.points))
+        hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
         order = np.argsort(shares)[: np.isfinite(shares).sum()]
@@ -104,16 +104,16 @@ class PoseByPose(Planner, abc.ABC):
             return self._plan(case, Status.BLOCKED)
         best, least, contact, tries = None, np.inf, case.delay, 0
         enough = 0.0 if self.patient else np.inf
-        places = order[is_free[1:]]
+        indices = order[is_free[1:]]
         while (begin := time.perf_counter()) < until and (best is None or least > enough):
-            again, turn = divmod(tries, len(places))
-            place, tries = places[turn], tries + 1
+            again, turn = divmod(tries, len(indices))
+            index, tries = indices[turn], tries + 1
             end = min(until, begin + self.longest * 2.0 ** min(again, 30))
-            goal = Goal(angles[place], float(contacts[place] - case.delay))
+            goal = Goal(angles[index], float(contacts[index] - case.delay))
             found = self.motion_to(case, free, goal, lambda end=end: end - time.perf_counter())
             late = np.inf if found is None else found.execution / goal.available - 1.0
             if late < least:
-                best, least, contact = found, late, contacts[place]
+                best, least, contact = found, late, contacts[index]
         return self._plan(case, Status.NO_PATH, best, contact, tries)
 
     def _plan(
@@ -151,14 +151,15 @@ class PoseByPose(Planner, abc.ABC):
 
 
 @functools.partial(jax.jit, static_argnames="points")
-def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
-    """Return why there can be no plan, and end poses.
+def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
+    """Return the status if no plan can exist, and the end poses.
 
     Returns:
-        status: () int32, NO_PATH unless the case itself says that there is none.
+        status: () int32, NO_PATH unless the case itself excludes a plan.
         angles: (C, 6) [rad].
         contact: (C,) [s].
-        share: (C,) of the time there is that a bang-bang motion takes; infinite if it is too late.
+        share: (C,), (duration of a bang-bang motion) / (available time); infinite if it is too
+            late.
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
@@ -167,10 +168,10 @@ def _goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
 
 
 @dataclasses.dataclass(frozen=True)
-class WayThenTime(PoseByPose):
-    """A planner that finds a way of the joints, which is timed by TOPP-RA then.
+class PathThenTime(PoseByPose):
+    """A planner that finds a path of the joints, which TOPP-RA then times.
 
-    Raises `MissingExtra` unless its packages are installed.
+    Its constructor raises `MissingExtra` unless its packages are installed.
     """
 
     pieces: ClassVar[int] = PIECES
@@ -180,23 +181,23 @@ class WayThenTime(PoseByPose):
     def __post_init__(self) -> None:
         super().__post_init__()
         for name in self.packages:
-            required(name)
+            import_extra(name)
 
     @abc.abstractmethod
-    def way_to(
+    def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a free way from the case's angles to a goal, or None."""
+        """Return points (N, 6) [rad] of a free path from the case's angles to a goal, or None."""
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the way with its timing; none at all where the arm is at the goal already.
+        """Return the timed path; a motion of zero duration if the arm is at the goal already.
 
-        The spline through a way's points may leave the way: where it then touches something,
-        points are put half-way between the others, so that it follows the way more closely.
+        The spline through a path's points may leave the path. If it then collides, midpoints are
+        inserted between the points, so that it follows the path more closely.
         """
-        points = self.way_to(case, free, goal, left)
+        points = self.path_to(case, free, goal, left)
         if points is not None:
             apart = np.linalg.norm(np.diff(points, axis=0), axis=1) > 1e-6
             points = points[np.append(apart, True)]
@@ -206,7 +207,7 @@ class WayThenTime(PoseByPose):
         limits = (np.asarray(x, float) for x in (case.limits.velocity, case.limits.acceleration))
         velocity, acceleration = limits
         while points is not None and 2 * len(points) <= PIECES:
-            motion = timed_way(points, velocity, acceleration)
+            motion = time_path(points, velocity, acceleration)
             if motion is not None and free.is_motion_free(*motion):
                 coeffs, durations = motion
                 return HostMotion(coeffs, durations, float(durations.sum()))

@@ -1,7 +1,7 @@
 """The baseline `rrt-connect` of [Natarajan2024]: RRT-Connect by OMPL, timed by TOPP-RA; one thread.
 
-The method of [Kuffner2000]. A tree grows from either end by edges of up to `reach`, the length that
-the code behind the paper has. Edges are looked at in one batch each.
+The method of [Kuffner2000]. Two trees grow from start and goal by edges of up to `reach`, the
+length in the code behind the paper. Each edge is checked in one batch.
 """
 
 import dataclasses
@@ -13,34 +13,34 @@ from typing import ClassVar
 import numpy as np
 
 from planner_jax.baselines.block.free_space import FreeSpace
-from planner_jax.baselines.block.path_timing import required
-from planner_jax.baselines.block.pose_by_pose import Clock, Goal, WayThenTime
+from planner_jax.baselines.block.path_timing import import_extra
+from planner_jax.baselines.block.pose_by_pose import Clock, Goal, PathThenTime
 from planner_jax.task.block.case import BlockCase
 
-_SEED = 1  # of OMPL's random numbers: one sequence a process
+_SEED = 1  # of OMPL's random numbers: one sequence per process
 
 
 @functools.cache
 def _ompl() -> tuple[ModuleType, ModuleType]:
-    """Return OMPL's modules `base` and `geometric`, told to be silent and what to draw."""
-    util = required("ompl.util")
+    """Import OMPL's modules `base` and `geometric`, silence its log and seed its generator."""
+    util = import_extra("ompl.util")
     util.setLogLevel(util.LOG_ERROR)
     util.RNG.setSeed(_SEED)
-    return required("ompl.base"), required("ompl.geometric")
+    return import_extra("ompl.base"), import_extra("ompl.geometric")
 
 
 @dataclasses.dataclass(frozen=True)
-class RrtConnectBlock(WayThenTime):
-    """Tries end poses one after another; needs the extra `arm-peers`."""
+class RrtConnectBlock(PathThenTime):
+    """A planner that tries end poses one after another; it needs the extra `arm-peers`."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], longest edge
-    shortcuts: bool = True  # whether a way is made simpler and shorter before it is timed
+    shortcuts: bool = True  # whether a path is shortened before it is timed
 
-    def way_to(
+    def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points of a way, or None."""
+        """Return points (N, 6) [rad] of a free path, or None."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)
@@ -77,16 +77,16 @@ class RrtConnectBlock(WayThenTime):
 
 
 def _numbers(state: Sequence[float]) -> np.ndarray:
-    """Return the angles (6,) of a state of OMPL's."""
+    """Return the angles (6,) of an OMPL state."""
     return np.array([state[k] for k in range(6)])
 
 
 def _validator(base: ModuleType, information: object, free: FreeSpace) -> object:
-    """Return the object that tells OMPL whether an edge is free."""
+    """Create the object by which OMPL checks whether an edge is free."""
 
     class Edges(base.MotionValidator):
         def checkMotion(self, begin: Sequence[float], end: Sequence[float]) -> bool:  # noqa: N802
-            """The name is OMPL's."""
+            """Return whether an edge is free; OMPL prescribes the name."""
             return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
 
     return Edges(information)

@@ -1,4 +1,4 @@
-"""The `catch` planner of [Yu2023catch]: contact and attitude by penalties (its eqs 18-28)."""
+"""The `catch` planner of [Yu2023catch]: contact and attitude as penalties (its eqs 18-28)."""
 
 import dataclasses
 
@@ -38,9 +38,8 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
-# Units of the offsets, and of the variables of a catch, log duration to jerk. Found by trial on the
-# cost gap of generated throws: the hinges are so stiff that curvature measured at one point says
-# little about the next.
+# Units of the offsets, and of the variables of a catch, log duration to jerk. They are tuned on the
+# cost gap of generated throws, since with stiff hinges the Hessian varies strongly between points.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT = {
@@ -49,11 +48,13 @@ _PATIENT = {
     "tolerance": 1e-8,
     "patience": 10,
 }
-COST_UNIT = 1e3  # the solver wants curvatures of moderate size
+COST_UNIT = 1e3  # scales the Hessian to moderate entries
 
 
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
-    """Excess over speed, body rate, thrust and ground, squares in their own units (eqs 26-28).
+    """Return the excess over speed, body rate, thrust and ground limits (eqs 26-28).
+
+    Squares are in their own units.
 
     Args:
         motion: samples of a trajectory.
@@ -115,30 +116,30 @@ class Catch:
 class PaperCatch(OptimisedPlanner):
     """The joint optimisation of catching time and state of [Yu2023catch].
 
-    Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate,
-    thrust and ground by the trapezoid rule + the penalties of the net's distance (eqs 22-24)
-    and angle (eq. 25). The paper gives neither weights nor thresholds: they are those of the
-    published C++ protocol, squares in their own units. Pieces of a segment are equally long
-    and the jerk at the last catch is zero.
+    Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate, thrust
+    and ground by the trapezoid rule + the penalties of the net's distance (eqs 22-24) and angle
+    (eq. 25). The paper reports neither weights nor thresholds; they come from the published C++
+    protocol, with squares in their own units. All pieces of a segment have the same duration, and
+    the jerk at the last catch is zero.
 
-    The variables are the paper's in other coordinates, so the optima are the same: waypoints
-    as whitened offsets, the position at the catch as the net's distance from the ball.
-    Decision variables, N segments with 3 (M - 1) + 13 each: offsets, log duration, miss,
+    The variables are a change of coordinates of the paper's variables, so that the optima are the
+    same: waypoints are whitened offsets, and the position at the catch is the net's offset from the
+    ball. N segments have 3 (M - 1) + 13 decision variables each: offsets, log duration, miss,
     velocity, acceleration and jerk (unused at the last catch).
 
-    It does not look at a case's extras; the referee does.
+    This planner ignores a case's extras; the referee checks them.
     """
 
     case_type = CatchCase
     num_pieces: int = 4  # M, of one segment
-    nodes: int = 16  # penalty intervals a piece
+    nodes: int = 16  # penalty intervals per piece
     time_weight: float = 1000.0  # rho
     limit_weight: float = 1e5
     ground_weight: float = 1e7
     miss_weight: float = 1e4
     angle_weight: float = 1e2
     hinge_width: float = 0.01  # mu, and eps of the angle
-    # The hinges are so stiff that they are brought on in stages.
+    # The hinges are stiff, so that their weights increase in stages.
     rounds: tuple[Round, ...] = (
         Round(
             starts=1,
@@ -155,7 +156,7 @@ class PaperCatch(OptimisedPlanner):
             ),
         ),
     )
-    scale: tuple[float, ...] = ()  # of one segment; () for what served best
+    scale: tuple[float, ...] = ()  # units of one segment's variables; () for the tuned ones
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -166,20 +167,20 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary and offsets to one segment."""
+        """The constant matrices from boundary states and offsets to one segment."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
-        """Number of waypoint variables of a segment."""
+        """The number of waypoint variables of a segment."""
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """The targets in the order of catching."""
+        """Order the targets by their catches."""
         return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
-        """From rest to rest below every ball, on minimum-jerk primitives, (1, n)."""
+        """Return minimum-jerk primitives between standstills below every ball, (1, n)."""
         if num != 1:
             raise ArgumentError("starts", "1", num)
         case, dtype = context.case, context.times.dtype
@@ -215,7 +216,7 @@ class PaperCatch(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype)).reshape(1, -1)
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
-        """The catches that the variables (N, 13) after the waypoint offsets describe."""
+        """Return the catches that the variables (N, 13) after the waypoint offsets describe."""
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -238,7 +239,7 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Segments and catches at a point."""
+        """Return segments and catches at a point."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale
         catch = self.catches(natural[:, self.num_offsets :], context)
@@ -248,7 +249,7 @@ class PaperCatch(OptimisedPlanner):
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
-        """The cost of energy, catches and time, ()."""
+        """Return the cost of energy, catches and time, ()."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
@@ -258,7 +259,7 @@ class PaperCatch(OptimisedPlanner):
         return rest + self.time_weight * catch.times[-1]
 
     def _along(self) -> Along:
-        """Penalties of the limits along the way."""
+        """Return the penalties on limits along the trajectory."""
         return Along(
             maps=self.maps,
             nodes=self.nodes,
@@ -269,7 +270,10 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
-        """The paper's cost over 1000. It names no violation, so the last iterate is the plan."""
+        """Return the paper's cost divided by 1000.
+
+        The violation is zero, so that the solver returns its last iterate.
+        """
         chain, catch = self._unpack(point, context)
         given = (context.case.gravity, context.case.limits)
         along, _ = integrate_along(self._along(), chain.columns, chain.piece_durations, given)
@@ -278,11 +282,11 @@ class PaperCatch(OptimisedPlanner):
         return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Whether a target is never within reach."""
+        """Return whether a target is never within reach."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """The plan at a point, its violation that of the protocol's samples."""
+        """Return the plan at a point; its violation is evaluated at the protocol's samples."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
         motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(

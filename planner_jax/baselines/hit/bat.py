@@ -1,4 +1,4 @@
-"""The baselines `bat` and `bat-lite`: the planner of [Yu2023bat] with and without its front end."""
+"""The baselines `bat` and `bat-lite`: the planner of [Yu2023bat] with and without transition."""
 
 import dataclasses
 import math
@@ -12,7 +12,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, required_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
-from planner_jax.baselines.hit.decoupled import aim_at_angle, decoupled_hit
+from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import require_settings
@@ -33,25 +33,24 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # minimum snap
-_COST_UNIT = 1e4  # the solver wants curvatures of moderate size
+_COST_UNIT = 1e4  # scales the Hessian to moderate entries
 _DECODE_NODES = 24
 
-# [Yu2023bat, Section VI-A]. phi is in its list of parameters and nowhere in its text; it is read
-# as the share of the way from s_0 to s_t.
+# [Yu2023bat, Section VI-A]. The paper lists phi but does not define it; here it is the fraction at
+# which s_mid divides the segment from s_0 to s_t.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
-_SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # varpi, velocity at the transition over the last one
-_TURNED = 2.0 / 3.0  # share of the hit's acceleration at the transition
+_SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # varpi, (velocity at transition) / (velocity at hit)
+_ACCELERATION_SHARE = 2.0 / 3.0  # (acceleration at transition) / (acceleration at hit)
 
-# The least steep path [m/s] on which the ball is followed back to the ground.
-_LEAST_RISE = 0.1
+_LEAST_RISE = 0.1  # [m/s], least vertical speed for extrapolation to the ground
 
 
 def serve_origin(case: HitCase) -> Array:
-    """Where the ball's flight, followed backwards, comes out of the ground: s_0, (3,) [m].
+    """Return where the ball's flight, traced backwards, leaves the ground: s_0, (3,) [m].
 
-    The mirrored ball flies forward against a drag of the other sign, for as long as it takes
-    without drag; the rest is a straight line. A ball that the drag of the other sign would
-    blow up is followed without drag.
+    The mirrored ball flies forward against drag of the opposite sign, for the drag-free flight
+    time; the remaining height is covered on a straight line. If drag of the opposite sign makes the
+    flight diverge, the drag-free flight is used.
     """
     mirrored = BallState(pos=case.ball.pos, vel=-case.ball.vel)
     floor = jnp.zeros_like(case.gravity)
@@ -66,17 +65,17 @@ def serve_origin(case: HitCase) -> Array:
 
 
 def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> Array:
-    """Where the quadrotor stops hurrying and starts swinging: p_t of [Yu2023bat, Section IV-A].
+    """Return p_t of [Yu2023bat, Section IV-A], where the quadrotor starts the swing.
 
-    The ray of Fig. 4 is read as the one from s_mid through p_h, the way along which the
-    racket swings: p_alpha, halfway from p_0 to p_h, is projected on it to p_perp, and p_t is
-    eta of the way from p_perp back to p_alpha.
+    The ray of Fig. 4 is read as the ray from s_mid through p_h, along which the racket swings.
+    p_alpha lies halfway between p_0 and p_h, and p_perp is its projection onto the ray. p_t divides
+    the segment from p_perp to p_alpha at the fraction eta.
 
     Args:
         start: (3,) p_0 [m].
         hit: (3,) p_h [m].
-        origin: (3,) s_0 [m], where the ball came from.
-        target: (3,) s_t [m], where it shall go.
+        origin: (3,) s_0 [m], origin of the ball's flight.
+        target: (3,) s_t [m], where the returned ball should land.
 
     Returns:
         (3,) [m].
@@ -89,8 +88,8 @@ def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> 
     return foot + _ETA * (halfway - foot)
 
 
-# Natural units of a waypoint coordinate [m], log T, a racket speed [m/s], a thrust [m/s^2]: by
-# hand, steps of one unit are of a sensible size.
+# Units of a waypoint coordinate [m], log T, a racket speed [m/s], a thrust [m/s^2], chosen by hand
+# so that steps of one unit have a sensible size.
 _UNITS = (0.1, 0.05, 0.3, 0.5)
 
 
@@ -99,52 +98,58 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 class BatHit(OptimisedPlanner):
     """The planner of [Yu2023bat]; with `transition=False` its "Bat-Lite".
 
-    Decision variables, n = 3 (M - 1) + 5, each in units of `scale`: the waypoints' positions
-    [m], log T, p_y_dot, p_z_dot, tau_x, tau_z. Taken from the paper as it stands:
+    The decision variables, n = 3 (M - 1) + 5, in units of `scale`, are the waypoints' positions
+    [m], log T, p_y_dot, p_z_dot, tau_x and tau_z. These parts follow the paper without changes:
 
-    - eqs 11-14, by which these give the whole state at the impact (`decoupled_hit`);
-    - Section IV-A, the transition point, and IV-C, one minimum-jerk primitive to it and one
-      from it (eqs 15-17): together the first guess, with the values of Section VI-A;
-    - eq. 19, MINCO with s = 4 and equal times; eqs 18a, 20-22 and 24a, one weighted sum of
-      the squared snap, T and the penalties L_mu of its ref. [10]; L-BFGS from one start, the
-      last iterate returned whatever limits it breaks.
+    - eqs 11-14, which derive the complete state at the impact (`solve_decoupled_hit`);
+    - Section IV-A, the transition point, and Section IV-C, a minimum-jerk primitive to it and
+      another one from it (eqs 15-17): together they form the initial guess, with the values of
+      Section VI-A;
+    - eq. 19, MINCO with s = 4 and equal times; eqs 18a, 20-22 and 24a, a weighted sum of the
+      squared snap, T and the penalties L_mu of its ref. [10]; L-BFGS from one start, whose last
+      iterate is returned even if it breaks limits.
 
-    Misprints are read as eq. 18a with D_max^2, eq. 22 with the velocity's z; the ground of
-    eq. 18a as z_min - z, because the squares turn their sign below ground.
+    Two misprints are corrected: eq. 18a has D_max^2, and eq. 22 has the velocity's z. The ground
+    term of eq. 18a is z_min - z, because the difference of squares changes its sign below the
+    ground.
 
-    Readings of what the paper leaves open: the transition acts in the first guess alone,
-    since eq. 18e leaves its state free and the least snap through free waypoints is MINCO's
-    joined trajectory; the ray of Fig. 4 (`transition_point`) and the thrust of Fig. 4b
-    (`transition_state`); no jerk at the impact. Bat-Lite's front end is a primitive straight
-    to the impact (ref. [11]): one stage, and so the time T_0 alone. Weights, mu, M, kappa,
-    units and the stopping rule are not given: M = 4 and usual values of MINCO planners.
+    The paper leaves some choices open; here they are:
 
-    `max_steps` is fitted: with 80 iterations both planners are within two points of the
-    published trials' means, 85.4 and 46.6 %, though hardly for the same serves. It decides
-    nearly everything. Success on 1,800 published serves after so many iterations, in %:
+    - The transition acts only on the initial guess. Eq. 18e leaves the transition state free, and
+      the least-snap trajectory through free waypoints is MINCO's joined trajectory.
+    - `transition_point` reads the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
+    - The jerk at the impact is zero.
+    - Bat-Lite's front end is one primitive straight to the impact (ref. [11]), with the time T_0.
+    - Weights, mu, M, kappa, units and the stopping rule are usual values of MINCO planners, with M
+      = 4.
 
-    iterations                 0   20   40   60   80  100  150  200  300
-    bat                        0   45   58   77   85   92   94   94   94
-    bat-lite                   0    8    5   23   48   63   79   82   82
-    bat-lite from T_0 + T_1   24   53   72   85   91   94   94   94   94
+    `max_steps` is fitted: with 80 iterations both planners are within two points of the mean
+    success of the published trials, 85.4 and 46.6 %, though hardly on the same serves. The number
+    of iterations decides the success almost alone. Success on 1,800 published serves by iterations,
+    in %:
 
-    So what the two-stage guess buys here is above all a first impact time nearer to the best
-    one, and a solver that is left to converge needs it less than the published one did.
+        iterations                 0   20   40   60   80  100  150  200  300
+        bat                        0   45   58   77   85   92   94   94   94
+        bat-lite                   0    8    5   23   48   63   79   82   82
+        bat-lite from T_0 + T_1   24   53   72   85   91   94   94   94   94
 
-    It does not look at a case's extras; the referee does.
+    The main benefit of the two-stage guess is therefore an initial impact time closer to the
+    optimum. A solver that runs to convergence needs this benefit less than the published one.
+
+    This planner ignores a case's extras; the referee checks them.
     """
 
     case_type = HitCase
     transition: bool = True
     num_pieces: int = 4  # M
-    nodes: int = 16  # kappa, penalty intervals a piece
+    nodes: int = 16  # kappa, penalty intervals per piece
     num_table_nodes: int = 48
     time_weight: float = 1e3  # rho
     limit_weight: float = 1e5  # W_D and W_c: speed, acceleration, body rate, ground
-    terminal_weight: float = 1e4  # W_r and W_t: apex, hitting speed; and where eqs 13-14 fail
+    terminal_weight: float = 1e4  # W_r and W_t: apex, hitting speed; also the defect of eqs 13-14
     hinge_width: float = 0.01  # mu, in the unit of each constraint
-    stage_times: tuple[float, float] = (0.7, 0.5)  # T_0, T_1 [s]; without transition the first
-    first_angle: float = math.radians(60.0)  # of the returned ball above the horizontal
+    stage_times: tuple[float, float] = (0.7, 0.5)  # T_0, T_1 [s]; without transition only T_0
+    first_angle: float = math.radians(60.0)  # elevation of the returned ball
     first_thrust_z: float = 1.1  # tau_z over gravity
     first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s]
     rounds: tuple[Round, ...] = (
@@ -171,20 +176,20 @@ class BatHit(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary and offsets to the trajectory."""
+        """The constant matrices from boundary states and offsets to the trajectory."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
-        """Number of waypoint variables."""
+        """The number of waypoint variables."""
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """The incoming ball's table; see `prepare_hit`."""
+        """Tabulate the incoming ball; see `prepare_hit`."""
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """The impact of the variables behind the waypoints, and the defect of eqs 13-14.
+        """Return the impact that the last five variables describe, and the defect of eqs 13-14.
 
         Args:
             natural: (5,) log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
@@ -192,7 +197,7 @@ class BatHit(OptimisedPlanner):
         """
         case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)
-        hit = decoupled_hit(
+        hit = solve_decoupled_hit(
             ball, case.target, natural[1:3], natural[3:5], case.restitution, case.gravity
         )
         impact = make_impact(
@@ -201,12 +206,12 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """The initial values of Section VI-A with the waypoints of the primitives, (1, n)."""
+        """Return the initial values of Section VI-A with waypoints on the primitives, (1, n)."""
         if num != 1:
             raise ArgumentError("starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
-        # A ball that lands sooner, because planning began late, is met before it lands.
+        # A ball that lands sooner, because planning starts late, is hit before it lands.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
@@ -219,7 +224,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Positions of the minimum-jerk primitives at equal times, (M - 1, 3) [m]."""
+        """Return positions on the minimum-jerk primitives at equal times, (M - 1, 3) [m]."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
@@ -233,18 +238,20 @@ class BatHit(OptimisedPlanner):
         return jnp.where((times < switch)[:, None], first, second)
 
     def transition_state(self, impact: Impact, case: HitCase) -> Array:
-        """Position, velocity and acceleration at the transition, (3, 3).
+        """Return position, velocity and acceleration at the transition, (3, 3).
 
-        The acceleration is 2/3 of that at the hit: the thrust then has the paper's vertical
-        part g + 2 (tau_z - g) / 3, and for e_tau, which only Fig. 4b defines, we take the
-        direction that goes with it, on the way from upright to the hit's.
+        The acceleration is 2/3 of the acceleration at the hit. The thrust then has the paper's
+        vertical part g + 2 (tau_z - g) / 3. Only Fig. 4b defines the direction e_tau; here it
+        follows from that acceleration and lies between vertical and the direction at the hit.
         """
         hit = impact.tail_state
         pos = transition_point(case.head_state[0], hit[0], serve_origin(case), case.target)
-        return jnp.stack([pos, jnp.asarray(_SLOWING, pos.dtype) * hit[1], _TURNED * hit[2]])
+        return jnp.stack(
+            [pos, jnp.asarray(_SLOWING, pos.dtype) * hit[1], _ACCELERATION_SHARE * hit[2]]
+        )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Whitened offsets, boundary rows, piece duration, impact and its defect at a point."""
+        """Return whitened offsets, boundary rows, piece duration, impact and defect at a point."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
@@ -257,7 +264,7 @@ class BatHit(OptimisedPlanner):
         return offsets, rows, duration, impact, defect
 
     def _terminal_penalty(self, impact: Impact, defect: Array, case: HitCase) -> Array:
-        """Apex (eq. 21), hitting speed (eq. 24a) and the defect of eqs 13-14."""
+        """Return the penalty on apex (eq. 21), hitting speed (eq. 24a) and defect of eqs 13-14."""
         limits = case.hit_limits
         excess = jnp.concatenate(
             [
@@ -268,7 +275,7 @@ class BatHit(OptimisedPlanner):
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
-        """The limits along the way (eq. 18a), the squares of their own units."""
+        """Return the penalty on limits along the trajectory (eq. 18a), squares in natural units."""
         limits = case.limits
         along = jnp.stack(motion_excess(motion, case.gravity, limits))
         one = jnp.ones_like(limits.speed)
@@ -280,7 +287,10 @@ class BatHit(OptimisedPlanner):
         return self.limit_weight * duration * jnp.sum(hinges * weights)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
-        """The cost of eq. 20. It names no violation, so that the last iterate is the plan."""
+        """Return the cost of eq. 20.
+
+        The violation is zero, so that the solver returns its last iterate.
+        """
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])
         motion = sample_motion(self.maps, self.nodes, columns, duration)
@@ -293,11 +303,11 @@ class BatHit(OptimisedPlanner):
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: HitContext) -> Array:
-        """Whether the ball is never within reach."""
+        """Return whether the ball is never within reach."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """The plan at a point, its violation looked for at 24 nodes a piece."""
+        """Return the plan at a point; its violation is evaluated at 24 nodes per piece."""
         case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])
@@ -311,5 +321,5 @@ class BatHit(OptimisedPlanner):
 
 
 def bat_lite(**options: Any) -> BatHit:
-    """`BatHit` without the transition point; options are its fields."""
+    """Create a `BatHit` without the transition point; options are its fields."""
     return BatHit(transition=False, **options)

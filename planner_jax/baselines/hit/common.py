@@ -1,4 +1,4 @@
-"""What the published baselines of [Yu2023bat] share: the stroke, and how far a plan is off."""
+"""Shared parts of the baselines of [Yu2023bat]: the stroke, and the largest violation of a plan."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -27,19 +27,19 @@ def make_impact(
     thrust: Array,
     case: HitCase,
 ) -> Impact:
-    """The impact of a ball on a quadrotor whose racket faces along its thrust.
+    """Return the impact of a ball on a quadrotor whose racket faces along its thrust.
 
     Args:
         time: () [s], of the impact.
         flight_time: () [s], from the impact to the landing.
         ball: just before the impact.
         after: (3,) [m/s], velocity of the ball just after it.
-        racket_vel: (3,) [m/s], of the quadrotor.
+        racket_vel: (3,) [m/s], velocity of the quadrotor.
         thrust: (3,) [m/s^2], per unit mass; not zero.
         case: for racket height and gravity.
 
     Returns:
-        The impact, the racket's centre at the ball and the quadrotor without jerk.
+        The impact, with the racket's centre at the ball and no jerk of the quadrotor.
     """
     normal = thrust / jnp.sqrt(jnp.maximum(jnp.sum(thrust**2), 1e-6))
     tail_state = jnp.stack(
@@ -63,7 +63,7 @@ def make_impact(
 
 
 def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
-    """Largest excess over any limit, that of the ground in metres and all others relative, ().
+    """Return the largest excess over any limit, (); relative, but in metres for the ground.
 
     Args:
         along: (4, N) from `motion_excess`.

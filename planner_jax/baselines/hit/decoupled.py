@@ -1,7 +1,7 @@
-"""The impact with uncoupled components of [Yu2023bat, Section IV-B] (eqs 11-14).
+"""The impact with decoupled components of [Yu2023bat, Section IV-B] (eqs 11-14).
 
-Two components of the racket's velocity and two of its thrust are given; the others follow
-from the ball and the target.
+Two components of the racket's velocity and two of its thrust are given; the others follow from the
+ball and the target.
 """
 
 import jax.numpy as jnp
@@ -14,21 +14,21 @@ from planner_jax.ball.flight import BallState
 _LEAST_THRUST_X = 1e-2  # [m/s^2]
 _LEAST_ROOT = 1e-2  # [m/s], of the discriminant of eq. 13c
 _LEAST_FLIGHT = 1e-2  # [s]
-_LEAST_PUSH = 1e-3  # [s], change of the ball's velocity over the thrust
+_LEAST_PUSH = 1e-3  # [s], (change of the ball's velocity) / thrust
 
 
 @struct.dataclass
 class DecoupledHit:
-    """What eqs 13 and 14 make of the four given components."""
+    """The solution of eqs 13 and 14 for four given components."""
 
     ball_vel_after: Array  # (3,) [m/s]
     flight_time: Array  # () [s], of the ball to the target
     racket_vel: Array  # (3,) [m/s], x by eq. 14a
     thrust: Array  # (3,) [m/s^2], y by eq. 14b
-    defect: Array  # () >= 0; where it is not 0, no hit with these components reaches the target
+    defect: Array  # () >= 0; if > 0, no hit with these components reaches the target
 
 
-def decoupled_hit(
+def solve_decoupled_hit(
     ball: BallState,
     target: Array,
     racket_vel_yz: Array,
@@ -36,16 +36,17 @@ def decoupled_hit(
     restitution: Array,
     gravity: Array,
 ) -> DecoupledHit:
-    """Solve eqs 13 and 14 for the rest of a hit that sends the ball to the target.
+    """Solve eqs 13 and 14 for a hit that sends the ball to the target.
 
-    With delta = tau_z / tau_x, xi = target - ball and c = v-_z - delta v-_x the flight time is
-    the later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x over that
-    root, written with divisions by xi_x and delta xi_x - xi_z that the root does without.
-    Eq. 14b is the change of the ball's v_y over that of v_x, times tau_x. What can still be
-    singular is guarded, and `defect` tells where: tau_x = 0, a negative discriminant, a ball
-    that flies or is pushed backwards. Values and gradients are finite everywhere.
+    With delta = tau_z / tau_x, xi = target - ball and c = v-_z - delta v-_x the flight time is the
+    later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x divided by that root;
+    the root avoids eq. 13c's divisions by xi_x and delta xi_x - xi_z. Eq. 14b is the change of the
+    ball's v_y divided by the change of its v_x, times tau_x. The remaining singularities are
+    guarded, and `defect` measures them: tau_x = 0, a negative discriminant, a ball that flies or is
+    pushed backwards. Values and gradients are finite everywhere.
 
-    Eq. 13d counts xi from the quadrotor; from the ball, 6 cm away, the target is hit exactly.
+    Eq. 13d measures xi from the quadrotor. Measured from the ball, 6 cm away, the target is hit
+    exactly.
 
     Args:
         ball: just before the impact.
@@ -89,21 +90,22 @@ def decoupled_hit(
 
 
 def aim_at_angle(pos: Array, target: Array, angle: float, gravity: Array) -> Array:
-    """Velocity with which a drag-free ball leaves at an angle and reaches the target.
+    """Return the velocity of a drag-free ball that leaves at an angle and reaches the target.
 
     Args:
         pos: (3,) [m].
-        target: (3,) [m]. One above the line of that angle is taken to be 0.1 m below it.
+        target: (3,) [m]. A target above the line at that angle is replaced by a point 0.1 m below
+            the line.
         angle: [rad], above the horizontal, less than pi / 2.
         gravity: () [m/s^2], magnitude.
 
     Returns:
         (3,) [m/s].
     """
-    way = target - pos
-    distance = jnp.sqrt(jnp.maximum(jnp.sum(way[:2] ** 2), 1e-4))
+    offset = target - pos
+    distance = jnp.sqrt(jnp.maximum(jnp.sum(offset[:2] ** 2), 1e-4))
     slope = jnp.tan(angle)
-    below = jnp.maximum(distance * slope - way[2], 0.1)
-    # Over the flight time t = sqrt(2 below / g) the ball falls that far from the line.
+    below = jnp.maximum(distance * slope - offset[2], 0.1)
+    # In the flight time t = sqrt(2 below / g) the ball falls `below` [m] from the line.
     flight_time = jnp.sqrt(2.0 * below / gravity)
-    return jnp.concatenate([way[:2], (distance * slope)[None]]) / flight_time
+    return jnp.concatenate([offset[:2], (distance * slope)[None]]) / flight_time

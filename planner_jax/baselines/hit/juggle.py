@@ -1,4 +1,4 @@
-"""The `juggle` baseline: one state-to-state primitive to a stroke that is fixed beforehand."""
+"""The `juggle` baseline: one state-to-state primitive to a predetermined stroke."""
 
 import dataclasses
 from typing import ClassVar
@@ -10,7 +10,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import required_impact
 from planner_jax.ball.prediction import PathTable, target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
-from planner_jax.baselines.parts.minimum_jerk import eased_minimum_jerk
+from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings
 from planner_jax.task.hit.case import HitCase
@@ -20,22 +20,20 @@ from planner_jax.trajectory.polynomial import sample_pieces, snap_energy
 
 _BISECTIONS = 30
 _SHORTEST = 1e-2  # [s], of a trajectory
-_LEAST_UPRIGHT = 1e-2  # vertical part of the racket's normal, by which v_z is divided
+_LEAST_UPRIGHT = 1e-2  # least vertical part of the racket's normal, the divisor of v_z
 
 
 def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array) -> Array:
-    """Time at which the target falls through a height.
+    """Return the time () [s] at which the target falls through a height.
 
-    Bisection, then a step of Newton's method, which alone is differentiated.
+    Bisection is followed by one Newton step, which alone is differentiated. If the height is not
+    crossed between the bounds, the result is next to one of them.
 
     Args:
-        path: of the target.
+        path: path of the target.
         height: () [m].
         earliest: () [s], when the target is above `height`.
-        latest: () [s], when it is below.
-
-    Returns:
-        () [s]; next to one of the bounds where the height is not crossed between them.
+        latest: () [s], when the target is below `height`.
     """
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -55,28 +53,28 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class JuggleHit(Planner):
-    """A minimum-jerk primitive to a stroke that is fixed beforehand; nothing is optimised.
+    """A minimum-jerk primitive to a predetermined stroke, without optimisation.
 
-    The "Juggle" of [Yu2023bat]. What is taken from where:
+    This is the "Juggle" of [Yu2023bat]. Its parts come from these sources:
 
-    - [Mueller2011] and [Dong2015]: the ball is
-      met where it falls through a fixed height; the returned ball rises to a fixed apex;
-      two components of the racket's velocity are fixed and the third follows from the impact.
+    - [Mueller2011] and [Dong2015]: the ball is hit where it falls through a fixed height; the
+      returned ball rises to a fixed apex; two components of the racket's velocity are fixed and the
+      third follows from the impact.
     - [Mueller2015]: the primitive of least jerk to that state.
-    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the
-      primitive), and its tau_z = 1.1 g at the impact.
-    - The published trials: v_x = v_y = 0 in every recorded hit; the quadrotor at 1.43 to
-      1.50 m, never above, which is the first 10 ms sample below 1.5 m; an apex of 2.3 m
-      (median; quartiles 2.2 and 2.4) that attitude and target imply, if gravity alone acts.
-    - Assumed: the ramp of `eased_minimum_jerk`. Without it the body rate jumps at time 0.
+    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the primitive),
+      and its tau_z = 1.1 g at the impact.
+    - The published trials: v_x = v_y = 0 in every recorded hit; a quadrotor height of 1.43 to 1.50
+      m, never above, which is the first 10 ms sample below 1.5 m; an apex of 2.3 m (median;
+      quartiles 2.2 and 2.4), which follows from attitude and target if only gravity acts.
+    - Assumed: the ramp of `minimum_jerk_after_ramp`. Without it the body rate jumps at time 0.
 
-    With the restitution 0.7 of [Yu2023bat] this planner succeeds on two serves of three, and
-    not on the one in ten of the published trials. Their recorded hits have a restitution near
-    0.32: a racket that must rise at 3 m/s at the impact instead of nearly resting. With that
-    restitution in the cases it succeeds on one in ten, and mostly in those of the 36
-    cases in which the published one did (correlation 0.65).
+    With the restitution 0.7 of [Yu2023bat] this planner succeeds on two of three serves, the
+    published one on one of ten. The recorded hits have a restitution near 0.32, which requires a
+    racket that rises at 3 m/s at the impact instead of being almost at rest. With that restitution
+    in the cases this planner succeeds on one of ten. Over the 36 scenarios its success correlates
+    with the published success (0.65).
 
-    It does not look at a case's extras; the referee does.
+    This planner ignores a case's extras; the referee checks them.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -85,25 +83,25 @@ class JuggleHit(Planner):
     apex: float = 2.3  # [m], of the returned ball
     thrust_z: float = 1.1  # vertical thrust at the impact over gravity
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
-    ease: float = 0.02  # [s], in which the jerk reaches that of the primitive
-    nodes: int = 60  # intervals a piece in which limits are looked at
+    ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
+    nodes: int = 60  # intervals per piece at whose ends limits are evaluated
     num_table_nodes: int = 48
 
     def __post_init__(self) -> None:
         require_settings(self)
 
     def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
-        """The primitive to the stroke; no variable is left to decide on.
+        """Return the primitive to the stroke, which has no free variable.
 
         Its cost is the mean squared jerk [Yu2023bat, eq. 15].
         """
         impact = self.impact(prepare_hit(case, self.num_table_nodes))
-        trajectory = eased_minimum_jerk(
+        trajectory = minimum_jerk_after_ramp(
             case.head_state, impact.tail_state[:3], impact.stroke.time, self.ease
         )
         motion = sample_pieces(trajectory, self.nodes)
         along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
-        # A height or an apex that cannot be, or a racket on edge, is a broken limit too.
+        # An impossible height or apex, or a vertical racket, counts as a violation too.
         meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
         too_low = jnp.maximum(impact.stroke.ball_pos[2], case.target[2]) - self.apex
         lying = _LEAST_UPRIGHT - impact.stroke.normal[2]
@@ -118,7 +116,10 @@ class JuggleHit(Planner):
         )
 
     def impact(self, context: HitContext) -> Impact:
-        """The stroke. A ball that never falls through `height` is met where it comes closest."""
+        """Return the stroke at the fixed height.
+
+        A ball that never falls through `height` is hit where it comes closest to that height.
+        """
         case, path = context.case, context.path
         gravity = case.gravity
         highest = jnp.maximum(case.ball.vel[2], 0.0) / gravity

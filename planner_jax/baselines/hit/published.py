@@ -1,4 +1,4 @@
-"""What was published with [Yu2023bat]: trial files (serves and outcomes), and success rates."""
+"""Data published with [Yu2023bat]: trial files (serves and outcomes), and success rates."""
 
 import csv
 import dataclasses
@@ -22,9 +22,9 @@ _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
 _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "target")
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
-_LISTED = 5  # how many bad rows a message spells out
+_LISTED = 5  # greatest number of bad rows in a message
 
-# Numbers and outcome of each line of a file; None where the line does not parse.
+# Numbers and outcome of each line of a file; None if the line does not parse.
 _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 
 
@@ -32,26 +32,26 @@ class Trial(NamedTuple):
     """One serve of a trial file."""
 
     line: int  # from 1
-    scenario: int  # place in court.SCENARIOS
+    scenario: int  # index in court.SCENARIOS
     file: str
     numbers: list[float]  # 12: serve position, serve velocity, landing position, target
-    solved: tuple[float, ...]  # per court.PLANNERS: 1 planned, 0 failed, NaN not published
+    solved: tuple[float, ...]  # by court.PLANNERS: 1 planned, 0 failed, NaN not published
 
 
 def read_trials(folder: str | os.PathLike) -> list[Trial]:
-    """Every serve of a folder of trial files  S_L_T_M.csv, line by line of all scenarios.
+    """Read every serve of a folder of trial files  S_L_T_M.csv, sorted by line, then scenario.
 
     Raises:
-        ArgumentError: as `planner_jax.task.hit.suites.read_serves` says.
+        ArgumentError: see `planner_jax.task.hit.suites.read_serves`.
     """
     problems: list[str] = []
     trials: list[Trial] = []
-    for scenario, paths in _trial_files(folder).items():
+    for scenario, paths in _find_trial_files(folder).items():
         tables = {letter: _read_file(path, problems) for letter, path in paths.items()}
         full = {letter: table for letter, table in tables.items() if table}
         trials += _merge(scenario, paths, full, problems)
     trials.sort(key=lambda trial: (trial.line, trial.scenario))
-    problems += _out_of_play(trials)
+    problems += _list_out_of_play(trials)
     if problems:
         listed = "; ".join(problems[:_LISTED])
         rest = f"; and {len(problems) - _LISTED} more" if len(problems) > _LISTED else ""
@@ -60,8 +60,8 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
     return trials
 
 
-def _trial_files(folder) -> dict[int, dict[str, Path]]:
-    """Paths of the trial files of a folder, by place of the scenario and letter of the planner."""
+def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
+    """Return the paths of a folder's trial files, by scenario index and planner letter."""
     folder = Path(folder)
     if not folder.is_dir():
         raise ArgumentError("serves", "an existing folder", str(folder))
@@ -85,7 +85,7 @@ def _trial_files(folder) -> dict[int, dict[str, Path]]:
 
 
 def _read_file(path: Path, problems: list[str]) -> _Table:
-    """The table of one file, and a problem for each line that does not parse."""
+    """Read the table of one file; append a problem for each line that does not parse."""
     try:
         with open_plain(path) as file:
             lines = file.read().decode("utf-8-sig", errors="replace").splitlines()
@@ -107,7 +107,7 @@ def _read_file(path: Path, problems: list[str]) -> _Table:
 
 
 def _parse(line: str) -> tuple[list[float], bool]:
-    """Twelve numbers of the serve, and whether the planner solved it, from one line."""
+    """Parse one line into the serve's twelve numbers and whether the planner solved it."""
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != 8:
         raise ArgumentError("row", "8 columns between commas", len(cells), verb="have")
@@ -122,7 +122,7 @@ def _parse(line: str) -> tuple[list[float], bool]:
 
 
 def _vector(name: str, cell: str, size: int) -> list[float]:
-    """The finite numbers of one blank-separated cell."""
+    """Parse the finite numbers of one blank-separated cell."""
     try:
         vector = [float(word) for word in cell.split()]
     except ValueError:
@@ -135,32 +135,32 @@ def _vector(name: str, cell: str, size: int) -> list[float]:
 def _merge(
     scenario: int, paths: dict[str, Path], tables: dict[str, _Table], problems: list[str]
 ) -> list[Trial]:
-    """Serves of one scenario from the files of its planners; problems where these disagree."""
+    """Merge the serves of one scenario from its planners' files; append a problem for conflicts."""
     trials = []
     for line in sorted(set().union(*tables.values())):
-        there = [letter for letter, table in tables.items() if line in table]
-        rule = f"serve must be the one in {paths[there[0]].name}"
+        present = [letter for letter, table in tables.items() if line in table]
+        rule = f"serve must be the one in {paths[present[0]].name}"
         problems += [
             f"{paths[letter].name}:{line}: {rule}, got no such line"
-            for letter in tables.keys() - there
+            for letter in tables.keys() - present
         ]
-        rows = {letter: row for letter in there if (row := tables[letter][line]) is not None}
+        rows = {letter: row for letter in present if (row := tables[letter][line]) is not None}
         if len(rows) < len(tables):
             continue
-        numbers, _ = rows[there[0]]
+        numbers, _ = rows[present[0]]
         problems += [
-            f"{paths[letter].name}:{line}: {rule}, {numbers}, got {again}"
-            for letter, (again, _) in rows.items()
-            if again != numbers
+            f"{paths[letter].name}:{line}: {rule}, {numbers}, got {other}"
+            for letter, (other, _) in rows.items()
+            if other != numbers
         ]
         outcome = {_FILE_PLANNER[letter]: float(solved) for letter, (_, solved) in rows.items()}
         solved = tuple(outcome.get(planner, math.nan) for planner in court.PLANNERS)
-        trials.append(Trial(line, scenario, paths[there[0]].name, numbers, solved))
+        trials.append(Trial(line, scenario, paths[present[0]].name, numbers, solved))
     return trials
 
 
-def _out_of_play(trials: list[Trial]) -> list[str]:
-    """Problems of the serves that start in the ground or do not come down in the hitting half."""
+def _list_out_of_play(trials: list[Trial]) -> list[str]:
+    """List the serves that start in the ground or do not land in the hitting half."""
     numbers = np.array([trial.numbers for trial in trials]).reshape(-1, 12)
     height = numbers[:, 2]
     position = np.column_stack([numbers[:, :2], np.where(height > 0.0, height, 1.0)])
@@ -177,17 +177,17 @@ def _out_of_play(trials: list[Trial]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class PublishedRates:
-    """Planning success rates in percent: a row per name in court.SCENARIOS, a column per planner.
+    """Planning success rates in percent: a row per court.SCENARIOS, a column per planner.
 
-    The two sources differ by up to 20 points, so name the one that a number is compared with.
+    The two sources differ by up to 20 points, so name the source of every comparison.
     """
 
     paper: np.ndarray  # (36, 3) [%], Table I of the paper
     trials: np.ndarray  # (36, 3) [%], counted from the published trial files, 1,000 rows each
 
 
-def published_rates() -> PublishedRates:
-    """The rates that came with [Yu2023bat], columns in the order of court.PLANNERS."""
+def read_published_rates() -> PublishedRates:
+    """Return the rates published with [Yu2023bat], columns in the order of court.PLANNERS."""
     text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )

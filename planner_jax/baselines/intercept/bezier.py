@@ -1,14 +1,14 @@
-"""Curves of one number over time, of Bezier pieces that all last equally long.
+"""Curves of one number over time, made of Bezier pieces of equal duration.
 
-Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with Bernstein's
-polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A point here is the paper's
-control point times the duration of its piece, h_j c_j^i, so that the curve lies between its points
-and a bound on the curve is the same bound on the points; eqs 22 and 23 as printed bound c_j^i,
-which is right for pieces of 1 s only.
+Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with the Bernstein
+polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A point here is the paper's control
+point times the duration of its piece, h_j c_j^i. The curve lies between its points, so that a bound
+on the curve is the same bound on the points. Eqs 22 and 23 as printed bound c_j^i, which is right
+only for pieces of 1 s.
 
-Everything that is linear in the points is a constant matrix for a horizon of 1: times T, T^2 for
-speed and acceleration of another. Pieces of equal length make these matrices independent of any
-problem. They are NumPy arrays in double precision.
+Everything that is linear in the points is a constant matrix for a horizon of 1. For a horizon T,
+speeds scale with 1 / T and accelerations with 1 / T^2. Since all pieces have the same duration,
+these matrices do not depend on the problem. They are NumPy arrays in double precision.
 """
 
 import math
@@ -21,15 +21,19 @@ from jax import Array
 
 @struct.dataclass
 class BezierCurve:
-    """A curve, or a batch of them with a leading axis on every leaf."""
+    """A curve, or a batch of curves with a leading axis on every leaf."""
 
-    points: Array  # (K, n + 1) [m], between which the curve lies
+    points: Array  # (K, n + 1) [m], control points
     horizon: Array  # () T [s], duration of all pieces together
 
     def at(self, time: Array, order: int = 0) -> Array:
-        """Value, or a derivative by the time of some order, of one curve at times (...) [s].
+        """Return the value of one curve, or a derivative by time, at times (...) [s].
 
-        Before 0 and past the end the nearest piece is continued.
+        Before 0 and after the horizon the nearest piece is extrapolated.
+
+        Args:
+            time: (...) [s].
+            order: of the derivative; 0 for the value.
         """
         pieces, degree = self.points.shape[0], self.points.shape[1] - 1
         place = time / self.horizon * pieces
@@ -45,9 +49,12 @@ class BezierCurve:
 
 
 def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
-    """From the points of a piece to those of its derivative, (degree + 1 - order, degree + 1).
+    """Return the matrix that maps a piece's points to the points of its derivative.
 
-    For a horizon of 1 that is cut into `pieces` ([Qu2022]'s third property).
+    The horizon is 1 and has `pieces` pieces ([Qu2022], third property of Bezier curves).
+
+    Returns:
+        (degree + 1 - order, degree + 1).
     """
     points = np.eye(degree + 1)
     for k in range(order):
@@ -56,7 +63,7 @@ def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
-    """Bernstein's polynomials at shares (S,) of a piece, (S, degree + 1)."""
+    """Return the Bernstein polynomials at positions (S,) in a piece, (S, degree + 1)."""
     u = np.asarray(shares, float)[:, None]
     i = np.arange(degree + 1)
     binomials = np.array([math.comb(degree, k) for k in i])
@@ -64,10 +71,10 @@ def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
 
 
 def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
-    """The integral of the squared derivative over a horizon of 1, as a form in all points.
+    """Return the quadratic form of the squared derivative's integral over a horizon of 1.
 
     Returns:
-        (K (n + 1), K (n + 1)), symmetric; the integral is points' form points.
+        (K (n + 1), K (n + 1)), symmetric; the integral is points^T form points.
     """
     map_ = hodograph(degree, order, pieces)
     m = degree - order
@@ -79,7 +86,9 @@ def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
-    """What is 0 where neighbours agree up to `orders` derivatives [Qu2022, eq. 21].
+    """Return the rows that vanish if neighbouring pieces agree up to derivative `orders`.
+
+    This is [Qu2022, eq. 21].
 
     Returns:
         ((K - 1) (orders + 1), K (n + 1)).
@@ -95,19 +104,22 @@ def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
 
 
 def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
-    """Rows (W, n + 1) for the points of one piece as rows for those of all pieces.
+    """Expand rows (W, n + 1) for one piece's points into rows for the points of all pieces.
 
-    The first row of a piece is the last row of the piece before, on a curve that is smooth
-    enough, and is left out: (K (W - 1) + 1, K (n + 1)).
+    On a smooth curve the first row of a piece equals the last row of the previous piece, so that it
+    is left out.
+
+    Returns:
+        (K (W - 1) + 1, K (n + 1)).
     """
     rows = np.kron(np.eye(pieces), of_piece)
     return np.delete(rows, np.arange(1, pieces) * len(of_piece), axis=0)
 
 
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Bounds (K, W) for the rows of single pieces as bounds for `rows_of_pieces`.
+    """Convert bounds (K, W) on the rows of single pieces into bounds on `rows_of_pieces`.
 
-    Where two pieces join both their bounds hold.
+    At a joint the bounds of both pieces apply.
     """
 
     def flat(bounds: Array, at_joints: Array) -> Array:

@@ -31,7 +31,7 @@ def words_to_pose(x, y, heading, lengths):
         if side == 1:
             y, sin, heading = -y, -sin, -heading
         row = 3 * side
-        # From the centre of the first circle to that of the last one, which turns the same way.
+        # Vector from the centre of the first circle to the centre of the last circle, same sense.
         across, up = x - sin, y + cos - 1.0
         far = math.sqrt(across**2 + up**2)
         if far < 1e-9:
@@ -92,7 +92,7 @@ def length_to_point(x, y):
             straight = math.sqrt(square)
             angle = math.atan2(up, x) + math.atan2(1.0, straight)
             best = min(best, _positive(angle) + straight)
-        else:  # inside of this circle: turn away first, and then this way
+        else:  # inside this circle: turn away from it first, then towards it
             far = math.sqrt(x**2 + (y + 1.0) ** 2)
             half = math.acos(min(max((far**2 + 3.0) / (4.0 * far), -1.0), 1.0))
             for sign in (1.0, -1.0):
@@ -131,5 +131,5 @@ def least_length(pose, goal, middle, curvature, lengths):
         for row in range(6):
             best = min(best, lengths[row, 0] + lengths[row, 1] + lengths[row, 2])
         return best / curvature
-    # Once its middle is on the goal, a car comes to it by driving so far straight on.
+    # The body's centre reaches the goal when the rear axle is `middle` [m] short of it.
     return max(length_to_point(x, y) / curvature - middle, 0.0)

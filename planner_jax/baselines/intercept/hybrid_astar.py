@@ -1,12 +1,12 @@
-"""Hybrid A*: a way for a car that only drives forward, among polygons that stand.
+"""Hybrid A*: a path for a car that only drives forward, among standing polygons.
 
-A search over cells of place and heading, with one continuous state a cell, along arcs that the car
-can drive [Dolgov2008]. It is the first half of [Qu2022]'s path planning (Section
-III-B). Shots, free Dubins ways from a node to the goal, are tried the more often, the nearer the
-goal is; the cheapest one ends the search once nothing that is left can be cheaper, where the paper
-takes the first. Unlike the rest of `plane` it runs on the host, one search at a time; its loops are
-compiled by numba, which the extra `baselines` installs. World frame in the plane, SI units,
-headings counter-clockwise from the x axis.
+The search runs over cells of position and heading, with one continuous state per cell, along arcs
+that the car can drive [Dolgov2008]. It is the first half of the path planning of [Qu2022] (Section
+III-B). Shots, which are collision-free Dubins paths from a node to the goal, are tried more often
+near the goal. The cheapest shot ends the search once no open node can be cheaper; the paper takes
+the first shot. The search runs on the host, one case at a time; its loops are compiled by numba,
+which the extra `baselines` installs. World frame in the plane, SI units, headings counter-clockwise
+from the x axis.
 """
 
 import dataclasses
@@ -19,16 +19,16 @@ from numpy.typing import ArrayLike
 from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
-_DISCS = 3  # that cover the body
+_DISCS = 3  # number of discs that cover the body
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridAstar:
     """Settings of the search.
 
-    A path costs its length, and turns cost more by `turn_price`. The heuristic is the length of the
-    shortest path without obstacles. [Qu2022] takes the greater one of this length and the straight
-    line, which is the same: the straight line is never longer.
+    The cost of a path is its length plus a price for turns. The heuristic is the length of the
+    shortest path without obstacles. [Qu2022] takes the maximum of this length and the straight-line
+    distance, which is equivalent, since the straight line is never longer.
     """
 
     cell: float = 0.1  # [m], side of a cell
@@ -37,26 +37,26 @@ class HybridAstar:
     # By how much, relative, the heuristic is stretched (weighted A* [Pohl1970]), and so how far
     # the cost may be above the least on the lattice.
     slack: float = 0.1
-    margin: float = 0.01  # [m], from polygons, for what lies between samples and nodes
-    poses: int = 129  # of the result
+    margin: float = 0.01  # [m], distance from polygons; covers the gaps between samples
+    poses: int = 129  # number of poses of the result
     max_expansions: int = 200_000
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridPath:
-    """What a search found; without a way the arrays are NaN, length and cost infinite.
+    """Result of a search; without a path the arrays are NaN, length and cost infinite.
 
-    Poses lie at equal distances along the way. It consists of arcs and straight lines, so that
-    curvatures jump between two poses.
+    Poses have equal distances along the path. The path consists of arcs and straight lines, so that
+    the curvature jumps between poses.
     """
 
     poses: np.ndarray  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
-    curvature: np.ndarray  # (N,) [1/m], just after a pose, of the last one just before
+    curvature: np.ndarray  # (N,) [1/m], just after each pose, at the last pose just before
     length: float  # [m]
-    cost: float  # [m], the length with the price of turns
-    expansions: int  # of nodes
+    cost: float  # [m], length plus price of turns
+    expansions: int  # number of expanded nodes
     found: bool
-    blocked: bool  # whether the car cannot stand at its start, or in no way at the goal
+    blocked: bool  # whether the start pose, or every pose at the goal, collides
 
 
 def hybrid_astar(
@@ -71,27 +71,27 @@ def hybrid_astar(
     end_heading: float | None = None,
     settings: HybridAstar = HybridAstar(),
 ) -> HybridPath:
-    """A way from a pose to where the body's middle is on a point.
+    """Search a path from a pose to a pose at which the body's centre is on the meeting point.
 
-    The body is three discs that cover it, so that it is taken for wider and longer than it is: a
-    gap just as wide as the car counts as closed. Where the end's heading is free, ways end with an
-    arc and a straight line.
+    The body is covered by three discs, so that it is treated as wider and longer than it is: a gap
+    just as wide as the car counts as closed. If the final heading is free, paths end with an arc
+    and a straight line.
 
     Args:
         start: (3,) x, y [m] of the rear axle and heading [rad].
-        meeting: (2,) [m], where the body's middle shall be.
-        walls: of one case; their velocities are not looked at.
-        curvature: [1/m], > 0, the tightest.
-        body: ends of the body behind (negative) and ahead of the rear axle, and half its width
-            [m], as for `separation`.
-        lower: (2,) [m], corner of the map, which the body's middle does not leave.
+        meeting: (2,) [m], required position of the body's centre.
+        walls: walls of one case; their velocities are ignored.
+        curvature: [1/m], > 0, greatest curvature.
+        body: ends of the body behind (negative) and ahead of the rear axle, and half its width [m],
+            as for `separation`.
+        lower: (2,) [m], corner of the map, which contains the body's centre.
         upper: (2,) [m], opposite corner.
-        end_heading: [rad]; left free if not given.
-        settings: how the way is sought.
+        end_heading: [rad], final heading; None leaves it free.
+        settings: settings of the search.
 
     Raises:
-        ValueError: an argument or a setting is out of its range.
-        ModuleNotFoundError: numba is not installed.
+        ArgumentError: an argument or a setting is out of its range.
+        MissingExtra: numba is not installed.
     """
     start, meeting, lower, upper = (np.array(x, np.float64) for x in (start, meeting, lower, upper))
     _require(start, meeting, lower, upper, curvature, body, end_heading, settings)
@@ -101,9 +101,9 @@ def hybrid_astar(
     has_heading = end_heading is not None
     heading = float(end_heading or 0.0)
     direction = np.array([np.cos(heading), np.sin(heading)])
-    place = meeting - middle * direction if has_heading else meeting
-    places = middle + half * np.arange(1.0 - _DISCS, _DISCS, 2.0)
-    around = np.ceil(max(abs(middle), *abs(places - middle)) / settings.cell + 0.5)
+    position = meeting - middle * direction if has_heading else meeting
+    positions = middle + half * np.arange(1.0 - _DISCS, _DISCS, 2.0)
+    around = np.ceil(max(abs(middle), *abs(positions - middle)) / settings.cell + 0.5)
     corner = lower - around * settings.cell
     shape = np.ceil((upper - corner) / settings.cell + around).astype(int) + 1
     scene = kernels.Scene(
@@ -112,7 +112,7 @@ def hybrid_astar(
         lower=lower,
         upper=upper,
         middle=middle,
-        places=places,
+        offsets=positions,
         clear=float(np.hypot(half, half_width)) + settings.margin,
         corner=corner,
         shape=(int(shape[0]), int(shape[1])),
@@ -125,12 +125,12 @@ def hybrid_astar(
         slack=float(settings.slack),
         max_expansions=settings.max_expansions,
     )
-    goal = kernels.Goal(np.append(place, heading), has_heading)
+    goal = kernels.Goal(np.append(position, heading), has_heading)
     node_of = np.zeros(int(shape.prod()) * settings.headings, np.int32)
     status, curvatures, lengths, cost, expansions = kernels.search(
         start, goal, scene, rules, node_of
     )
-    poses, bends = _sampled(start, curvatures, lengths, settings.poses)
+    poses, bends = _sample_arcs(start, curvatures, lengths, settings.poses)
     found = status == kernels.FOUND
     return HybridPath(
         poses=poses,
@@ -144,7 +144,7 @@ def hybrid_astar(
 
 
 def _kernels() -> ModuleType:
-    """The compiled loops; says what to install where numba is missing."""
+    """Import the compiled loops, or raise `MissingExtra` if numba is not installed."""
     try:
         return importlib.import_module("planner_jax.baselines.intercept.hybrid_astar_kernels")
     except ModuleNotFoundError as error:
@@ -154,7 +154,7 @@ def _kernels() -> ModuleType:
 
 
 def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:
-    """Raises `ValueError` for what is out of its range."""
+    """Raise `ArgumentError` if an argument is out of its range."""
     shapes = {
         "start": (start, 3),
         "meeting": (meeting, 2),
@@ -183,10 +183,10 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
             raise ArgumentError(name, f">= {least}", chosen[name])
 
 
-def _sampled(
+def _sample_arcs(
     start: np.ndarray, curvatures: np.ndarray, lengths: np.ndarray, num: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (num, 3) and curvatures (num,) at equal distances along arcs (P,) from a pose."""
+    """Sample poses (num, 3) and curvatures (num,) equidistantly along arcs (P,) from a pose."""
     if not len(lengths):
         return np.full((num, 3), np.nan), np.full(num, np.nan)
     ends = np.cumsum(lengths)
@@ -196,13 +196,13 @@ def _sampled(
     stations = np.linspace(0.0, ends[-1], num)
     part = np.minimum(np.searchsorted(ends, stations, side="right"), len(ends) - 1)
     along = stations - np.append(0.0, ends)[part]
-    places = corners[part] + _chords(heading[part], curvatures[part], along)
+    positions = corners[part] + _chords(heading[part], curvatures[part], along)
     turned = heading[part] + curvatures[part] * along
-    return np.concatenate([places, turned[:, None]], axis=1), curvatures[part]
+    return np.concatenate([positions, turned[:, None]], axis=1), curvatures[part]
 
 
 def _chords(heading: np.ndarray, curvature: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """From begin to end (..., 2) [m] of arcs."""
+    """Return the vectors (..., 2) [m] from start to end of arcs."""
     half = 0.5 * curvature * length
     chord = length * np.sinc(half / np.pi)
     return chord[..., None] * np.stack([np.cos(heading + half), np.sin(heading + half)], axis=-1)

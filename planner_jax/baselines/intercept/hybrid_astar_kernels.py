@@ -1,4 +1,4 @@
-"""The loops of `hybrid_astar`, compiled by numba, which this module needs.
+"""The loops of `hybrid_astar`, compiled by numba; importing this module requires numba.
 
 All code is scalar and runs on the host in float64. A pose is x [m], y [m] and heading [rad] of the
 rear axle in the world frame.
@@ -21,71 +21,71 @@ from planner_jax.baselines.intercept.dubins_kernels import (
 )
 
 FOUND, NOT_FOUND, BLOCKED = 0, 1, 2
-PRIMITIVES = 5  # full and half curvature to the left, straight, and likewise to the right
+PRIMITIVES = 5  # left at full and half curvature, straight, right at half and full curvature
 
 
 class Scene(NamedTuple):
-    """What is in the way of a body, and where on the map its middle may be."""
+    """Obstacles, the map, and the discs that cover the body."""
 
     polygons: np.ndarray  # (N, V, 2) [m], convex, counter-clockwise
     present: np.ndarray  # (N,) bool
     lower: np.ndarray  # (2,) [m], corner of the map
     upper: np.ndarray  # (2,) [m], the opposite corner
-    middle: float  # [m], how far the body's middle is ahead of the rear axle
-    places: np.ndarray  # (D,) [m], likewise of the discs that cover it
-    clear: float  # [m], least distance of a disc's middle from a polygon
-    corner: np.ndarray  # (2,) [m], of a grid on which the rear axle and all discs are
+    middle: float  # [m], distance of the body's centre ahead of the rear axle
+    offsets: np.ndarray  # (D,) [m], distances of the discs' centres ahead of the rear axle
+    clear: float  # [m], least distance of a disc's centre from a polygon
+    corner: np.ndarray  # (2,) [m], of a grid that contains the rear axle and all discs
     shape: tuple[int, int]  # of that grid, in cells
 
 
 class Goal(NamedTuple):
-    """A pose, or a point for the body's middle, where the heading is free."""
+    """A pose, or a point for the body's centre with a free heading."""
 
-    pose: np.ndarray  # (3,), of the rear axle; of a point its x and y
+    pose: np.ndarray  # (3,), of the rear axle; x and y of the point if the heading is free
     has_heading: bool
 
 
 class Rules(NamedTuple):
-    """What a search may do, and what it costs."""
+    """Limits and prices of a search."""
 
-    curvature: float  # [1/m], the tightest
+    curvature: float  # [1/m], greatest curvature
     cell: float  # [m], side of a cell
-    headings: int  # bins of a turn
-    price: float  # what a metre at the tightest curvature costs more than a straight one [m]
-    slack: float  # by how much, relative, the heuristic is stretched
+    headings: int  # heading bins of a full turn
+    price: float  # added cost [m] per metre driven at the greatest curvature
+    slack: float  # relative inflation of the heuristic
     max_expansions: int
 
 
 class _Field(NamedTuple):
-    """Distances at the nodes of a grid, at which a search looks things up."""
+    """Distances from polygons at the nodes of a grid, for lookups during a search."""
 
-    far: np.ndarray  # (X, Y) [m], from the nearest polygon
-    corner: np.ndarray  # (2,) [m], of the node (0, 0)
+    far: np.ndarray  # (X, Y) [m], distances from the nearest polygon
+    corner: np.ndarray  # (2,) [m], position of node (0, 0)
     step: float  # [m], between nodes
 
 
 class _Primitives(NamedTuple):
-    """Arcs of one length, of which every one turns by whole bins."""
+    """Arcs of one length that each turn by a whole number of bins."""
 
     reach: float  # [m], their length
-    bins: np.ndarray  # (PRIMITIVES,) int, by which they turn
-    moves: np.ndarray  # (PRIMITIVES, M, 2) [m], to each sample, in the frame of their start
-    directions: np.ndarray  # (headings, PRIMITIVES, M, 2), cos and sin of the heading there
+    bins: np.ndarray  # (PRIMITIVES,) int, heading change of each arc in bins
+    moves: np.ndarray  # (PRIMITIVES, M, 2) [m], samples in the frame of the start
+    directions: np.ndarray  # (headings, PRIMITIVES, M, 2), cos and sin of the samples' headings
 
 
 class _Tree(NamedTuple):
-    """Nodes that were reached, one a cell."""
+    """The reached nodes, one per cell."""
 
-    place: np.ndarray  # (nodes, 3), x [m], y [m], and the cost so far [m]
-    bin: np.ndarray  # (nodes,) int32, of heading from that of the start
-    parent: np.ndarray  # (nodes,) int32, -1 of the start
-    primitive: np.ndarray  # (nodes,) int32, that led here
-    node: np.ndarray  # (cells,) int32, n + 1 of the node n in a cell, -n - 1 once it is expanded
+    place: np.ndarray  # (nodes, 3), x [m], y [m], and cost from the start [m]
+    bin: np.ndarray  # (nodes,) int32, heading bin relative to the start's heading
+    parent: np.ndarray  # (nodes,) int32, -1 for the start
+    primitive: np.ndarray  # (nodes,) int32, the arc from the parent
+    node: np.ndarray  # (cells,) int32, n + 1 for node n of a cell, -n - 1 if it is expanded
 
 
 @njit(cache=True)
 def _distance(x, y, polygon):
-    """How far a point is outside of a convex polygon (V, 2), counter-clockwise; negative inside."""
+    """Return the signed distance of a point from a convex counter-clockwise polygon (V, 2)."""
     nearest, highest = np.inf, -np.inf
     before_x, before_y = polygon[-1, 0], polygon[-1, 1]
     for k in range(polygon.shape[0]):
@@ -103,14 +103,14 @@ def _distance(x, y, polygon):
 
 @njit(cache=True)
 def distance_field(polygons, present, corner, step, shape, cap):
-    """Distance [m] from the nearest polygon at the nodes of a grid, `cap` where it is greater.
+    """Return distances [m] from the nearest polygon at the nodes of a grid, at most `cap`.
 
     Args:
         polygons: (N, V, 2) [m].
         present: (N,) bool.
-        corner: (2,) [m], the node (0, 0).
+        corner: (2,) [m], position of node (0, 0).
         step: [m], between nodes.
-        shape: how many nodes along x and y.
+        shape: number of nodes along x and y.
         cap: [m], > 0.
     """
     field = np.full(shape, cap)
@@ -132,8 +132,8 @@ def distance_field(polygons, present, corner, step, shape, cap):
 
 
 @njit(cache=True)
-def _between_nodes(field, x, y):
-    """Bilinear value of a field at a place counted in nodes, held at the grid's edge."""
+def _interpolate(field, x, y):
+    """Interpolate a field bilinearly at a position in nodes, clamped to the grid."""
     x = min(max(x, 0.0), field.shape[0] - 1.000001)
     y = min(max(y, 0.0), field.shape[1] - 1.000001)
     i, j = int(x), int(y)
@@ -145,29 +145,29 @@ def _between_nodes(field, x, y):
 
 @njit(cache=True)
 def _is_free(x, y, cos, sin, scene, field):
-    """Whether the body is on the map and clear of polygons, the rear axle at (x, y) [m]."""
+    """Return whether the body with its rear axle at (x, y) [m] is on the map and collision-free."""
     mid_x, mid_y = x + scene.middle * cos, y + scene.middle * sin
     if mid_x < scene.lower[0] or mid_x > scene.upper[0]:
         return False
     if mid_y < scene.lower[1] or mid_y > scene.upper[1]:
         return False
-    for k in range(scene.places.shape[0]):
-        at_x = (x + scene.places[k] * cos - field.corner[0]) / field.step
-        at_y = (y + scene.places[k] * sin - field.corner[1]) / field.step
-        if _between_nodes(field.far, at_x, at_y) < scene.clear:
+    for k in range(scene.offsets.shape[0]):
+        at_x = (x + scene.offsets[k] * cos - field.corner[0]) / field.step
+        at_y = (y + scene.offsets[k] * sin - field.corner[1]) / field.step
+        if _interpolate(field.far, at_x, at_y) < scene.clear:
             return False
     return True
 
 
 @njit(cache=True)
-def _free_at(pose, scene, field):
-    """Whether a pose is."""
+def _is_free_at(pose, scene, field):
+    """Return whether the body at a pose is on the map and collision-free."""
     return _is_free(pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2]), scene, field)
 
 
 @njit(cache=True)
-def _field_around(scene, cell):
-    """The field of a scene; two of its steps are a cell."""
+def _compute_field(scene, cell):
+    """Compute the distance field of a scene, with two grid steps per cell."""
     shape = (2 * scene.shape[0] + 1, 2 * scene.shape[1] + 1)
     cap = scene.clear + cell
     far = distance_field(scene.polygons, scene.present, scene.corner, 0.5 * cell, shape, cap)
@@ -175,8 +175,8 @@ def _field_around(scene, cell):
 
 
 @njit(cache=True)
-def _goal_poses(goal, scene, num):
-    """Poses at the goal: the one, or of a free heading so many (num, 3)."""
+def _list_goal_poses(goal, scene, num):
+    """Return the pose at the goal, (1, 3), or `num` poses (num, 3) if its heading is free."""
     back = 0.0 if goal.has_heading else scene.middle
     poses = np.empty((1 if goal.has_heading else num, 3))
     for k in range(poses.shape[0]):
@@ -189,23 +189,23 @@ def _goal_poses(goal, scene, num):
 
 @njit(cache=True)
 def _is_blocked(start, goal, scene, field):
-    """Whether the body cannot stand at the start, or in no way at the goal."""
-    if not _free_at(start, scene, field):
+    """Return whether the body collides at the start, or at every pose of the goal."""
+    if not _is_free_at(start, scene, field):
         return True
-    poses = _goal_poses(goal, scene, 72)
+    poses = _list_goal_poses(goal, scene, 72)
     for k in range(poses.shape[0]):
-        if _free_at(poses[k], scene, field):
+        if _is_free_at(poses[k], scene, field):
             return False
     return True
 
 
 @njit(cache=True)
-def _primitives(start_heading, rules):
-    """Arcs longer than a cell's diagonal, sampled at most half a cell apart."""
+def _compute_primitives(start_heading, rules):
+    """Compute arcs longer than a cell's diagonal, sampled at most half a cell apart."""
     width = TURN / rules.headings
     turns = 2
     while turns * width / rules.curvature <= math.sqrt(2.0) * rules.cell:
-        turns += 2  # half the curvature turns by half of them
+        turns += 2  # even, since half the curvature turns by half the bins
     reach = turns * width / rules.curvature
     num = int(math.ceil(reach / (0.5 * rules.cell)))
     half = turns // 2
@@ -227,13 +227,13 @@ def _primitives(start_heading, rules):
 
 @njit(cache=True)
 def _sinc(x):
-    """sin(x) / x."""
+    """Return sin(x) / x."""
     return math.sin(x) / x if abs(x) > 1e-9 else 1.0
 
 
 @njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
-    """Whether a way of three parts [m] from a pose is free all along."""
+    """Return whether a path of three parts [m] from a pose is collision-free."""
     x, y, heading = pose[0], pose[1], pose[2]
     for k in range(3):
         if parts[k] > 0.0:
@@ -250,10 +250,11 @@ def _is_free_along(pose, parts, senses, curvature, scene, field):
 
 
 @njit(cache=True)
-def _shot(pose, goal, bound, rules, scene, field, lengths):
-    """The cheapest free word to the goal of all that cost less than a bound [m].
+def _shoot(pose, goal, bound, rules, scene, field, lengths):
+    """Find the cheapest collision-free Dubins word to the goal with a cost below a bound [m].
 
-    Returns its row of `lengths` [m], -1 if there is none, and its cost [m].
+    Returns:
+        Its row of `lengths` [m], or -1 without such a word, and its cost [m].
     """
     x, y = in_frame(pose, goal, rules.curvature)
     if goal.has_heading:
@@ -283,7 +284,7 @@ def _shot(pose, goal, bound, rules, scene, field, lengths):
 
 @njit(cache=True)
 def _empty_tree(node_of, max_expansions):
-    """A tree without nodes, with room for all that so many expansions can reach."""
+    """Allocate a tree without nodes that holds all nodes `max_expansions` can reach."""
     most = min(PRIMITIVES * max_expansions, node_of.size) + 1
     return _Tree(
         np.empty((most, 3)),
@@ -296,7 +297,7 @@ def _empty_tree(node_of, max_expansions):
 
 @njit(cache=True)
 def _cell_of(x, y, heading_bin, field, headings):
-    """Number of the cell (x, y, heading), -1 off the grid."""
+    """Return the index of the cell of (x, y, heading), or -1 outside the grid."""
     i = int((x - field.corner[0]) / (2.0 * field.step))
     j = int((y - field.corner[1]) / (2.0 * field.step))
     num_x, num_y = field.far.shape[0] // 2, field.far.shape[1] // 2
@@ -307,9 +308,9 @@ def _cell_of(x, y, heading_bin, field, headings):
 
 @njit(cache=True)
 def _is_free_primitive(tree, node, p, primitives, scene, field):
-    """Whether a primitive from a node is free all along."""
+    """Return whether a primitive from a node is collision-free."""
     x, y, k = tree.place[node, 0], tree.place[node, 1], tree.bin[node]
-    # The heading of a node is that of the straight primitive.
+    # The straight primitive keeps the heading of the node.
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     for m in range(primitives.moves.shape[1]):
         ahead, aside = primitives.moves[p, m]
@@ -321,8 +322,17 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 
 @njit(cache=True)
-def _way_back(tree, node, primitives, lengths, senses, curvature):
-    """Curvatures [1/m] and lengths [m] of primitives to a node and of the three parts after it."""
+def _trace_back(tree, node, primitives, lengths, senses, curvature):
+    """Collect the path to a node and the shot after it: curvatures [1/m] and lengths [m].
+
+    Args:
+        tree: reached nodes.
+        node: where the shot starts.
+        primitives: arcs between nodes.
+        lengths: (3,) [m], parts of the shot.
+        senses: (3,), 1 for left, -1 for right, 0 for straight, of these parts.
+        curvature: [1/m], greatest curvature.
+    """
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]
@@ -339,14 +349,14 @@ def _way_back(tree, node, primitives, lengths, senses, curvature):
 
 @njit(cache=True)
 def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
-    """Write a node."""
+    """Write a node into the tree."""
     tree.place[node, 0], tree.place[node, 1], tree.place[node, 2] = x, y, cost
     tree.bin[node], tree.parent[node], tree.primitive[node] = heading_bin, parent, primitive
 
 
 @njit(cache=True)
 def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
-    """Reach the neighbours of a node; how many of the tree's nodes are then in use."""
+    """Add the neighbours of a node to tree and heap, and return the number of nodes in use."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     last = primitives.moves.shape[1] - 1
@@ -380,25 +390,25 @@ def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, 
 
 @njit(cache=True)
 def search(start, goal, scene, rules, node_of):
-    """Hybrid A* from a pose (3,) to a `Goal` in a `Scene` by `Rules`.
+    """Run Hybrid A* from a pose (3,) to a `Goal` in a `Scene` by `Rules`.
 
     Args:
         start: (3,).
         goal: a `Goal`.
         scene: a `Scene`.
         rules: `Rules`.
-        node_of: (cells and headings,) int32, zeros to write to; NumPy gets them from the system
-            without touching them.
+        node_of: (cells and headings,) int32, zeros, overwritten. NumPy allocates such zeros without
+            touching the memory; numba would write them.
 
     Returns:
         Status (FOUND, NOT_FOUND or BLOCKED), curvatures (P,) [1/m] and lengths (P,) [m] of the
-        parts of the way, its cost [m], and how many nodes were expanded.
+        parts of the path, its cost [m], and the number of expanded nodes.
     """
     none = np.zeros(0)
-    field = _field_around(scene, rules.cell)
+    field = _compute_field(scene, rules.cell)
     if _is_blocked(start, goal, scene, field):
         return BLOCKED, none, none, np.inf, 0
-    primitives = _primitives(start[2], rules)
+    primitives = _compute_primitives(start[2], rules)
     tree = _empty_tree(node_of, rules.max_expansions)
     _enter(tree, 0, -1, 0, start[0], start[1], 0.0, 0)
     tree.node[_cell_of(start[0], start[1], 0, field, rules.headings)] = 1
@@ -418,8 +428,8 @@ def search(start, goal, scene, rules, node_of):
         tree.node[cell] *= -1
         expansions += 1
         wait -= 1
-        if wait <= 0:  # shots are the more frequent, the nearer the goal is
-            row, rest = _shot(pose, goal, best_cost - cost, rules, scene, field, lengths)
+        if wait <= 0:  # shots are more frequent near the goal
+            row, rest = _shoot(pose, goal, best_cost - cost, rules, scene, field, lengths)
             if row >= 0:
                 best_cost, best_node, best_row = cost + rest, node, row
                 for k in range(3):
@@ -430,7 +440,7 @@ def search(start, goal, scene, rules, node_of):
         )
     if best_node < 0:
         return NOT_FOUND, none, none, np.inf, expansions
-    curvatures, parts = _way_back(
+    curvatures, parts = _trace_back(
         tree, best_node, primitives, best_lengths, SENSES[best_row], rules.curvature
     )
     return FOUND, curvatures, parts, best_cost, expansions

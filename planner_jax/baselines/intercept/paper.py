@@ -1,8 +1,8 @@
 """The planner of [Qu2022]: Hybrid A*, gradient descent, dynamic programming, Bezier pieces.
 
-The search runs on the host, one case after another; all that follows is a compiled program. What
-the paper leaves open: sizes and limits are those of the case, and the car drives beside the
-smoothed path, with a curvature that begins as the case has it and does not jump.
+The search runs on the host, one case after another; all later steps are one compiled program. Where
+the paper leaves a choice open, sizes and limits are taken from the case. The car drives beside the
+smoothed path, along a path whose curvature starts at the case's curvature and has no jumps.
 """
 
 import dataclasses
@@ -26,14 +26,14 @@ from planner_jax.task.intercept.plan import InterceptPlan, explain
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import ends_of
 
-_PACE = 1.2  # times those speeds, at which the steering angle can still follow a path
+_PACE = 1.2  # factor on the expected speed that the steering rate must still allow
 
 
-def printed_speed(end_weight: float | None = None) -> SpeedStep:
-    """The speed step as [Qu2022] has it: edges of polygons continued, pieces of a tenth.
+def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
+    """Return the speed step of [Qu2022]: continued polygon edges, pieces of a tenth of the horizon.
 
     Args:
-        end_weight: of a soft end, w_2 T^3 / w_1: 300 for the paper's weights and T = 10 s. By
+        end_weight: w_2 T^3 / w_1 of a soft end, 300 for the paper's weights and T = 10 s. By
             default the end is exact.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["trapezoid-edges"], end_weight=end_weight)
@@ -42,40 +42,40 @@ def printed_speed(end_weight: float | None = None) -> SpeedStep:
 
 @dataclasses.dataclass(frozen=True)
 class PaperIntercept(Planner):
-    """Meets the target at the case's time along one searched path."""
+    """A planner that reaches the target at the case's time along one searched path."""
 
     case_type: ClassVar[type] = InterceptCase
     search: HybridAstar = HybridAstar()
     smoothing: Smoothing = Smoothing()
     follow: FollowConfig = FollowConfig()
-    step: SpeedStep = printed_speed()
+    step: SpeedStep = paper_speed_step()
     attempts: ClassVar[tuple[Search, ...]] = (Search(1),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plans of a batch."""
+        """Return the plans of a batch."""
         num = len(np.asarray(cases.time))
-        found = [self.searched(take(cases, k)) for k in range(num)]
+        found = [self.search_path(take(cases, k)) for k in range(num)]
         poses, bends, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
-        plans = _driven(self, cases, poses, bends, length, is_found)
+        plans = _drive_paths(self, cases, poses, bends, length, is_found)
         return jax.tree.map(np.array, plans)
 
-    def searched(self, case: InterceptCase) -> tuple[np.ndarray, ...]:
-        """Poses (N, 3), curvatures (N,) and length () of a path, and whether there is one."""
-        way = self.way(case)
+    def search_path(self, case: InterceptCase) -> tuple[np.ndarray, ...]:
+        """Return a path: poses (N, 3), curvatures (N,), length () [m], and whether it exists."""
+        found = self.find_path(case)
         dtype = np.asarray(case.time).dtype
-        if way is None or not way.found:
+        if found is None or not found.found:
             shape = (self.search.poses, 3)
             poses = np.broadcast_to(np.asarray(case.start), shape).astype(dtype)
             return poses, np.zeros(shape[0], dtype), np.ones((), dtype), np.zeros((), bool)
         return (
-            way.poses.astype(dtype),
-            way.curvature.astype(dtype),
-            np.asarray(way.length, dtype),
+            found.poses.astype(dtype),
+            found.curvature.astype(dtype),
+            np.asarray(found.length, dtype),
             np.ones((), bool),
         )
 
-    def way(self, case: InterceptCase) -> HybridPath | None:
-        """What Hybrid A* finds; None of a case that is not finite."""
+    def find_path(self, case: InterceptCase) -> HybridPath | None:
+        """Return the path that Hybrid A* finds, or None if the case is not finite."""
         goal = np.asarray(case.target.at(case.time).pos)
         numbers = [case.start, goal, case.limits.curvature, case.lower, case.upper]
         numbers += jax.tree.leaves((case.body, case.walls.corners, case.walls.centre))
@@ -96,7 +96,7 @@ class PaperIntercept(Planner):
         )
 
     def path(self, case: InterceptCase, poses: Array, bends: Array, length: Array) -> Path:
-        """The path that the car drives, of a searched one."""
+        """Return the path that the car drives, from the poses of a searched path."""
         smooth = smooth_path(
             poses,
             bends,
@@ -108,7 +108,7 @@ class PaperIntercept(Planner):
             upper=case.upper,
             settings=self.smoothing,
         )
-        # Slow enough a change for the speeds that the car has at the start and needs on average.
+        # The steering rate must suffice for the initial speed and for the mean speed.
         pace = _PACE * jnp.maximum(case.speed, smooth.length / case.time)
         rate = case.limits.steering_rate / (case.body.wheelbase * pace)
         return path_beside(
@@ -124,7 +124,7 @@ class PaperIntercept(Planner):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _driven(
+def _drive_paths(
     planner: PaperIntercept,
     cases: InterceptCase,
     poses: Array,
@@ -132,10 +132,10 @@ def _driven(
     length: Array,
     is_found: Array,
 ) -> InterceptPlan:
-    """The plans along searched paths, leaves with a leading axis B."""
+    """Return the plans along searched paths; leaves have a leading axis B."""
 
-    def one(given: tuple) -> InterceptPlan:
-        case, poses, bends, length, is_found = given
+    def plan_one(lane: tuple) -> InterceptPlan:
+        case, poses, bends, length, is_found = lane
         path = planner.path(case, poses, bends, length)
         plan = planner.step.drive(case, path, planner.step.problem(case, path))
         worst = jnp.where(is_found, plan.violation, jnp.inf)
@@ -143,4 +143,4 @@ def _driven(
         plan = dataclasses.replace(plan, violation=worst, status=status)
         return explain(case, status, plan)
 
-    return lax.map(one, (cases, poses, bends, length, is_found))
+    return lax.map(plan_one, (cases, poses, bends, length, is_found))

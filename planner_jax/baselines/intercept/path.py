@@ -1,4 +1,4 @@
-"""A way of the rear axle, without a speed: the first half of a plan that splits both."""
+"""A path of the rear axle without a speed: the result of a planner's first half."""
 
 import dataclasses
 
@@ -14,9 +14,9 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @struct.dataclass
 class Path:
-    """N equally spaced points of a way, or a batch with leading axes; stations count from 0.
+    """N equally spaced points of a path, or a batch with leading axes; stations start at 0.
 
-    Between two points the curvature changes evenly along the way.
+    Between two points the curvature is linear in the station.
     """
 
     pos: Array  # (N, 2) [m], of the rear axle's middle
@@ -25,17 +25,17 @@ class Path:
     length: Array  # () [m]
 
     def curvature_at(self, station: Array) -> Array:
-        """Curvature [1/m] of one way at stations (M,) [m]; held at its ends."""
+        """Return the curvature [1/m] of one path at stations (M,) [m]; constant beyond its ends."""
         stations = jnp.linspace(0.0, 1.0, self.curvature.shape[-1]) * self.length
         return jnp.interp(station, stations, self.curvature)
 
 
 def path_along(start: Array, length: Array, curvature: Array) -> Path:
-    """The path from a pose (3,) with curvatures (N,) [1/m] at equal distances."""
-    way = motion(start, length, jnp.ones_like(curvature), curvature, 1)
+    """Return the path from a pose (3,) with curvatures (N,) [1/m] at equal distances."""
+    drive = motion(start, length, jnp.ones_like(curvature), curvature, 1)
     return Path(
-        pos=jnp.concatenate([start[None, :2], way.pos[:, 0]]),
-        heading=jnp.concatenate([start[None, 2], way.heading[:, 0]]),
+        pos=jnp.concatenate([start[None, :2], drive.pos[:, 0]]),
+        heading=jnp.concatenate([start[None, 2], drive.heading[:, 0]]),
         curvature=curvature,
         length=length,
     )
@@ -44,21 +44,21 @@ def path_along(start: Array, length: Array, curvature: Array) -> Path:
 def path_of_drive(
     start: Array, time: Array, speed: Array, curvature: Array, num: int, samples: int = 8
 ) -> Path:
-    """The way of a drive whose speed and curvature change evenly between equal knots.
+    """Return the path of a drive whose speed and curvature are linear between equally spaced knots.
 
     Args:
         start: (3,) x, y [m], heading [rad].
-        time: () [s], the end.
-        speed: (K + 1,) [m/s], at the knots, nowhere negative.
+        time: () [s], end of the drive.
+        speed: (K + 1,) [m/s], at the knots, >= 0.
         curvature: (K + 1,) [1/m].
-        num: N, points of the path.
-        samples: of every piece, between which the curvature is interpolated by the station.
+        num: N, number of points of the path.
+        samples: samples per piece, between which the curvature is interpolated by station.
     """
     knots = jnp.arange(speed.shape[0]) * samples
     fine = jnp.arange((speed.shape[0] - 1) * samples + 1)
     v, c = (jnp.interp(fine, knots, each) for each in (speed, curvature))
     step = time / (fine.shape[0] - 1)
-    # Where the car stands the station has to grow a little, to be interpolated by.
+    # At standstill the station increases by a tiny step, since interpolation needs distinct values.
     moved = jnp.maximum(0.5 * (v[1:] + v[:-1]) * step, 1e-6)
     station = jnp.concatenate([jnp.zeros_like(moved[:1]), jnp.cumsum(moved)])
     even = jnp.linspace(0.0, 1.0, num) * station[-1]
@@ -67,12 +67,12 @@ def path_of_drive(
 
 @dataclasses.dataclass(frozen=True)
 class FollowConfig:
-    """How a car follows given points; static."""
+    """Settings of the fit of a drivable path to given points; static."""
 
-    stride: int = 2  # every how many points the curvature has a knot
-    miss: float = 0.01  # [m], away from a point counts as much as
-    rate: float = 1.0  # ... such a share of the greatest rate of the curvature
-    slack: float = 0.02  # share of every limit that is kept free
+    stride: int = 2  # points between two knots of the curvature
+    miss: float = 0.01  # [m], distance from a point that adds 1 to the cost
+    rate: float = 1.0  # weight of (curvature rate / limit)^2
+    slack: float = 0.02  # fraction of every limit that stays unused
     solver: LevenbergConfig = LevenbergConfig(30)
 
 
@@ -86,39 +86,39 @@ def path_beside(
     rate: Array,
     config: FollowConfig = FollowConfig(),
 ) -> Path:
-    """A path that a car can drive along given points: its curvature does not jump.
+    """Return a path without curvature jumps that a car can drive along given points.
 
-    Searched and smoothed paths begin with a curvature that the car does not have, and consist of
-    arcs. This is the path nearest to their points by least squares among those whose curvature
-    changes evenly between knots and keeps its limits, as far as that goes.
+    Searched and smoothed paths consist of arcs, and start with a curvature that the car does not
+    have. The returned path minimises the squared distance from their points. Its curvature is
+    linear between knots and keeps its limits where the solver can satisfy them.
 
     Args:
         start: (3,) x, y [m] and heading [rad].
         curvature: () [1/m], at the start.
-        points: (N, 2) [m], at equal distances, the first one the start's; N - 1 is a multiple of
-            the stride.
-        bends: (N,) [1/m], curvature there, as a first guess.
+        points: (N, 2) [m], at equal distances, the first at the start; N - 1 is a multiple of the
+            stride.
+        bends: (N,) [1/m], curvature at the points, the initial guess.
         length: () [m], of the path.
-        most: () [1/m], the greatest curvature.
-        rate: () [1/m^2], the greatest change of curvature by the way.
+        most: () [1/m], limit of the curvature.
+        rate: () [1/m^2], limit of the curvature's derivative by station.
         config: weights and sizes.
     """
     num = (points.shape[0] - 1) // config.stride
-    own = jnp.eye(num, dtype=points.dtype)
-    change = (own - jnp.eye(num, k=-1, dtype=points.dtype)) * num
+    identity = jnp.eye(num, dtype=points.dtype)
+    change = (identity - jnp.eye(num, k=-1, dtype=points.dtype)) * num
     limits = most * (1.0 - config.slack), rate * (1.0 - config.slack)
 
-    def at(unknown: Array) -> Array:
+    def knots_of(unknown: Array) -> Array:
         return jnp.concatenate([curvature[None], unknown])
 
     def evaluate(unknown: Array) -> Model:
-        knots = at(unknown)
-        way = motion(start, length, jnp.ones_like(knots), knots, config.stride)
-        away = (way.pos - points[1:].reshape(way.pos.shape)) / config.miss**2
+        knots = knots_of(unknown)
+        drive = motion(start, length, jnp.ones_like(knots), knots, config.stride)
+        away = (drive.pos - points[1:].reshape(drive.pos.shape)) / config.miss**2
         rates = (knots[1:] - knots[:-1]) * (num / length)
-        pull, stiffness = by_unknowns(way, nearness(away, config.miss), is_time_free=False)
+        pull, stiffness = by_unknowns(drive, nearness(away, config.miss), is_time_free=False)
         values, rows = [], []
-        each = ((unknown, own, limits[0]), (rates, change / length, limits[1]))
+        each = ((unknown, identity, limits[0]), (rates, change / length, limits[1]))
         for value, row, limit in each:
             over = jnp.maximum(jnp.abs(value) / limit - 1.0, 0.0)
             sign = jnp.where(over > 0.0, jnp.sign(value), 0.0) / limit
@@ -136,13 +136,18 @@ def path_beside(
         )
 
     guess = jnp.clip(bends[config.stride :: config.stride], -most, most)
-    knots = at(least_squares(evaluate, guess, config.solver).point)
-    places = jnp.arange(points.shape[0]) / config.stride
-    return path_along(start, length, jnp.interp(places, jnp.arange(num + 1), knots))
+    knots = knots_of(least_squares(evaluate, guess, config.solver).point)
+    positions = jnp.arange(points.shape[0]) / config.stride
+    return path_along(start, length, jnp.interp(positions, jnp.arange(num + 1), knots))
 
 
 def nearness(push: Array, miss: float) -> Quadratic:
-    """The squared distance of samples (K, S) from places, as half its gradient (K, S, 2) is."""
+    """Return the quadratic model of the squared distance of samples (K, S) from given positions.
+
+    Args:
+        push: (K, S, 2), half the gradient by the position of each sample.
+        miss: [m], distance of unit cost.
+    """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)
     return Quadratic(

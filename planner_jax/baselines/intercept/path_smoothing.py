@@ -1,27 +1,27 @@
-"""Paths that a search has found, made smooth by gradient descent [Qu2022, Section III-C].
+"""Smoothing of searched paths by gradient descent [Qu2022, Section III-C].
 
-Points of the path move, its ends stay. The cost (eq. 12) keeps them away from obstacles (eq. 13),
-within the curvature's limit (eq. 14) and evenly spaced on a line as straight as may be (eq. 15).
-What is printed does not work as it stands; here
+Inner points of the path move, its ends are fixed. The cost (eq. 12) keeps the points away from
+obstacles (eq. 13), within the curvature limit (eq. 14) and evenly spaced on a line that is as
+straight as possible (eq. 15). The equations as printed do not work. The differences are:
 
-* J_obs counts only points nearer than d_max, as the text says; eq. 13 would also draw the others
-  to that distance;
-* J_cur counts only what is above kappa_max, squared; eq. 14 sums the difference itself, which has
-  no least value and weighs the same everywhere. Delta phi is the angle between two displacements,
-  where the difference of two arctangents jumps;
-* alpha_1, alpha_2, alpha_3 of eq. 16 are the one step alpha by the weights of eq. 12, which the
-  experiments name;
-* lengths are measured in the mean distance of neighbouring points, near the pixels of the paper's
-  map: J_cur is the only term whose scale depends on the unit, and in metres the step makes it
-  diverge. A step that would raise the cost is halved instead;
-* the first two points and the last two are held, as the car's heading there is given.
+* J_obs counts only points nearer than d_max, as the paper's text says. Eq. 13 would also attract
+  the other points to that distance.
+* J_cur counts only the excess over kappa_max, squared. Eq. 14 sums the difference itself, which has
+  no minimum. Delta phi is the angle between two displacements; the difference of two arctangents
+  has jumps.
+* alpha_1, alpha_2, alpha_3 of eq. 16 are the single step alpha times the weights of eq. 12, which
+  the experiments name.
+* Lengths are measured in the mean distance of neighbouring points, which is close to a pixel of the
+  paper's map. The scale of J_cur depends on the unit, and in metres the descent diverges. A step
+  that would increase the cost is halved instead.
+* The first two and the last two points are fixed, since the car's heading at the ends is given.
 
 The points are the control points of a cubic B-spline, which has headings and a continuous
-curvature: at a knot it is nearly that of three points, which J_cur looks at. None of the terms is
-a strict limit, so a smooth path may be bent too much, often where a wall near an end pushes the
-points beside those that are held. Points part of the way from the given path are tried then, and
-in the end the given path is kept. A path as tight as the limit all along leaves no room: search
-with nine tenths of it. World frame in the plane, SI units.
+curvature. At a knot its curvature is close to the curvature of three neighbouring points, which
+J_cur limits. No term is a strict limit, so that a smooth path may exceed the curvature limit, often
+because a wall near an end pushes the points next to the fixed ones. Then points between the given
+and the smooth path are tried, and finally the given path is returned. A given path at the curvature
+limit leaves no freedom: search with nine tenths of the limit. World frame in the plane, SI units.
 """
 
 import dataclasses
@@ -35,25 +35,25 @@ from jax import Array, lax
 from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
-_FINE = 8  # samples of a piece of the spline, for its length
-# Of the way from given points to smooth ones, what is tried; at 0 the spline alone smooths.
+_FINE = 8  # samples per piece of the spline, for its length
+# Fractions of the shift from given to smooth points that are tried; at 0 only the spline smooths.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
-# Relative, for rounding: searched arcs are just as tight as allowed.
-_CURVATURE_ROOM = 1e-3
+# Relative tolerance for rounding, since searched arcs have exactly the greatest curvature.
+_CURVATURE_TOLERANCE = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """Weights and step of [Qu2022, Section V-C], and what else shapes the program."""
+    """Weights and step of [Qu2022, Section V-C], and sizes of the compiled program."""
 
     obstacle: float = 0.1
     curvature: float = 0.1
     smoothness: float = 0.2
     step: float = 0.25
-    reach: float = 0.5  # [m], d_max, from which on obstacles do not matter; not in the paper
+    reach: float = 0.5  # [m], d_max, range of obstacles; not in the paper
     iterations: int = 100
-    stride: int = 4  # every how many poses one is a point that moves
-    margin: float = 0.01  # [m], that the body keeps from walls between poses
+    stride: int = 4  # poses between two points that move
+    margin: float = 0.01  # [m], distance from walls; covers the gaps between poses
 
 
 @struct.dataclass
@@ -63,8 +63,8 @@ class SmoothPath:
     poses: Array  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
     curvature: Array  # (N,) [1/m]
     length: Array  # () [m]
-    is_smooth: Array  # () bool; False where the given path was kept
-    share: Array  # (), of the way from the given points to smooth ones; 0 where it was kept
+    is_smooth: Array  # () bool; False if the given path is returned
+    share: Array  # (), fraction of the shift from given to smooth points; 0 if not smooth
 
 
 def smooth_path(
@@ -79,23 +79,24 @@ def smooth_path(
     upper: Array,
     settings: Smoothing = Smoothing(),
 ) -> SmoothPath:
-    """A path made smooth, or as it is if it then were in a wall, off the map or bent too much.
+    """Smooth a path; return it unchanged if every smooth one would break a limit.
 
-    Pure, for one case; `vmap` it for many.
+    A limit is broken in a wall, outside the map, or above the greatest curvature. Pure, for one
+    case; use `vmap` for a batch.
 
     Args:
         poses: (N, 3) at equal distances, N - 1 a multiple of the stride.
-        bends: (N,) [1/m], curvature there.
+        bends: (N,) [1/m], curvature at the poses.
         length: () [m], of the given path.
-        walls: that stand.
-        curvature: () [1/m], > 0, the tightest.
+        walls: standing obstacles.
+        curvature: () [1/m], > 0, greatest curvature.
         body: ends of the body behind and ahead of the rear axle, and half its width [m].
-        lower: (2,) [m], corner of the map, which the body's middle does not leave.
+        lower: (2,) [m], corner of the map, which contains the body's centre.
         upper: (2,) [m], opposite corner.
         settings: weights and sizes.
 
     Raises:
-        ValueError: the number of poses does not fit the stride, or is too small.
+        ArgumentError: the number of poses does not fit the stride, or is too small.
     """
     pieces, rest = divmod(poses.shape[0] - 1, settings.stride)
     if rest or pieces < 4:
@@ -107,20 +108,20 @@ def smooth_path(
     corners = walls.vertices(jnp.zeros_like(length))
     middle = 0.5 * (body[0] + body[1])
 
-    def tried(share: Array) -> tuple[Array, Array, Array, Array]:
-        """A path and whether it is a good one."""
+    def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
+        """Return a path between the given and the smooth one, and whether it keeps all limits."""
         points = given + share * (smooth - given)
-        found, bent, total = resampled(points, poses[0, 2], poses[-1, 2], poses.shape[0])
+        found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])
         x, y, heading = found.T
         gap = separation(corners, walls.present, x[None], y[None], heading, body)
         ahead = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=1)
         place = found[:, :2] + middle * ahead
         good = jnp.all(gap >= settings.margin) & jnp.all((place >= lower) & (place <= upper))
-        good &= jnp.all(jnp.abs(bent) <= curvature * (1.0 + _CURVATURE_ROOM))
+        good &= jnp.all(jnp.abs(bent) <= curvature * (1.0 + _CURVATURE_TOLERANCE))
         return found, bent, total, good
 
     shares = jnp.asarray(_SHARES, poses.dtype)
-    *paths, good = jax.vmap(tried)(shares)
+    *paths, good = jax.vmap(evaluate)(shares)
     first, is_smooth = jnp.argmax(good), jnp.any(good)
     found, bent, total = (
         jnp.where(is_smooth, path[first], kept)
@@ -138,12 +139,12 @@ def smooth_path(
 def smooth_points(
     points: Array, walls: Obstacles, curvature: Array, settings: Smoothing = Smoothing()
 ) -> Array:
-    """Points (n + 1, 2) [m] after gradient descent [Qu2022, eq. 16]; the ends stay.
+    """Return points (n + 1, 2) [m] after gradient descent [Qu2022, eq. 16]; the ends are fixed.
 
     Args:
-        points: (n + 1, 2) [m], about equally far apart, such as `control_points`.
-        walls: that stand.
-        curvature: () [1/m], the tightest.
+        points: (n + 1, 2) [m], about equally spaced, such as `control_points`.
+        walls: standing obstacles.
+        curvature: () [1/m], greatest curvature.
         settings: weights and sizes.
     """
     unit = _mean_distance(points)
@@ -156,7 +157,7 @@ def smooth_points(
 
     def descend(state: tuple, _: None) -> tuple[tuple, None]:
         points, value, slope, step = state
-        # The cost is of lengths in units: its slope by them is `unit` times that by metres.
+        # The cost has lengths in units: its gradient by units is `unit` times the one by metres.
         moved = points - jnp.where(moves[:, None], step * unit**2 * slope, 0.0)
         new = (moved, *value_and_slope(moved))
         is_lower = new[1] <= value
@@ -175,12 +176,12 @@ def smoothing_cost(
     curvature: Array,
     settings: Smoothing = Smoothing(),
 ) -> Array:
-    """J_G of [Qu2022, eq. 12], () without unit; see the top of the module for its terms.
+    """Return J_G of [Qu2022, eq. 12], (), dimensionless; the module's docstring explains its terms.
 
     Args:
         points: (n + 1, 2) [m].
-        unit: () [m], in which lengths are measured.
-        walls: that stand.
+        unit: () [m], unit of length.
+        walls: standing obstacles.
         curvature: () [1/m], kappa_max.
         settings: weights and reach.
     """
@@ -198,14 +199,15 @@ def smoothing_cost(
 
 
 def control_points(poses: Array, bends: Array) -> Array:
-    """Control points (n + 1, 2) [m] of a B-spline that runs close to poses (n + 1, 3).
+    """Return control points (n + 1, 2) [m] of a B-spline close to poses (n + 1, 3).
 
-    The spline cuts corners by a sixth of how far three points are off a line; inner points are
-    moved by as much, and those beside the ends so that the curvatures there are the given ones.
+    A cubic B-spline deviates from a control point by a sixth of the second difference of the points
+    around it. Inner points are shifted to compensate. The points next to the ends are placed so
+    that the curvature at the ends is the given one.
 
     Args:
-        poses: (n + 1, 3), about equally far apart.
-        bends: (n + 1,) [1/m], curvature there.
+        poses: (n + 1, 3), about equally spaced.
+        bends: (n + 1,) [1/m], curvature at the poses.
     """
     points = poses[:, :2]
     step = _mean_distance(points)
@@ -220,26 +222,26 @@ def control_points(poses: Array, bends: Array) -> Array:
     return jnp.concatenate([points[:1], first[None], inner[1:-1], last[None], points[-1:]])
 
 
-def resampled(
+def resample(
     points: Array, start_heading: Array, end_heading: Array, num: int
 ) -> tuple[Array, Array, Array]:
-    """Poses at equal distances along the B-spline of control points.
+    """Sample poses at equal distances along the B-spline of control points.
 
-    It begins and ends where they do, with the given headings.
+    The spline starts and ends at the first and last control point, with the given headings.
 
     Args:
-        points: (n + 1, 2) [m], about equally far apart.
+        points: (n + 1, 2) [m], about equally spaced.
         start_heading: () [rad].
-        end_heading: () [rad], to a multiple of a turn.
-        num: N, how many poses.
+        end_heading: () [rad], up to a multiple of a full turn.
+        num: N, number of poses.
 
     Returns:
-        poses: (N, 3), the first heading the given one, the others continuous from it.
+        poses: (N, 3), the first heading is `start_heading`, the others continue it without jumps.
         curvature: (N,) [1/m].
         length: () [m].
     """
     pieces = points.shape[0] - 1
-    control = _clamped(points, start_heading, end_heading)
+    control = _clamp_ends(points, start_heading, end_heading)
     places = jnp.linspace(0.0, pieces, pieces * _FINE + 1, dtype=points.dtype)
     # Simpson's rule on every pair of half steps.
     half = 0.5 / _FINE
@@ -258,10 +260,11 @@ def resampled(
     return poses, cross / (square * jnp.sqrt(square)), stations[-1]
 
 
-def _clamped(points: Array, start_heading: Array, end_heading: Array) -> Array:
-    """Control points with the two beyond the ends (n + 3, 2), so that the ends are met.
+def _clamp_ends(points: Array, start_heading: Array, end_heading: Array) -> Array:
+    """Add a control point beyond each end, (n + 3, 2), so that the spline meets the ends.
 
-    The first and the last one are moved, so that the spline begins and ends where they were.
+    The first and the last point are shifted, so that the spline starts and ends at their original
+    positions.
     """
 
     def end(at: Array, beside: Array, heading: Array) -> tuple[Array, Array]:
@@ -274,12 +277,15 @@ def _clamped(points: Array, start_heading: Array, end_heading: Array) -> Array:
 
 
 def _mean_distance(points: Array) -> Array:
-    """Mean distance () [m] of neighbouring points."""
+    """Return the mean distance () [m] of neighbouring points."""
     return jnp.mean(jnp.linalg.norm(points[1:] - points[:-1], axis=1))
 
 
 def _nearest(points: Array, walls: Obstacles) -> Array:
-    """Distance (n,) [m] of points from the nearest wall; its slope is known without more work."""
+    """Return the distance (n,) [m] of points from the nearest wall.
+
+    Its gradient is the known unit vector away from the wall, without differentiating the distance.
+    """
     fixed = lax.stop_gradient(points)
     x, y = fixed.T
     far, away = distances(walls.vertices(jnp.zeros_like(x[0])), walls.present, x[None], y[None])
@@ -289,11 +295,11 @@ def _nearest(points: Array, walls: Obstacles) -> Array:
 
 
 def _spline(control: Array, place: Array) -> tuple[Array, Array, Array]:
-    """Positions (M, 2) of a uniform cubic B-spline and their first two derivatives.
+    """Evaluate positions (M, 2) of a uniform cubic B-spline and their first two derivatives.
 
     Args:
-        control: (n + 3, 2), of which each belongs to a knot, the first one to knot -1.
-        place: (M,), counted in knots, from 0 to n.
+        control: (n + 3, 2), control points of the knots -1, 0, ..., n + 1.
+        place: (M,), in knots, from 0 to n.
     """
     k = jnp.clip(place.astype(jnp.int32), 0, control.shape[0] - 4)
     u = (place - k)[:, None]

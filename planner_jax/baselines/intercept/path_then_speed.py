@@ -1,11 +1,11 @@
-"""Planners that split path and speed [Qu2022]: a path among what stands, then a speed along it.
+"""Planners that first find a path and then a speed along it [Qu2022].
 
-Where a path crosses something that stays on it no speed helps, which is what the split loses. So
-several paths are tried, each another way round what stands.
+If an obstacle stays on the path, no speed along the path avoids it. These planners therefore try
+several paths that pass the standing obstacles on different sides.
 """
 
 import dataclasses
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -26,17 +26,17 @@ from planner_jax.task.intercept.searches import Search, make_grid
 
 @dataclasses.dataclass(frozen=True)
 class SpeedStep:
-    """Sizes of the second half, which all sources of paths share; static."""
+    """Settings of the speed step, which all path sources share; static."""
 
-    # None drives with constant speed, whatever moves.
+    # None: constant speed, moving obstacles are ignored.
     speed: SpeedPlanner | None = dataclasses.replace(SPEED_PLANNERS["trapezoid"], pieces=20)
     projection: Projection = Projection()
-    slack: float = 0.015  # share of every limit that is kept free
-    pieces: int = 200  # of the plan's speed and curvature
-    checked: int = 2  # samples of each, where obstacles are looked at
+    slack: float = 0.015  # fraction of every limit that stays unused
+    pieces: int = 200  # number of pieces of the plan's speed and curvature
+    checked: int = 2  # samples per piece at which distances from obstacles are computed
 
     def problem(self, case: InterceptCase, path: Path) -> StationTimeProblem:
-        """The problem of driving along a path."""
+        """Return the station-time problem of driving along a path."""
         return station_time_problem(
             path,
             case.movers,
@@ -49,7 +49,7 @@ class SpeedStep:
         )
 
     def drive(self, case: InterceptCase, path: Path, problem: StationTimeProblem) -> InterceptPlan:
-        """The plan of one path: its speed, and the curvature that the path has there."""
+        """Return the plan along one path: the planned speed, with the curvature of the path."""
         times = jnp.linspace(0.0, 1.0, self.pieces + 1) * case.time
         if self.speed is None:
             station, speed = ramp_and_cruise(problem, times)
@@ -76,11 +76,11 @@ class SpeedStep:
 
 
 def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, Array]:
-    """Station [m] and speed [m/s] at times (M,) with the shortest ramp to a constant speed.
+    """Return station [m] and speed [m/s] at times (M,) for a short ramp to a constant speed.
 
-    The ramp has the greatest acceleration, and the car is at the end of the way in time if it can
-    be: with a change of speed d the way is v0 T + d T - d |d| / (2 a). [Qu2022] compares with
-    constant speed (its Fig. 4), and leaves out how the car comes by it.
+    The ramp has the greatest acceleration a. Its speed change d makes the car reach the end of the
+    path at the horizon T if possible: the path length is v0 T + d T - d |d| / (2 a). [Qu2022]
+    compares with constant speed (Fig. 4) and leaves out the ramp.
     """
     limit, horizon = problem.acceleration_limit, problem.horizon
     missing = problem.end_station - problem.initial_speed * horizon
@@ -96,14 +96,14 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathThenSpeed(Planner):
-    """Meets the target at the case's time along one of several paths among what stands."""
+    """A planner that reaches the target at the case's time along the best of several paths."""
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     source: PathSource = PathSource()
     step: SpeedStep = SpeedStep()
-    # How many paths get a speed, those first through which dynamic programming finds the line of
-    # least acceleration; None: all.
+    # Number of paths that get a speed, ranked by the acceleration of their lines from dynamic
+    # programming; None: all paths.
     tries: int | None = None
     searches: tuple[Search, ...] = (Search(8),)
 
@@ -114,42 +114,51 @@ class PathThenSpeed(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches; their ways are paths."""
+        """The searches; `paths` of a search is their number."""
         return self.searches
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plan of one case: of all paths that got a speed, the best."""
+        """Return the plan of one case: the best among all paths that get a speed."""
         return self.solve_in_layers(case, attempt, None)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """The plans of a batch, all together."""
-        # All go through as many layers as the one with the most, so that they stay in step.
+        """Return the plans of a batch, computed together."""
+        # Every case uses the largest number of layers, so that all loops have the same length.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
 
     def solve_in_layers(
         self, case: InterceptCase, attempt: Search, layers: Array | None
     ) -> InterceptPlan:
-        """The plan of one case, of a reach set of so many layers."""
+        """Return the plan of one case from a reach set with a given number of layers.
+
+        Args:
+            case: one case.
+            attempt: the search for paths.
+            layers: () int32, layers of the reach set; None derives them from the case.
+        """
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
         return explain(case, reason, plan)
 
     def best_drive(self, case: InterceptCase, found: StaticPaths) -> InterceptPlan:
-        """The plan of least acceleration along one of the paths; without any the least bad."""
+        """Return the plan of least acceleration along one of the paths.
+
+        If no plan is solved, the plan with the smallest violation is returned.
+        """
         problems = jax.vmap(lambda path: self.step.problem(case, path))(found.paths)
         paths, violation = found.paths, found.violation
         if self.tries is not None:
-            order = self.ranked(problems, violation)[: self.tries]
+            order = self.rank_paths(problems, violation)[: self.tries]
             paths, problems = jax.tree.map(lambda leaf: leaf[order], (paths, problems))
         drives = jax.vmap(lambda path, problem: self.step.drive(case, path, problem))(
             paths, problems
         )
         return jax.tree.map(lambda leaf: leaf[best_of(drives)], drives)
 
-    def ranked(self, problems: StationTimeProblem, violation: Array) -> Array:
-        """Places of paths (P,), the best first."""
+    def rank_paths(self, problems: StationTimeProblem, violation: Array) -> Array:
+        """Return the indices of the paths (P,), the most promising path first."""
         grid = (self.step.speed or SPEED_PLANNERS["trapezoid"]).grid
         lines = jax.vmap(lambda problem: reference_line(problem, grid))(problems)
         cost = jnp.where(lines.found, lines.cost, 1e6) + jnp.where(violation > 0.0, 1e3, 0.0)
@@ -157,9 +166,10 @@ class PathThenSpeed(Planner):
 
 
 def best_of(plans: InterceptPlan) -> Array:
-    """Place of the best of some plans of one case: solved with the least cost, else violated least.
+    """Return the index of the best of several plans of one case.
 
-    A plan without a line through the graph is worse than one without a curve along it.
+    A solved plan of least cost is best, then the plan with the smallest violation. A plan without a
+    line through the station-time graph is worse than a plan without a curve beside the line.
     """
     cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
     cost = jnp.where(jnp.isfinite(cost), cost, 1e6)
@@ -167,29 +177,32 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Up to eight paths, on each a curve of least acceleration in a corridor of trapezoids.
+    """Create the planner that tries eight paths with curves in trapezoidal corridors.
 
     Args:
-        **fields: of `PathThenSpeed`.
+        **fields: fields of `PathThenSpeed`.
     """
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 
-def em(kind: Literal["em", "em-exact"] = "em", **fields: object) -> PathThenSpeed:
-    """The best path with the speed step of the EM planner, at the same setting.
+def em(**fields: object) -> PathThenSpeed:
+    """Create the planner that combines the best path with the speed step of the EM planner.
+
+    The speed step has the pieces and sample times of `lattice`.
 
     Args:
-        kind: a key of `SPEED_PLANNERS`, its pieces and samples set to those of `lattice`.
-        **fields: of `PathThenSpeed`.
+        **fields: fields of `PathThenSpeed`.
     """
-    speed = dataclasses.replace(SPEED_PLANNERS[kind], pieces=20, samples=5)
+    speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
 def constant(**fields: object) -> PathThenSpeed:
-    """The best path with constant speed after a short ramp, whatever moves.
+    """Create the planner that drives the best path at constant speed, ignoring movers.
+
+    A short ramp from the initial speed comes first.
 
     Args:
-        **fields: of `PathThenSpeed`.
+        **fields: fields of `PathThenSpeed`.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})

@@ -1,11 +1,11 @@
-"""What of a path moving obstacles block, and when, as quadrangles in the plane of station and time.
+"""Projection of moving obstacles onto a path: quadrangles in the plane of station and time.
 
-The body at a point of the path and a polygon that moves evenly overlap in one interval of time:
-on every axis that may part them (their edges' normals) both cover intervals, one of which moves
-evenly, and what is left when every axis has had its say is exact. Along the path these intervals
-make up a region, which on a bent path can come in several runs. Each run is cut into slabs of
-equal duration, and each slab covered by a quadrangle ([Qu2022, Section IV-A]: parallelograms,
-which is what a straight path has).
+The body at a point of the path and a polygon in uniform motion overlap during one time interval.
+The separating axis theorem gives this interval exactly: along the normal of each edge the body and
+the polygon cover intervals, the polygon's interval moves uniformly, and the result is the
+intersection over all axes. Along the path these time intervals form a region. On a curved path the
+region can have several runs. Each run is divided into slabs of equal duration, and each slab is
+covered by a quadrangle ([Qu2022, Section IV-A] has parallelograms, the shape on a straight path).
 """
 
 import dataclasses
@@ -20,17 +20,19 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-_SLOPES = np.linspace(-2.0, 2.0, 17)  # that an edge may have, in heights of its slab by duration
-_BEFORE = 0.05  # of the horizon, what is looked at before it begins and after it ends
+_SLOPES = np.linspace(
+    -2.0, 2.0, 17
+)  # candidate slopes of an edge, in (height of the slab) / duration
+_BEFORE = 0.05  # fraction of the horizon that is projected before its start and after its end
 
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
     """Sizes of a projection; static."""
 
-    runs: int = 2  # of one obstacle; more than that are joined to the last one
-    slabs: int = 4  # of one run
-    margin: float = 0.01  # [m], that the body keeps from obstacles
+    runs: int = 2  # runs of one obstacle; further runs are joined to the last one
+    slabs: int = 4  # slabs of one run
+    margin: float = 0.01  # [m], distance of the body from obstacles
 
 
 def station_time_problem(
@@ -43,19 +45,19 @@ def station_time_problem(
     projection: Projection = Projection(),
     slack: float = 0.0,
 ) -> StationTimeProblem:
-    """The problem of driving along a path among moving obstacles, to be at its end in time.
+    """Return the problem of driving along a path among moving obstacles, to reach its end in time.
 
-    The car begins without acceleration [Qu2022, Section V-C].
+    The car starts without acceleration [Qu2022, Section V-C].
 
     Args:
-        path: of the rear axle, N points.
-        movers: obstacles.
-        body: of the car.
-        limits: of the car.
+        path: path of the rear axle, N points.
+        movers: moving obstacles.
+        body: body of the car.
+        limits: limits of the car.
         horizon: () [s].
         speed: () [m/s], at time 0.
         projection: sizes.
-        slack: share of every limit that is kept free.
+        slack: fraction of every limit that stays unused.
     """
     return StationTimeProblem(
         end_station=path.length,
@@ -64,20 +66,21 @@ def station_time_problem(
         initial_acceleration=jnp.zeros_like(horizon),
         speed_limit=speed_limits(path, body, limits) * (1.0 - slack),
         acceleration_limit=limits.acceleration * (1.0 - slack),
-        blocked=blocked_by(path, movers, body, horizon, projection),
+        blocked=project_obstacles(path, movers, body, horizon, projection),
     )
 
 
 def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
-    """The greatest speed between every two neighbours of a path, (N - 1,) [m/s].
+    """Return the greatest speed between every two neighbouring points of a path, (N - 1,) [m/s].
 
-    That of the car, that of its lateral acceleration, sqrt(a / |kappa|) [Qu2022, eq. 23], and
-    that at which the steering angle changes at its greatest rate.
+    It is the least of three limits: the car's speed limit, sqrt(a / |kappa|) for its lateral
+    acceleration [Qu2022, eq. 23], and the speed at which the steering angle changes at its greatest
+    rate.
     """
     step = path.length / (path.curvature.shape[0] - 1)
     bend = jnp.maximum(jnp.abs(path.curvature[1:]), jnp.abs(path.curvature[:-1]))
     lateral = jnp.sqrt(limits.lateral_acceleration / jnp.maximum(bend, 1e-6))
-    # The steering angle turns fastest where the curvature is least.
+    # The steering angle changes fastest at the smallest curvature.
     before, after = path.curvature[:-1], path.curvature[1:]
     least = jnp.where(before * after > 0.0, jnp.minimum(before**2, after**2), 0.0)
     gain = body.wheelbase / (1.0 + body.wheelbase**2 * least)
@@ -85,10 +88,18 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
     return jnp.minimum(limits.speed, jnp.minimum(lateral, steering))
 
 
-def blocked_by(
+def project_obstacles(
     path: Path, movers: Obstacles, body: CarBody, horizon: Array, projection: Projection
 ) -> Blocked:
-    """Quadrangles that cover what moving obstacles (M) block, P = M * runs * slabs of them."""
+    """Return P = M * runs * slabs quadrangles that cover everything M moving obstacles block.
+
+    Args:
+        path: path of the rear axle, N points.
+        movers: M obstacles.
+        body: body of the car.
+        horizon: () [s].
+        projection: sizes.
+    """
     half_step = 0.5 * path.length / (path.curvature.shape[0] - 1)
     begin, finish = overlap(path, movers, body, half_step, projection.margin)
     first, last = -_BEFORE * horizon, (1.0 + _BEFORE) * horizon
@@ -99,7 +110,7 @@ def blocked_by(
     station = jnp.linspace(0.0, 1.0, path.curvature.shape[0]) * path.length
 
     def cover(own: Array, begin: Array, finish: Array) -> Blocked:
-        return _covered(own, begin, finish, station, half_step, projection.slabs)
+        return _cover_run(own, begin, finish, station, half_step, projection.slabs)
 
     of_runs = jax.vmap(cover, in_axes=(0, None, None))
     own = is_blocked[:, None] & (run[:, None] == 1 + np.arange(projection.runs)[:, None])
@@ -110,10 +121,18 @@ def blocked_by(
 def overlap(
     path: Path, movers: Obstacles, body: CarBody, half_step: Array, margin: float
 ) -> tuple[Array, Array]:
-    """From when to when [s] the body overlaps obstacles at points of a path, (M, N) each.
+    """Return when the body overlaps obstacles at points of a path: start and end [s], (M, N) each.
 
-    The body is so much larger that the interval holds for half a step before and after the point.
-    Where there is none it begins after its end; of an obstacle that stands it may be infinite.
+    The body is enlarged so that the interval is valid for half a step before and after each of the
+    N points. Without an overlap the interval starts after its end. For an obstacle at rest it may
+    be infinite.
+
+    Args:
+        path: path of the rear axle, N points.
+        movers: M obstacles.
+        body: body of the car.
+        half_step: () [m], half the distance of neighbouring points.
+        margin: [m], distance kept from obstacles.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -138,11 +157,11 @@ def overlap(
     finish = -begin
 
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
-        """What an axis for every obstacle and point, x and y (M, 1) or (1, N), leaves of it."""
+        """Intersect intervals (M, N) with the overlap along axes x, y of shape (M, 1) or (1, N)."""
         mine = [x * corner[:, 0] + y * corner[:, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
-        # They overlap while -behind < rate t < before.
+        # They overlap while -after < rate t < before.
         before = _most(mine) - _least(other)
         after = _most(other) - _least(mine)
         is_still = jnp.abs(rate) < 1e-7
@@ -173,10 +192,19 @@ def _least(values: list[Array]) -> Array:
     return jnp.min(jnp.stack(values), axis=0)
 
 
-def _covered(
+def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Quadrangles (slabs,) over the points `own` (N,) of a path, blocked from begin to finish."""
+    """Cover one run with quadrangles (slabs,).
+
+    Args:
+        own: (N,) bool, the points of the path that belong to the run.
+        begin: (N,) [s], when each point becomes blocked.
+        finish: (N,) [s], when each point becomes free again.
+        station: (N,) [m], of the points.
+        half_step: () [m], half the distance of neighbouring points.
+        slabs: number of quadrangles.
+    """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))
     last = jnp.max(jnp.where(own, finish, -jnp.inf))
@@ -185,12 +213,15 @@ def _covered(
     start = first + width * jnp.arange(slabs)
     middle = (start + 0.5 * width)[:, None]
     is_in = own & (begin < start[:, None] + width) & (finish > start[:, None])  # (slabs, N)
-    # Every point blocks a rectangle; its corners from the slab's middle.
+    # Every point blocks a rectangle; its sides are relative to the slab's middle.
     left = jnp.clip(begin - middle, -0.5 * width, 0.5 * width)
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """The lowest line above the upper corners (1), or the highest below the lower ones (-1)."""
+        """Return the lowest line above the upper corners (side 1).
+
+        Side -1 gives the highest line below the lower corners.
+        """
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)
         lowest = jnp.min(jnp.where(is_in, height, jnp.inf), axis=1)

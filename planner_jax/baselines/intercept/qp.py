@@ -1,13 +1,14 @@
-"""Many convex quadratic programs that differ by their bounds alone, each solved exactly.
+"""Batches of convex quadratic programs that share their matrices, each solved exactly.
 
     minimise x' Q x / 2   subject to   E x = e,   lower <= R x <= upper
 
-with Q, E and R constant, e, lower and upper free. All that depends on the matrices is done once, in
-double precision on the host: x = base e + Z y with Z' Q Z = 1 leaves the point y of least length
-between pairs of parallel planes. From y = 0, the optimum without bounds, the dual method of
-[Goldfarb1983] takes one plane after another into its working set: as
-many steps as planes are active in the end, when none has to leave again. Its linear algebra is
-products with matrices, no factorisation, so that a batch is a batch of products.
+with Q, E and R constant; e, lower and upper differ between programs. All work that depends only on
+the matrices is done once, in double precision on the host: x = base e + Z y with Z' Q Z = 1 turns
+the program into finding the shortest y between pairs of parallel planes. The start y = 0 is the
+optimum without bounds. The dual method of [Goldfarb1983] adds one plane after another to its
+working set. It takes as many steps as planes are active at the optimum, unless a plane has to leave
+the working set again. The linear algebra consists of matrix products, without factorisations, so
+that a batch is a batch of products.
 """
 
 import dataclasses
@@ -26,54 +27,51 @@ from planner_jax.core.protocol import Status
 
 @struct.dataclass
 class QpTemplate:
-    """What programs of the same matrices share, made by `qp_template`, in double precision."""
+    """The part that programs of the same matrices share, in double precision; see `qp_template`."""
 
-    base: Array | np.ndarray  # (n, q), to the optimum without bounds, from e
-    base_cost: Array | np.ndarray  # (q, q), its cost is e' base_cost e
+    base: Array | np.ndarray  # (n, q), maps e to the optimum without bounds
+    base_cost: Array | np.ndarray  # (q, q), the cost of this optimum is e' base_cost e
     directions: Array | np.ndarray  # (n, d) Z
-    reach: Array | np.ndarray  # (M, q), R x at the optimum without bounds, from e
-    normals: (
-        Array | np.ndarray
-    )  # (M, d), rows of R Z as unit vectors; 0 where the equalities decide R x
-    scales: Array | np.ndarray  # (M,), their lengths before; 1 where the equalities decide
+    reach: Array | np.ndarray  # (M, q), maps e to R x at the optimum without bounds
+    normals: Array | np.ndarray  # (M, d), unit rows of R Z; 0 if the equalities fix the row of R x
+    scales: Array | np.ndarray  # (M,), lengths of the rows of R Z; 1 if the equalities fix the row
 
 
 @struct.dataclass
 class QpSolution:
-    """One solution, or a batch of them with a leading axis on every leaf."""
+    """One solution, or a batch of solutions with a leading axis on every leaf."""
 
     point: Array  # (n,) x
     cost: Array  # (), x' Q x / 2
-    multiplier: Array  # (M,), slope of the cost by a bound: > 0 lower, < 0 upper, 0 not active
+    multiplier: Array  # (M,), derivative of the cost by a bound: > 0 lower, < 0 upper, 0 inactive
     violation: Array  # (), the largest excess over a bound, relative to 1 + |bound|
-    steps: Array  # () int32, planes taken up and dropped
+    steps: Array  # () int32, number of planes added and dropped
     status: Array  # () int32: CONVERGED, INFEASIBLE, MAX_STEPS or NON_FINITE of `Status`
 
 
 @dataclasses.dataclass(frozen=True)
 class QpConfig:
-    """Sizes of the method; what they leave unsolved has status MAX_STEPS."""
+    """Sizes of the method. Programs that they leave unsolved get status MAX_STEPS."""
 
-    active: int = 64  # bounds that can be active at once; no more than the unknowns d
+    active: int = 64  # greatest number of active bounds; at most the number d of unknowns
     max_steps: int = 60
 
 
 def qp_template(
     hessian: ArrayLike, equalities: ArrayLike, rows: ArrayLike, zeros: ArrayLike | None = None
 ) -> QpTemplate:
-    """What programs of these matrices share; NumPy, in double precision.
+    """Prepare the part that programs of these matrices share; NumPy, in double precision.
 
-    A term linear in x is a product with an unknown that an equality holds at 1.
+    A term linear in x can be written as a product with an unknown that an equality fixes to 1.
 
     Args:
-        hessian: (n, n) Q, symmetric, positive definite where E x = 0.
+        hessian: (n, n) Q, symmetric, positive definite on the null space of E.
         equalities: (q, n) E, independent rows.
         rows: (M, n) R.
-        zeros: (z, n), more rows of equalities, whose right side is always 0.
+        zeros: (z, n), more rows of equalities, whose right sides are always 0.
 
     Raises:
-        ValueError: the equalities depend on each other, or the cost has no single minimum; one
-            line.
+        ArgumentError: the equalities are not independent, or the minimum is not unique.
     """
     q, e, r = (np.asarray(each, np.float64) for each in (hessian, equalities, rows))
     given = len(e)
@@ -110,20 +108,20 @@ def qp_template(
 
 @struct.dataclass
 class _Search:
-    """One program on its way: a point, and the working set of planes on which it is optimal."""
+    """State of the search of one program: a point, and the working set on which it is optimal."""
 
     point: Array  # (d,) y
-    excess: Array  # (M,), how far it is beyond the nearer plane of each pair, above the tolerance
-    maps: Array  # (d + A, d): projector off the working set's normals, and their pseudo-inverse
-    rows: Array  # (A,) int32, which planes are in the working set
-    sides: Array  # (A,), 1 for a lower bound, -1 for an upper one, 0 for none: the slot is free
+    excess: Array  # (M,), distance beyond the nearer plane of each pair, less the tolerance
+    maps: Array  # (d + A, d): projector orthogonal to the working set, and its pseudo-inverse
+    rows: Array  # (A,) int32, planes of the working set
+    sides: Array  # (A,), 1 for a lower bound, -1 for an upper bound, 0 for a free slot
     multipliers: Array  # (A,)
-    held: Array  # (M,) bool, which rows are in the working set
-    entering: Array  # () int32, the plane that is being taken up, -1 before it is chosen
-    pressure: Array  # (), its multiplier so far
+    held: Array  # (M,) bool, whether a row is in the working set
+    entering: Array  # () int32, the plane that is being added; -1 if none is selected
+    pressure: Array  # (), multiplier of the entering plane
     steps: Array  # () int32
-    status: Array  # () int32: MAX_STEPS until no step can lead on or there is no place left
-    is_stuck: Array  # () bool
+    status: Array  # () int32: MAX_STEPS, or INFEASIBLE if no step is possible
+    is_stuck: Array  # () bool, whether no step is possible or no slot is free
 
 
 def solve_qp(
@@ -133,32 +131,33 @@ def solve_qp(
     upper: Array,
     config: QpConfig = QpConfig(),
 ) -> QpSolution:
-    """The optimum of one program; differentiable by the right side and the bounds.
+    """Return the optimum of one program; differentiable by the right side and the bounds.
 
-    Derivatives are those at a fixed working set, which are the true ones wherever no active bound
-    has a multiplier of zero. In single precision the cost is right to some 1e-6.
+    Derivatives hold the working set fixed, which is exact unless an active bound has a multiplier
+    of zero. In single precision the relative error of the cost is about 1e-6.
 
     Args:
-        template: of the matrices.
+        template: prepared matrices.
         right_side: (q,) e.
-        lower: (M,), -inf for none.
-        upper: (M,), inf for none.
+        lower: (M,), -inf for no bound.
+        upper: (M,), inf for no bound.
         config: sizes.
 
     Returns:
-        The solution; of a program without one the best point that was found. Rows whose value
-        the equalities decide count in `violation`, and can be the reason why there is none.
+        The solution, or the best point found if the program has no solution. Rows whose values
+        follow
+        from the equalities alone count in `violation` too, and can make the program infeasible.
     """
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
     unbounded = _product(t.reach, right_side)
-    # Bounds of unit normals on y, and what of them rounding may exceed.
+    # Bounds on y along unit normals, and their tolerance for rounding.
     low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales
     eps = jnp.finfo(dtype).eps
     slack = 16.0 * eps * (1.0 + jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0))
     slack = slack + 16.0 * eps * jnp.where(jnp.isfinite(high), jnp.abs(high), 0.0)
     is_free = jnp.any(t.normals != 0.0, axis=1)
-    search = _searched(t.normals, is_free, *lax.stop_gradient((low, high, slack)), config)
+    search = _search(t.normals, is_free, *lax.stop_gradient((low, high, slack)), config)
 
     inverse = search.maps[t.normals.shape[1] :]  # (A, d)
     is_lower, is_upper = search.sides > 0.0, search.sides < 0.0
@@ -192,10 +191,10 @@ def solve_qp(
     )
 
 
-def _searched(
+def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """The dual method, from the empty working set to the optimum."""
+    """Run the dual method from the empty working set to the optimum."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype
@@ -214,7 +213,7 @@ def _searched(
         reached = jnp.sum(normal * s.point)
         side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
         gap = jnp.maximum(low[row] - reached, reached - high[row])
-        # Where the point moves as the plane is taken up, and how fast multipliers fall.
+        # Direction of the point as the plane is added, and rates at which multipliers decrease.
         both = _product(s.maps, side * normal)
         move, fall = both[:size], both[size:]
         freedom = jnp.sum(move**2)
@@ -230,7 +229,7 @@ def _searched(
         is_stuck = is_hopeless | (is_added & taken[place])
         length = jnp.where(is_stuck, 0.0, length)
 
-        # Both a plane more and a plane less change the maps by a product of two vectors.
+        # Adding or dropping a plane changes the maps by an outer product of two vectors.
         lost = s.maps[size + loser]
         other = jnp.where(is_added, both, _product(s.maps, lost))
         axis = jnp.where(is_added, move, lost)

@@ -1,11 +1,11 @@
-"""Paths among what stands, each another way round it: what a split of path and speed begins with.
+"""Paths that pass standing obstacles on different sides, for planners that split path and speed.
 
-They come from the machinery of `spacetime`, with nothing that moves and a target that stands where
-it will be met. Random ways through the reach set are told apart by the side on which they pass
-each wall: the angle by which a way turns around a wall's middle differs from that of another one
-by whole turns just if the wall lies between them. Those that differ most are refined by least
-squares, each at the time of its own arrival, and their speed is forgotten. Some are longer than
-they need to be: what moves may block all the short ones.
+The paths come from the machinery of the `spacetime` planner, for a case without moving obstacles
+and with a target that stands at the meeting point. Random paths through the reach set are compared
+by the side on which they pass each wall: the angle by which a path turns around a wall's centre
+differs by whole turns between two paths if and only if the wall lies between them. The paths that
+differ most are refined by least squares, each with its own arrival time; their speeds are then
+discarded. Some paths are longer than necessary, because moving obstacles may block all short ones.
 """
 
 import dataclasses
@@ -26,8 +26,8 @@ from planner_jax.task.intercept.problem import Guess, MotionProblem
 from planner_jax.task.intercept.searches import Reachability, Search, draw_cell_path, search_reach
 from planner_jax.task.intercept.terms import wrap
 
-_SHARES = 8  # of a way, where it is compared with others
-_OTHER_SIDE = 8.0  # [m], how much farther apart ways are that pass a wall on different sides
+_SHARES = 8  # points of a path at which it is compared with others
+_OTHER_SIDE = 8.0  # [m], added distance of paths that pass a wall on different sides
 
 
 @struct.dataclass
@@ -35,26 +35,32 @@ class StaticPaths:
     """P paths of one case."""
 
     paths: Path  # leaves (P, ...)
-    violation: Array  # (P,), largest relative excess of the drive they come from; <= 0 is good
-    is_reached: Array  # () bool, whether a way of cells leads to the meeting in time
-    steps: Array  # () int32, of least squares, the most of any path
+    violation: Array  # (P,), largest relative excess of the refined drive; <= 0 keeps all limits
+    is_reached: Array  # () bool, whether a sequence of cells reaches the meeting point in time
+    steps: Array  # () int32, greatest number of least-squares steps of any path
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathSource:
-    """Finds paths; as many as an attempt has ways."""
+    """A source of paths; an attempt's `paths` is their number."""
 
     problem: MotionProblem = MotionProblem()
-    drawn: int = 8  # ways for every path, of which those that differ are refined
-    later: int = 10  # layers after the earliest arrival that ways arrive at, in turns
-    points: int = 129  # of a path
+    drawn: int = 8  # random paths per returned path; the most different ones are refined
+    later: int = 10  # arrival layers after the earliest one, over which random paths cycle
+    points: int = 129  # number of points of a path
 
     def paths(
         self, case: InterceptCase, attempt: Search, layers: Array | None = None
     ) -> StaticPaths:
-        """Find the paths of one case; see `search_reach` for the layers of a batch."""
-        still = standing(case)
+        """Find the paths of one case.
+
+        Args:
+            case: one case.
+            attempt: the search; its number of `paths` is returned.
+            layers: layers of the reach set, shared by a batch; see `search_reach`.
+        """
+        still = without_movers(case)
         found = search_reach(still, attempt, is_time_free=True, layers=layers)
         arrivals, is_reached = found.layers, found.is_reached
         first = jnp.argmax(arrivals)
@@ -63,7 +69,7 @@ class PathSource:
         layer = jnp.where(arrivals[layer], layer, first).astype(jnp.int32)
         noise = draw_noise(attempt.lattice, num, attempt.seed, 1)
         times, guesses = jax.vmap(lambda n, noise: self.guess(still, found, n, noise))(layer, noise)
-        chosen = self.different(still, times, guesses, attempt.paths)
+        chosen = self.select_different(still, times, guesses, attempt.paths)
 
         def path(start: tuple[Array, Guess]) -> tuple[Path, Array, Array]:
             time, guess = start
@@ -89,18 +95,21 @@ class PathSource:
     def guess(
         self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
-        """When a random way arrives that ends at a layer, and where least squares begin."""
+        """Return arrival time [s] and initial guess along a random path that ends at a layer."""
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step
         guess = self.problem.guess_along(dataclasses.replace(case, time=time), grid, path, layer)
         return time, guess
 
-    def different(self, case: InterceptCase, times: Array, guesses: Guess, num: int) -> Array:
-        """Places of some of D guesses, the shortest first, then those farthest from the rest.
+    def select_different(
+        self, case: InterceptCase, times: Array, guesses: Guess, num: int
+    ) -> Array:
+        """Return the indices of `num` of D guesses that differ most.
 
-        Ways are as far apart as their points at equal shares of their lengths are on average, and
-        farther apart than any others if they pass a wall on different sides.
+        The shortest comes first; each next guess is the one farthest from all selected guesses. The
+        distance of two paths is the mean distance of their points at equal fractions of their
+        lengths, plus a large constant if they pass a wall on different sides.
         """
         goal = case.target.at(case.time).pos
 
@@ -111,7 +120,7 @@ class PathSource:
             station = jnp.cumsum(jnp.maximum(0.5 * (speed[1:] + speed[:-1]), 1e-3) * step)
             at = jnp.linspace(0.0, 1.0, _SHARES + 1)[1:] * station[-1]
             points = jnp.stack([jnp.interp(at, station, pos[:, k]) for k in range(2)], axis=1)
-            turns = turns_around(case.walls, case.start[:2], pos, goal)
+            turns = count_turns(case.walls, case.start[:2], pos, goal)
             return points, turns, station[-1]
 
         points, turns, length = jax.vmap(way)(times, guesses)
@@ -128,11 +137,11 @@ class PathSource:
         return jnp.concatenate([first[None], others])
 
 
-def standing(case: InterceptCase) -> InterceptCase:
-    """The case without movers, of a target that stands where it will be met."""
+def without_movers(case: InterceptCase) -> InterceptCase:
+    """Return the case without movers, its target at rest at the meeting point."""
     goal = case.target.at(case.time).pos
     still = TurningPath(pos=goal, vel=jnp.zeros_like(goal), turn_rate=jnp.zeros_like(case.time))
-    # One that is absent, so that nothing is worked out for movers.
+    # One absent obstacle, so that movers cost no computation.
     none = Obstacles(
         centre=jnp.zeros((1, 2), goal.dtype),
         corners=jnp.zeros((1, 3, 2), goal.dtype),
@@ -142,13 +151,13 @@ def standing(case: InterceptCase) -> InterceptCase:
     return dataclasses.replace(case, target=still, movers=none)
 
 
-def turns_around(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Array:
-    """How many turns more than the straight line a way makes around every wall's middle, (N,).
+def count_turns(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Array:
+    """Count the turns of a path around every wall's centre, relative to the straight line, (N,).
 
     Args:
-        walls: N of them.
+        walls: N walls.
         start: (2,) [m].
-        pos: (M, 2) [m], of the way, close enough together not to jump past a wall's middle.
+        pos: (M, 2) [m], points of the path, close enough together not to jump past a wall's centre.
         goal: (2,) [m].
     """
     points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre

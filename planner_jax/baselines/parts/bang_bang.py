@@ -1,9 +1,9 @@
-"""Motions of joints that are only accelerated as hard as they may be, coast, and brake to rest.
+"""Bang-bang motions of joints: accelerate at the limit, coast, and brake to standstill.
 
-Each joint is a double integrator with a greatest rate v and a greatest acceleration a. The quickest
-way to turn by d from a rate u is to accelerate towards the goal, coast at v if that is reached, and
-brake. A joint that would arrive before the slowest one coasts more slowly, so that all arrive
-together: with a peak p and a duration T,
+Each joint is a double integrator with a velocity limit v and an acceleration limit a. The quickest
+motion by an angle d from an initial rate u accelerates towards the goal, coasts at v if v is
+reached, and brakes. A joint that would arrive before the slowest joint coasts more slowly, so that
+all joints arrive together. With the coasting rate p and the duration T,
 
     d = (u + p) |p - u| / 2a  +  p (T - |p - u| / a - p / a)  +  p^2 / 2a.
 """
@@ -16,35 +16,35 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 @struct.dataclass
-class _Mirrored:
-    """Joints mirrored so that each has to be braked from a rate >= 0."""
+class _MirroredJoints:
+    """Joints mirrored so that each brakes from a rate >= 0."""
 
     side: Array  # (J,), 1 or -1
     turn: Array  # (J,) [rad]
     rate: Array  # (J,) [rad/s]
 
 
-def _mirrored(turn: Array, rate: Array, acceleration: Array) -> _Mirrored:
+def _mirror(turn: Array, rate: Array, acceleration: Array) -> _MirroredJoints:
     stopping = 0.5 * rate * jnp.abs(rate) / acceleration
     side = jnp.where(turn >= stopping, 1.0, -1.0)
-    return _Mirrored(side=side, turn=side * turn, rate=side * rate)
+    return _MirroredJoints(side=side, turn=side * turn, rate=side * rate)
 
 
 def _root(square: Array) -> Array:
-    """Square root with a finite slope at zero, and zero below."""
+    """Return the square root with a finite slope at zero, and zero for negative arguments."""
     return jnp.where(square > 0.0, jnp.sqrt(jnp.where(square > 0.0, square, 1.0)), 0.0)
 
 
 def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) -> Array:
-    """The shortest time (J,) [s] in which each joint turns so far and stands.
+    """Return the shortest time (J,) [s] in which each joint turns by an angle and stops.
 
     Args:
         turn: (J,) [rad].
-        rate: (J,) [rad/s], at the start, no faster than the limit.
+        rate: (J,) [rad/s], at the start, within the limit.
         velocity: (J,) [rad/s], > 0, limit.
         acceleration: (J,) [rad/s^2], > 0, limit.
     """
-    joints = _mirrored(turn, rate, acceleration)
+    joints = _mirror(turn, rate, acceleration)
     peak = _root(acceleration * joints.turn + 0.5 * joints.rate**2)
     fast = jnp.minimum(peak, velocity)
     ramps = (fast**2 - 0.5 * joints.rate**2) / acceleration
@@ -55,21 +55,21 @@ def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) 
 def bang_bang(
     start: Array, rate: Array, turn: Array, duration: Array, acceleration: Array
 ) -> PiecewisePolynomial:
-    """The motion in which all joints arrive after the duration, and stand.
+    """Return the motion in which all joints arrive at the end of the duration and stop.
 
     Args:
         start: (J,) [rad].
         rate: (J,) [rad/s], at the start.
-        turn: (J,) [rad], how far each joint turns.
-        duration: () [s], no shorter than any of `least_times`; rates then keep their limits.
-        acceleration: (J,) [rad/s^2], > 0, what the joints accelerate and brake with.
+        turn: (J,) [rad], angle by which each joint turns.
+        duration: () [s], at least the greatest of `least_times`; rates then keep their limits.
+        acceleration: (J,) [rad/s^2], > 0, with which the joints accelerate and brake.
 
     Returns:
-        2 J + 1 pieces of degree 2, cut where a joint begins or ends to coast; some may last 0 s.
+        2 J + 1 pieces of degree 2, cut where a joint starts or ends coasting; some may last 0 s.
     """
-    joints = _mirrored(turn, rate, acceleration)
+    joints = _mirror(turn, rate, acceleration)
     u, d, a = joints.rate, joints.turn, acceleration
-    # Peaks above the rate at the start are a root of the quadratic above; others are linear in d.
+    # Peaks above the initial rate solve the quadratic above; other peaks are linear in d.
     b, c = a * duration + u, a * d + 0.5 * u**2
     above = 2.0 * c / jnp.maximum(b + _root(b**2 - 4.0 * c), 1e-9)
     below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)

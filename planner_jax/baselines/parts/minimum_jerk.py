@@ -1,4 +1,4 @@
-"""The minimum-jerk primitive between two full states ([Yu2023bat, eqs 15-17]; its ref. [9])."""
+"""Minimum-jerk primitives between two full states [Yu2023bat, eqs 15-17]."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -7,14 +7,15 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> PiecewisePolynomial:
-    """The quintic of least integral |jerk|^2 between two states.
+    """Return the quintic that minimises the integral of |jerk|^2 between two states.
 
-    [Yu2023bat, eqs 16-17]; the differences of eq. 17 must be taken from the coasting state,
-    Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2 and so on (the print holds only from hover).
+    [Yu2023bat, eqs 16-17]. The differences of eq. 17 are relative to the state after coasting,
+    Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2 and so on; the equation as printed holds only from
+    hover.
 
     Args:
         head_state: (3, 3) position, velocity, acceleration at the start.
-        tail_state: (3, 3) the same at the end.
+        tail_state: (3, 3) position, velocity, acceleration at the end.
         duration: () T [s], > 0.
 
     Returns:
@@ -32,24 +33,24 @@ def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> Piece
     return PiecewisePolynomial(coeffs=coeffs[None], durations=jnp.reshape(t, (1,)))
 
 
-def eased_minimum_jerk(
+def minimum_jerk_after_ramp(
     head_state: Array, tail_state: Array, duration: Array, ease: float
 ) -> PiecewisePolynomial:
-    """The minimum-jerk primitive, its first jerk reached by a ramp and not at once.
+    """Return a minimum-jerk primitive after a linear ramp to its initial jerk.
 
-    The primitive begins with a jerk that a hovering quadrotor does not have: its body rate
-    would jump. Here the jerk first runs in a straight line from its value at the head to the
-    one that the primitive begins with, which starts from where the ramp has led. That jerk J
-    is the root of J = first jerk of the primitive after a ramp to J, affine in J.
+    The primitive starts with a jerk that a hovering quadrotor does not have, so that its body rate
+    would jump. Here the jerk first changes linearly from its value at the head to the initial jerk
+    J of the primitive, which starts where the ramp ends. J solves J = (initial jerk of the
+    primitive after a ramp to J), which is affine in J.
 
     Args:
         head_state: (4, 3), jerk included.
         tail_state: (3, 3) position, velocity, acceleration.
         duration: () [s] > 0, of ramp and primitive together.
-        ease: [s] > 0, of the ramp, but at most half of `duration`.
+        ease: [s] > 0, of the ramp; half of `duration` if that is less.
 
     Returns:
-        Two pieces of degree 5 that join up to the jerk.
+        Two pieces of degree 5 with continuous jerk.
     """
     t = jnp.minimum(ease, 0.5 * duration)
     p0, v0, a0, j0 = head_state
@@ -68,7 +69,7 @@ def eased_minimum_jerk(
         return 6.0 * primitive(jerk).coeffs[0, 3]
 
     constant = first_jerk(jnp.zeros_like(j0))
-    # By differences this would be lost in rounding: the two are a thousand times as large.
+    # Finite differences would lose the slope in rounding: both jerks are a thousand times as large.
     share = t / (duration - t)
     slope = -share * (4.5 + share * (6.0 + 2.5 * share))
     jerk = constant / (1.0 - slope)

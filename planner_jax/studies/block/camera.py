@@ -1,8 +1,8 @@
-"""A pinhole camera: from points of the world to pixels with depths, and back.
+"""A pinhole camera: from world points to pixels with depths, and back.
 
-A pixel is (column, row), and whole numbers are the middles of pixels. The camera's own axes are x
-to the right and y down in the image, and z ahead. Depth is measured along z, as depth images have
-it, not along the ray. Points and pixels may have any leading axes.
+A pixel is (column, row), and whole numbers are the centres of pixels. The camera's axes are x to
+the right and y down in the image, and z forward. Depth is measured along z, as in depth images, not
+along the ray. Points and pixels may have any leading axes.
 """
 
 import functools
@@ -22,7 +22,7 @@ Kind = TypeVar("Kind")
 
 @struct.dataclass
 class Camera:
-    """Where a camera is, where it looks and how large its image is."""
+    """Position, orientation, focal length and image size of a camera."""
 
     rotation: Array  # (3, 3), its columns are the camera's axes in the world frame
     position: Array  # (3,) [m], world frame
@@ -31,7 +31,7 @@ class Camera:
 
     @property
     def centre(self) -> Array:
-        """Where the optical axis meets the image (2,) [px]."""
+        """The pixel (2,) [px] of the optical axis."""
         return jnp.asarray(0.5 * (np.array(self.size) - 1.0), jnp.result_type(self.focal))
 
 
@@ -43,16 +43,16 @@ def from_numbers(kind: Callable[..., Kind], **leaves: ArrayLike) -> Kind:
 def looking_at(
     position: ArrayLike, target: ArrayLike, *, size: tuple[int, int], field_of_view: float
 ) -> Camera:
-    """Make a camera that looks at a target, its image level; NumPy float32 leaves.
+    """Create a camera that points at a target, with a level image; NumPy float32 leaves.
 
     Args:
         position: (3,) [m].
-        target: (3,) [m], neither above nor below.
+        target: (3,) [m], neither above nor below the camera.
         size: columns and rows of the image.
         field_of_view: [rad], of the image's width, between 0 and pi.
 
     Raises:
-        ValueError: an argument is out of its range; one line.
+        ArgumentError: an argument is out of its range.
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     ahead = target - position
@@ -71,47 +71,41 @@ def looking_at(
     return from_numbers(pinhole, rotation=rotation, position=position, focal=focal)
 
 
-def placed(camera: Camera, pose: np.ndarray) -> Camera:
-    """Move a camera to a pose (4, 4), such as one that calibration found."""
-    own = functools.partial(Camera, focal=camera.focal, size=camera.size)
-    return from_numbers(own, rotation=pose[:3, :3], position=pose[:3, 3])
-
-
 def to_camera(camera: Camera, points: Array) -> Array:
-    """Points (..., 3) [m] of the world along the camera's axes."""
+    """Convert points (..., 3) [m] from the world frame to the camera frame."""
     away = points - camera.position
     return jnp.matmul(away, jnp.asarray(camera.rotation), precision=lax.Precision.HIGHEST)
 
 
 def to_world(camera: Camera, points: Array) -> Array:
-    """Points (..., 3) [m] along the camera's axes in the world frame."""
+    """Convert points (..., 3) [m] from the camera frame to the world frame."""
     rotation = jnp.asarray(camera.rotation)
     return camera.position + jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST)
 
 
 def project(camera: Camera, points: Array) -> tuple[Array, Array]:
-    """Where points (..., 3) [m] of the world are seen.
+    """Project world points (..., 3) [m] into the image.
 
     Returns:
-        pixels: (..., 2) [px], within the image or not; of a point that is not ahead of the camera,
-            any finite numbers.
+        pixels: (..., 2) [px], inside or outside the image; arbitrary finite numbers for points that
+            are not in front of the camera.
         depths: (...) [m], negative behind the camera.
     """
-    own = to_camera(camera, points)
-    depths = own[..., 2]
+    point_in_camera = to_camera(camera, points)
+    depths = point_in_camera[..., 2]
     safe = jnp.where(depths > 1e-6, depths, 1.0)
-    return camera.centre + camera.focal * own[..., :2] / safe[..., None], depths
+    return camera.centre + camera.focal * point_in_camera[..., :2] / safe[..., None], depths
 
 
 def back_project(camera: Camera, pixels: Array, depths: Array) -> Array:
-    """The points (..., 3) [m] of the world that are seen at pixels (..., 2) in depths (...) [m]."""
+    """Return the world points (..., 3) [m] at pixels (..., 2) with depths (...) [m]."""
     across = (pixels - camera.centre) / camera.focal
     ray = jnp.concatenate([across, jnp.ones_like(across[..., :1])], axis=-1)
     return to_world(camera, ray * depths[..., None])
 
 
 def in_view(camera: Camera, points: Array) -> Array:
-    """Which points (..., 3) [m] of the world lie ahead of the camera and within its image."""
+    """Return whether world points (..., 3) [m] are in front of the camera and in its image."""
     pixels, depths = project(camera, points)
     inside = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
     return (depths > 1e-6) & jnp.all(inside, axis=-1)

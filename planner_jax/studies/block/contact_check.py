@@ -1,8 +1,8 @@
-"""Contacts of plans with a ball that differs a little from the ball they were planned for.
+"""Contacts of plans with a ball that differs a little from the planned ball.
 
-A plan names the time at which its ball is met. The true ball comes to the shield a little earlier
-or later, and a little beside. `end_at_contact` names the true time instead, so that the referee
-judges the true contact. Robot base frame, z up, SI units.
+A plan contains the time of its contact. The true ball arrives at the shield a little earlier or
+later, and at a slightly different point. `end_at_contact` computes the true time, so that the
+referee judges the true contact. Robot base frame, z up, SI units.
 """
 
 import dataclasses
@@ -21,37 +21,38 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _SAMPLES = 256  # times at which ball and shield are compared
-_HALVINGS = 24  # of the time between two of them
+_HALVINGS = 24  # bisections between two of these times
 
 
 def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
     """Return the motions up to their contacts with the balls of these cases.
 
-    An arm that need not stand at the contact brakes evenly after its motion, as fast as its limits
-    allow; the ball meets it while it brakes, or standing. Where a ball crosses the shield's plane
-    several times, the crossing nearest to the shield's middle counts. A plan whose ball never
-    crosses the plane is returned unchanged, and the referee rejects it.
+    An arm that need not be at rest at the contact brakes after its motion with constant
+    deceleration, as fast as its limits allow; the contact may happen while it brakes or after it
+    has stopped. If a ball crosses the shield's plane several times, the crossing nearest to the
+    shield's centre is the contact. A plan whose ball never crosses the plane is returned unchanged,
+    and the referee rejects it.
 
     Args:
         cases: a batch of B, with the true balls, and the delays of the plans.
         plans: plans of these cases for other balls; polynomials of degree 2 or more.
 
     Returns:
-        Plans with one piece more, of no length if the contact comes before.
+        Plans with one more piece, of zero duration if the contact comes before it.
     """
     return _end_each_at_contact(cases, plans)
 
 
 def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockPlan:
-    """Return the motions begun later, up to their contacts as `end_at_contact` finds them.
+    """Return the motions with a later start, up to their contacts by `end_at_contact`.
 
     Args:
-        cases: a batch of B, of arms that stand.
+        cases: a batch of B, of arms at rest.
         plans: plans of these cases.
         late: (B,) [s], delays, >= 0. A plan with a delay of 0 keeps its motion and its contact.
 
     Returns:
-        Plans with two pieces more.
+        Plans with two more pieces.
     """
     return _delay_each(cases, plans, late)
 
@@ -78,7 +79,7 @@ def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
     motion = append_braking(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:
-        """Return the ball's height () [m] over the shield's plane, and its squared distance."""
+        """Return the ball's height () [m] above the shield's plane and its squared distance."""
         ends = jnp.sum(motion.durations)
         angles = evaluate(motion, jnp.clip(time - case.delay, 0.0, ends))
         rotation, middle = shield_pose(case.arm, angles)
@@ -106,9 +107,9 @@ _end_each_at_contact = jax.jit(jax.vmap(_find_contact))
 
 
 def _cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Cut a motion at a time () [s] since its start; a motion that ends before stays whole.
+    """Cut a motion at a time () [s] after its start; a motion that ends earlier stays complete.
 
-    Pieces that begin later last 0 s, and start from where the motion is cut.
+    Later pieces get a duration of 0 s and start at the state of the cut.
     """
     starts = jnp.cumsum(motion.durations) - motion.durations
     last = jnp.minimum(time, jnp.sum(motion.durations))

@@ -1,13 +1,13 @@
-"""The flight of a ball by least squares through where it was seen [Natarajan2024, eqs 5 to 8].
+"""Least-squares fit of a ball's flight to its observations [Natarajan2024, eqs 5 to 8].
 
-Without drag a flight is linear in where the ball is and how fast at any one time, once the known
-fall is taken off: the least squares are six linear equations. They are set up around the
-observations' own middle and scale, and solved twice, the second time for what the first left, so
-that float32 does where depths are a hundred times less certain than what lies across. World frame,
-z up, SI units, one ball; `jax.vmap` makes many.
+After the known fall is subtracted, a drag-free flight is linear in the ball's position and velocity
+at any one time: the least squares are six linear equations. The equations are centred and scaled by
+the observations' own mean and spread, and solved twice, the second time for the residuals of the
+first solution. This makes float32 sufficient even if depths are a hundred times less certain than
+the other coordinates. World frame, z up, SI units, one ball; use `jax.vmap` for a batch.
 
-Nothing has to be kept from one fit to the next: all that was seen so far, as one buffer with NaN
-for what is still to come, is fitted anew in constant time.
+Nothing is stored between fits. Every fit uses all observations so far, in one buffer with NaN for
+later observations, and takes constant time.
 """
 
 import enum
@@ -22,7 +22,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 
 
 class Sight(enum.IntEnum):
-    """What became of looking for one ball."""
+    """The outcome of observing one ball."""
 
     SEEN = 0
     NEVER_SEEN = 1
@@ -36,19 +36,19 @@ class Sight(enum.IntEnum):
 
 _MESSAGES = {
     Sight.SEEN: "seen often enough for a flight",
-    Sight.NEVER_SEEN: "the camera never sees the ball; check where it looks, and the ball's colour",
-    Sight.SEEN_ONCE: "seen at one time only, which tells no velocity; look for longer",
+    Sight.NEVER_SEEN: "the camera never sees the ball; check its direction, and the ball's colour",
+    Sight.SEEN_ONCE: "seen at one time only, which gives no velocity; observe for longer",
 }
 
 
 @struct.dataclass
 class FlightFit:
-    """A flight, and how well it is known; NaN where the ball was not seen at two times."""
+    """A fitted flight and its uncertainty; NaN if the ball was not seen at two times."""
 
     belief: EkfState  # about position and velocity at `time`
     time: Array  # () [s], weighted middle of the observations
-    misfit: Array  # () root mean square of what they are off, in standard deviations; 1 as believed
-    num: Array  # () int32, observations that were fitted
+    misfit: Array  # () root mean square residual in standard deviations; 1 is expected
+    num: Array  # () int32, number of fitted observations
     status: Array  # () int32, a `Sight`
 
     @property
@@ -58,24 +58,25 @@ class FlightFit:
 
 
 def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Array) -> FlightFit:
-    """The free flight of least squares through observations; pure, so jit and vmap it.
+    """Return the least-squares free flight through observations; pure, so jit and vmap it.
 
     Minimises  sum_k e_k' W_k e_k,  e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights
-    this is [Natarajan2024, eq. 8]. The covariance is that of the estimate if every W_k is the
-    inverse of its observation's.
+    this is [Natarajan2024, eq. 8]. The covariance is correct if every W_k is the inverse covariance
+    of its observation.
 
     Args:
-        times: (N,) [s], in no order.
-        places: (N, 3) x_k [m]. One that is not finite counts as absent, so that shapes stay fixed.
-        information: W_k [1/m^2], (N, 3, 3); or (N,) or () where the noise is as large in every
-            direction. One of zero is absent too.
+        times: (N,) [s], in any order.
+        places: (N, 3) x_k [m]. A position that is not finite counts as absent, so that shapes stay
+            fixed.
+        information: W_k [1/m^2], (N, 3, 3); or (N,) or () for isotropic noise. An observation with
+            zero information is absent too.
         gravity: () [m/s^2], magnitude.
     """
     dtype = places.dtype
     weights = jnp.asarray(information, dtype)
     if weights.ndim < 3:
-        alike = jnp.broadcast_to(weights, times.shape)
-        weights = alike[:, None, None] * jnp.eye(3, dtype=dtype)
+        isotropic = jnp.broadcast_to(weights, times.shape)
+        weights = isotropic[:, None, None] * jnp.eye(3, dtype=dtype)
     trace = jnp.trace(weights, axis1=1, axis2=2)
     present = jnp.isfinite(times) & jnp.all(jnp.isfinite(places), axis=1) & (trace > 0.0)
     present = present & jnp.isfinite(trace)
@@ -104,24 +105,27 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
             ],
         ]
     )
-    # A lane without a flight solves something harmless.
+    # Without a flight the identity is solved instead.
     normal = jnp.where(enough, normal, jnp.eye(6, dtype=dtype))
 
-    def left(unknowns: Array) -> Array:
-        """What the observations are off a flight, (N, 3) [m]."""
+    def residuals(unknowns: Array) -> Array:
+        """Return the residuals of the observations, (N, 3) [m]."""
         return seen - unknowns[:3] - steps[:, None] * unknowns[3:]
 
-    def better(unknowns: Array) -> Array:
-        pull = jnp.einsum("nij,nj->ni", weights, left(unknowns), precision=lax.Precision.HIGHEST)
+    def refine(unknowns: Array) -> Array:
+        """Return the solution after one step of iterative refinement."""
+        pull = jnp.einsum(
+            "nij,nj->ni", weights, residuals(unknowns), precision=lax.Precision.HIGHEST
+        )
         slope = jnp.concatenate([jnp.sum(pull, axis=0), jnp.sum(steps[:, None] * pull, axis=0)])
         return unknowns + solve_definite(normal, slope[:, None])[:, 0]
 
-    unknowns = better(better(jnp.zeros(6, dtype)))
+    unknowns = refine(refine(jnp.zeros(6, dtype)))
     inverse = solve_definite(normal, jnp.eye(6, dtype=dtype))
     units = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, 1.0, dtype) / scale])
     mean = units * unknowns + jnp.concatenate([centre, jnp.zeros(3, dtype)])
     covariance = 0.5 * units[:, None] * (inverse + inverse.T) * units
-    off = left(unknowns)
+    off = residuals(unknowns)
     squares = jnp.einsum("ni,nij,nj->", off, weights, off, precision=lax.Precision.HIGHEST)
     free = jnp.maximum(3 * num - 6, 1)
     unseen = jnp.where(num == 0, Sight.NEVER_SEEN, Sight.SEEN_ONCE)
@@ -137,8 +141,8 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     )
 
 
-def believed_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
-    """The belief about the ball at a time () [s], before or after it was seen."""
+def belief_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
+    """Return the estimate of the ball at a time () [s], before or after its observations."""
     ahead = jnp.asarray(time, fit.time.dtype) - fit.time
     ball = drag_free_flight(fit.ball, ahead, gravity)
     P = fit.belief.covariance
@@ -152,10 +156,10 @@ def believed_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
 
 
 def across_std(belief: EkfState) -> Array:
-    """Root mean square () [m] of how far the ball passes from where it is believed to.
+    """Return the standard deviation () [m] of the ball's position normal to its estimated velocity.
 
-    That is the error of the position across the believed velocity; what lies along it is an error
-    of time only.
+    It is the root of the summed variances of both normal directions. An error along the velocity is
+    only an error in time.
     """
     place, vel = belief.covariance[:3, :3], belief.mean[3:]
     along = jnp.einsum("i,ij,j->", vel, place, vel, precision=lax.Precision.HIGHEST)
@@ -164,10 +168,14 @@ def across_std(belief: EkfState) -> Array:
 
 
 def error_across(belief: EkfState, ball: BallState) -> Array:
-    """How far () [m] a ball at the believed time passes from where it is believed to.
+    """Return the distance () [m] of the estimate from the true ball, normal to the ball's velocity.
 
-    It is the part of the position's error across the ball's own velocity, to first order in the
-    error the distance at which it meets a shield that waits for it straight on.
+    To first order in the error, it is the distance between expected and true contact on a shield
+    that faces the ball.
+
+    Args:
+        belief: estimate at some time.
+        ball: true ball at that time.
     """
     off = belief.mean[:3] - ball.pos
     along = jnp.sum(off * ball.vel) / jnp.maximum(jnp.sum(ball.vel**2), 1e-12)
@@ -175,7 +183,7 @@ def error_across(belief: EkfState, ball: BallState) -> Array:
 
 
 def _root(square: Array) -> Array:
-    """The root () of what is a square but for rounding; of slope zero at zero."""
+    """Return the square root () of a square; zero with slope zero if rounding makes it negative."""
     there = square > 0.0
-    # NaN, of a ball that was not seen, stays NaN.
+    # NaN, for a ball that was not seen, stays NaN.
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0 * square)

@@ -1,9 +1,9 @@
-"""How well a camera sees a ball, frame by frame.
+"""Measurement noise of a camera that observes a ball.
 
-A stereo camera measures the disparity  d = f b / z  of two images a baseline b apart. An error of
-the disparity is one of the depth z of  z^2 / (f b)  times as much, so the noise of depth grows with
-the square of the distance, whereas that across the ray grows with the distance itself. Round noise,
-as large in every direction and at every distance, stands beside it for comparisons.
+A stereo camera measures the disparity  d = f b / z  of two images with a baseline b. An error of
+the disparity causes an error of the depth z that is  z^2 / (f b)  times as large. The depth noise
+thus grows with the square of the distance, and the noise normal to the ray grows linearly.
+Isotropic noise, equal in all directions and at all distances, serves for comparisons.
 """
 
 import jax
@@ -24,24 +24,24 @@ from planner_jax.studies.block.camera import (
 
 @struct.dataclass
 class StereoNoise:
-    """Errors of a stereo camera; those of one frame do not depend on those of another."""
+    """Errors of a stereo camera, independent between frames."""
 
     baseline: Array  # () [m]
-    pixel_std: Array  # () [px], of the ball's middle in the image, each way
-    disparity_std: Array  # () [px], of the ball's disparity as a whole
-    speckle_std: Array  # () [px], of the disparity of one pixel, beside that
+    pixel_std: Array  # () [px], of the ball's centre in the image, in each direction
+    disparity_std: Array  # () [px], of the ball's mean disparity
+    speckle_std: Array  # () [px], of one pixel's disparity, in addition to `disparity_std`
     dropout: Array  # () probability that a pixel, or in `sightings` a frame, has no depth
-    mismatch: Array  # () probability that a pixel has the depth of something else
+    mismatch: Array  # () probability that a pixel has the depth of another object
 
 
 @struct.dataclass
-class RoundNoise:
-    """Errors that are alike in every direction; those of frames do not depend on each other."""
+class IsotropicNoise:
+    """Isotropic errors, independent between frames."""
 
     std: Array  # () [m], of each coordinate
 
 
-Noise = StereoNoise | RoundNoise
+Noise = StereoNoise | IsotropicNoise
 
 
 def stereo_noise(
@@ -53,14 +53,14 @@ def stereo_noise(
     dropout: float = 0.05,
     mismatch: float = 0.05,
 ) -> StereoNoise:
-    """Errors of a stereo camera as NumPy float32 leaves.
+    """Create the errors of a stereo camera as NumPy float32 leaves.
 
-    The baseline of 0.12 m is that of the ZED 2i with which [Natarajan2024] sees, by its maker's
-    documentation. A fifth of a pixel is the usual estimate for the matching of one pixel; that
-    half of it is left in the mean over a ball, and the other numbers, are assumptions.
+    The baseline of 0.12 m is the one of the ZED 2i, the camera of [Natarajan2024], by its maker's
+    documentation. A fifth of a pixel is a usual estimate for the matching error of one pixel. Half
+    of it is assumed to remain in the mean over a ball; the other numbers are assumptions too.
 
     Raises:
-        ValueError: a number is out of its range; one line.
+        ArgumentError: a number is out of its range.
     """
     given = locals()
     for name, value in given.items():
@@ -75,29 +75,28 @@ def stereo_noise(
 
 
 def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
-    """Standard deviations (...) [m] of a ball's depths (...) [m], to first order."""
+    """Return the standard deviations (...) [m] of a ball's depths (...) [m], to first order."""
     return depths**2 * noise.disparity_std / (camera.focal * noise.baseline)
 
 
 def information(camera: Camera, noise: Noise, points: Array) -> Array:
-    """Inverses (..., 3, 3) [1/m^2] of the covariance with which balls at (..., 3) [m] are seen.
+    """Return the inverse covariances (..., 3, 3) [1/m^2] of observed balls at points (..., 3) [m].
 
-    The error of a stereo camera is that of the pixel along the image, and that of the depth along
-    the ray. World frame; to first order in the errors. Places where balls were seen serve as well
-    as those where they were.
+    A stereo camera has a pixel error along the image and a depth error along the ray. World frame;
+    to first order in the errors. Observed positions may replace the true ones.
     """
-    if isinstance(noise, RoundNoise):
-        alike = jnp.eye(3, dtype=points.dtype) / noise.std**2
-        return jnp.broadcast_to(alike, (*points.shape[:-1], 3, 3))
-    own = to_camera(camera, points)
-    depth = jnp.maximum(own[..., 2], 1e-3)
+    if isinstance(noise, IsotropicNoise):
+        isotropic = jnp.eye(3, dtype=points.dtype) / noise.std**2
+        return jnp.broadcast_to(isotropic, (*points.shape[:-1], 3, 3))
+    point_in_camera = to_camera(camera, points)
+    depth = jnp.maximum(point_in_camera[..., 2], 1e-3)
     sharp = camera.focal / (depth * noise.pixel_std)
     blurred = 1.0 / depth_std(camera, noise, depth)
     none = jnp.zeros_like(depth)
-    # Rows that make the error along the camera's axes one of independent unit deviations.
+    # Rows that whiten the error in the camera frame.
     rows = [
-        jnp.stack([sharp, none, -sharp * own[..., 0] / depth], axis=-1),
-        jnp.stack([none, sharp, -sharp * own[..., 1] / depth], axis=-1),
+        jnp.stack([sharp, none, -sharp * point_in_camera[..., 0] / depth], axis=-1),
+        jnp.stack([none, sharp, -sharp * point_in_camera[..., 1] / depth], axis=-1),
         jnp.stack([none, none, blurred], axis=-1),
     ]
     rotation = jnp.asarray(camera.rotation)
@@ -106,16 +105,16 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
 
 
 def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
-    """Where balls at (N, 3) [m] are seen, a frame each; NaN where they are not.
+    """Return observed positions of balls at points (N, 3) [m], one per frame.
 
-    This is what `sims.segment.sighting` makes of images, without the images. A ball outside the
-    image is not seen, but nothing stands in its way either. A stereo camera's pixels and
-    disparities have Gaussian errors, and frames are lost.
+    This simulates the result of `sims.segment.sighting` without images. A ball outside the image is
+    not seen; occlusion is ignored. A stereo camera's pixels and disparities have Gaussian errors,
+    and some frames are lost.
 
     Returns:
-        (N, 3) [m], world frame.
+        (N, 3) [m], world frame; NaN if the ball is not seen.
     """
-    if isinstance(noise, RoundNoise):
+    if isinstance(noise, IsotropicNoise):
         seen = points + noise.std * jax.random.normal(key, points.shape, points.dtype)
         return jnp.where(in_view(camera, points)[:, None], seen, jnp.nan)
     to_pixel, to_disparity, to_loss = jax.random.split(key, 3)
@@ -125,7 +124,7 @@ def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
     scale = camera.focal * noise.baseline
     error = noise.disparity_std * jax.random.normal(to_disparity, depths.shape, dtype)
     disparity = scale / jnp.where(depths > 1e-6, depths, 1.0) + error
-    there = in_view(camera, points) & (disparity > 0.0)
+    is_valid = in_view(camera, points) & (disparity > 0.0)
     lost = jax.random.uniform(to_loss, depths.shape, dtype) < noise.dropout
-    seen = back_project(camera, pixels, scale / jnp.where(there, disparity, 1.0))
-    return jnp.where((there & ~lost)[:, None], seen, jnp.nan)
+    seen = back_project(camera, pixels, scale / jnp.where(is_valid, disparity, 1.0))
+    return jnp.where((is_valid & ~lost)[:, None], seen, jnp.nan)

@@ -1,8 +1,8 @@
-"""Throws as a camera sees them: what a planner knows of the ball, and from when on.
+"""Camera observations of throws, and the cases that planners get from them.
 
-A ball is seen first at a case's time 0, then in every frame. What was seen until some moment is
-fitted, and a case with the fitted ball is what a planner gets; the referee has the true one. Robot
-base frame, z up, SI units.
+A ball is first seen at a case's time 0, then in every frame. The observations until some moment are
+fitted. Planners get a case with the fitted ball, the referee gets the true ball. Robot base frame,
+z up, SI units.
 """
 
 import dataclasses
@@ -20,11 +20,17 @@ from planner_jax.studies.block.camera import Camera, looking_at
 from planner_jax.studies.block.flight_fit import (
     FlightFit,
     across_std,
-    believed_at,
+    belief_at,
     error_across,
     fit_flight,
 )
-from planner_jax.studies.block.noise import Noise, RoundNoise, information, sightings, stereo_noise
+from planner_jax.studies.block.noise import (
+    IsotropicNoise,
+    Noise,
+    information,
+    sightings,
+    stereo_noise,
+)
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.scene import RIG_HALF, Box
@@ -32,7 +38,7 @@ from planner_jax.task.block.scene import RIG_HALF, Box
 
 @struct.dataclass
 class Eye:
-    """A camera in the scene, and how well it sees."""
+    """A camera in the scene, its noise and its frame rate."""
 
     camera: Camera
     noise: Noise
@@ -43,9 +49,9 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
     """Return a camera 1.6 m above the base, on a mast on the rig's beam behind the arm.
 
     [Natarajan2024] mounts its camera on the rig's beams, its authors' model in front of the arm,
-    where 110 degrees do not take in what is thrown from 60 degrees on either side. From here a
-    width of 120 degrees sees the throws of the suites until shortly before the outer box, over the
-    arm and, 0.3 m to the left, aslant past the pole. Place and width are assumptions.
+    from where 110 degrees do not cover throws from 60 degrees to either side. From the mast 120
+    degrees cover the throws of the suites until shortly before the outer box, over the arm and, 0.3
+    m to the left, past the pole. Position and field of view are assumptions.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])
@@ -57,11 +63,11 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
 
     Args:
         rate: [Hz], of frames.
-        std: [m], of each coordinate instead: round noise.
+        std: [m], standard deviation of each coordinate, for isotropic noise instead.
         camera: in the scene.
 
     Raises:
-        ValueError: a number is not positive; one line.
+        ArgumentError: a number is not positive.
     """
     if not rate > 0.0:
         raise ArgumentError("rate", "> 0", rate)
@@ -69,28 +75,29 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
         raise ArgumentError("std", "> 0", std)
     return Eye(
         camera=mast_camera() if camera is None else camera,
-        noise=stereo_noise() if std is None else RoundNoise(std=host_leaf(std, np.float32)),
+        noise=stereo_noise() if std is None else IsotropicNoise(std=host_leaf(std, np.float32)),
         rate=rate,
     )
 
 
 def frame_times(eye: Eye, seconds: float) -> np.ndarray:
-    """Return times (N,) [s] of the frames until a moment [s], the first at 0."""
-    # A frame at that very moment counts, whatever its time rounds to.
+    """Return the times (N,) [s] of the frames until a moment [s], the first at 0."""
+    # A frame at the moment itself counts despite rounding.
     return np.arange(int(np.floor(seconds * eye.rate + 1e-6)) + 1) / eye.rate
 
 
-def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
-    """Return where the balls of a batch of cases are seen at times (N,) [s]; pure.
+@jax.jit
+def watch(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
+    """Return the observed positions of a batch of balls at times (N,) [s]; pure.
 
     Args:
         cases: a batch of B, with the true balls.
-        eye: that sees them.
+        eye: the camera.
         times: (N,) [s], of frames.
-        key: of the noise, or (B,) of them.
+        key: of the noise, or one key per case, (B,).
 
     Returns:
-        (B, N, 3) [m]; NaN where a ball is not seen.
+        (B, N, 3) [m]; NaN if a ball is not seen.
     """
 
     def one(ball: BallState, gravity: Array, key: Array) -> Array:
@@ -101,23 +108,33 @@ def watched(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
     return jax.vmap(one)(cases.ball, cases.gravity, keys)
 
 
-def fitted(eye: Eye, times: Array, places: Array, gravity: Array, until: Array) -> FlightFit:
-    """Return the flight of one ball from where it was seen until a moment; pure.
+def fit_until(eye: Eye, times: Array, places: Array, gravity: Array, until: Array) -> FlightFit:
+    """Fit the flight of one ball to its observations until a moment; pure.
 
     Args:
-        eye: that saw it.
+        eye: the camera of the observations.
         times: (N,) [s].
         places: (N, 3) [m].
         gravity: () [m/s^2], magnitude.
-        until: () [s]; what was seen later does not count.
+        until: () [s]; later observations are ignored.
     """
     known = jnp.where((times <= until + 1e-4)[:, None], places, jnp.nan)
     return fit_flight(times, known, information(eye.camera, eye.noise, known), gravity)
 
 
+@jax.jit
+def fit_throws(
+    cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array
+) -> tuple[BallState, FlightFit]:
+    """Return balls at time 0 and fits of a batch, from the observations until a moment."""
+    fits = jax.vmap(fit_until, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
+    start = jnp.zeros((), times.dtype)
+    return jax.vmap(belief_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
+
+
 @struct.dataclass
 class SeenThrows:
-    """A batch of throws as they are known at some moment."""
+    """A batch of throws as estimated at some moment."""
 
     cases: BlockCase  # with the fitted balls; planners get them
     fits: FlightFit  # leaves (B, ...)
@@ -126,27 +143,29 @@ class SeenThrows:
 def see(
     cases: BlockCase, eye: Eye, seconds: float, *, seed: int = 0, overhead: float = 0.0
 ) -> SeenThrows:
-    """Return a batch of throws after some seconds of flight were seen.
+    """Return a batch of throws as estimated after some seconds of flight.
 
-    Plan with the returned cases, made `cautious`. To judge the plans, give the true cases the delay
-    of the returned ones, and pass both through `studies.block.contact_check.end_at_contact`. A ball
-    that was seen at fewer than two times is NaN, and `fits.status` gives the reason.
+    Plan with the returned cases, made `cautious`. To judge the plans, set the delay of the true
+    cases to the returned delay, and pass cases and plans through
+    `studies.block.contact_check.end_at_contact`. A ball that was seen at fewer than two times is
+    NaN, and `fits.status` gives the reason.
 
     Args:
         cases: a batch of B, with the true balls.
-        eye: that sees them.
+        eye: the camera.
         seconds: [s], from a case's time 0 until the fit, >= 0.
         seed: of the noise.
-        overhead: [s], until the arm may start from then on, >= 0.
+        overhead: [s], from the fit until the arm may start, >= 0.
 
     Raises:
-        ValueError: a time is negative; one line.
+        ArgumentError: a time is negative.
     """
     for name, value in (("seconds", seconds), ("overhead", overhead)):
         if not value >= 0.0:
             raise ArgumentError(name, ">= 0", value)
     times = jnp.asarray(frame_times(eye, seconds), cases.gravity.dtype)
-    balls, fits = _seen(cases, eye, times, jax.random.key(seed))
+    places = watch(cases, eye, times, jax.random.key(seed))
+    balls, fits = fit_throws(cases, eye, times, places, times[-1])
     delay = jnp.full_like(cases.delay, seconds + overhead)
     return SeenThrows(cases=dataclasses.replace(cases, ball=balls, delay=delay), fits=fits)
 
@@ -159,21 +178,21 @@ def cautious(
     edge: float = 0.0,
     at_rest: bool = False,
 ) -> BlockCase:
-    """Return a batch of seen cases as a planner should get it, which takes the ball at its word.
+    """Return a batch of observed cases with reserves for the error of the fit, for a planner.
 
-    The ball is to be met near the shield's middle, so that the rest of the shield is left for the
-    error of the fit. One that is believed to pass the protected box by may well come into it: for
-    it, the box that a planner sees is larger.
+    A planner takes the fitted ball as exact. Contact near the shield's centre leaves the rest of
+    the shield for the error of the fit. A ball that is estimated to miss the protected box may
+    still hit it: for such a ball the box is enlarged.
 
     Args:
         cases: a batch with fitted balls.
-        offset: [m], greatest distance of the ball from the shield's middle, where the case allows
-            more.
-        grow: [m], by how much that box is larger on its sides and at its top.
-        edge: [m], kept from both ends of the ball's way between the boxes, since it is not where
-            it is believed to be along its way either.
-        at_rest: whether the arm must stand when it meets the ball, whatever the case says: then it
-            does not matter if the ball is late.
+        offset: [m], greatest distance of the contact from the shield's centre, unless the case has
+            less.
+        grow: [m], enlargement of that box on its sides and at its top.
+        edge: [m], distance from both ends of the ball's trajectory between the boxes, a reserve for
+            the error along the trajectory.
+        at_rest: whether the arm must be at rest at the contact even if the case does not require
+            it; then a late ball is blocked too.
     """
     inner, outer = cases.scene.inner, cases.scene.outer
     passes = ~jax.jit(jax.vmap(flight_of))(cases).comes
@@ -191,26 +210,18 @@ def cautious(
 
 @jax.jit
 def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
-    """Return errors of fits across the flight midway between the boxes, for the true balls.
+    """Return errors of fits normal to the flight, midway between the boxes of the true balls.
 
     Returns:
         error: (B,) [m].
-        std: (B,) [m], what they are believed to be.
+        std: (B,) [m], their estimated standard deviations.
     """
 
     def one(case: BlockCase, fit: FlightFit) -> tuple[Array, Array]:
         flight = flight_of(case)
         middle = 0.5 * (flight.earliest + flight.latest)
-        belief = believed_at(fit, middle, case.gravity)
+        belief = belief_at(fit, middle, case.gravity)
         truth = drag_free_flight(case.ball, middle, case.gravity)
         return error_across(belief, truth), across_std(belief)
 
     return jax.vmap(one)(cases, fits)
-
-
-@jax.jit
-def _seen(cases: BlockCase, eye: Eye, times: Array, key: Array) -> tuple[BallState, FlightFit]:
-    places = watched(cases, eye, times, key)
-    fits = jax.vmap(fitted, (None, None, 0, 0, None))(eye, times, places, cases.gravity, times[-1])
-    beliefs = jax.vmap(believed_at, (0, None, 0))(fits, jnp.zeros_like(times[0]), cases.gravity)
-    return beliefs.ball, fits

@@ -1,11 +1,11 @@
-"""Receding horizon: the motion is decided anew while more of the ball's flight is seen.
+"""Receding horizon: the motion is decided again as more of the ball's flight is observed.
 
-At given moments all that was seen so far is fitted anew. A motion that would still meet the ball of
-the new fit near where it was aimed to goes on. Else one is planned from where the arm will be once
-it can begin, with the rates that it then has; if none is found that meets the ball closer to the
-shield's middle, the old one goes on, and brakes after its contact. What the arm has done by the end
-is one plan, of pieces of all of them, which the referee judges against the true ball. With one
-moment this is what an arm does that decides once. Robot base frame, z up, SI units.
+At given moments all observations so far are fitted. A motion that would still meet the newly fitted
+ball near the intended contact continues. Otherwise a new motion is planned from the state that the
+arm will have when it can start. If no new motion meets the ball closer to the shield's centre, the
+old motion continues and brakes after its contact. The pieces of all executed motions form one plan,
+which the referee judges against the true ball. With a single moment the arm decides once. Robot
+base frame, z up, SI units.
 """
 
 import dataclasses
@@ -17,7 +17,6 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.flight import BallState
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
@@ -25,14 +24,14 @@ from planner_jax.core.protocol import Status, is_solved, select_into, take
 from planner_jax.planning.plan import plan
 from planner_jax.planning.replan import Replanning
 from planner_jax.studies.block.contact_check import end_at_contact
-from planner_jax.studies.block.flight_fit import FlightFit, Sight, believed_at
+from planner_jax.studies.block.flight_fit import FlightFit, Sight
 from planner_jax.studies.block.observation import (
     Eye,
     cautious,
     fit_errors,
-    fitted,
+    fit_throws,
     frame_times,
-    watched,
+    watch,
 )
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -42,22 +41,21 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-# [m]; a motion that would meet the ball within so much of the shield's middle needs no better one.
-_NEAR = 0.02
-_EXCESS = 0.05  # share by which the contact of a motion that goes on may exceed what is asked for
-_LONG = 100.0  # [s], that an arm stands after its motion
+_NEAR = 0.02  # [m], contacts this near to the shield's centre need no improvement
+_EXCESS = 0.05  # relative excess over contact limits up to which a motion continues
+_LONG = 100.0  # [s], standstill after a motion
 
 
 @dataclasses.dataclass(frozen=True)
 class Aim:
-    """How a ball that is not known exactly is to be met; as in `cautious`."""
+    """Reserves for meeting a ball that is not known exactly; see `cautious`."""
 
     offset: float  # [m]
     at_rest: bool = False
     edge: float = 0.0  # [m]
 
 
-# In order: each for the balls for which nothing was found by those before.
+# Each aim is tried for the balls that the previous aims left without a plan.
 AIMS = (
     Aim(0.005, at_rest=True, edge=0.05),
     Aim(0.005, edge=0.05),
@@ -68,16 +66,16 @@ AIMS = (
 
 @struct.dataclass
 class Decided:
-    """A batch of throws, and what arms did that decided while they watched."""
+    """A batch of throws, and the motions of arms that decided while observing."""
 
-    cases: BlockCase  # the true balls, with the delay from which on the motions count
-    plans: BlockPlan  # give them to `end_at_contact`, then to the referee, with these cases
-    fits: FlightFit  # leaves (M, B, ...), of every moment
-    begun: Array  # (B,) [s], when the first motion began; infinite without any
-    motions: Array  # (B,) int32, how many motions were begun
+    cases: BlockCase  # the true balls, and the delay at which the motions start
+    plans: BlockPlan  # pass them to `end_at_contact`, then to the referee, with these cases
+    fits: FlightFit  # leaves (M, B, ...), one per moment
+    start: Array  # (B,) [s], when the first motion started; infinite without a motion
+    motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return errors (B,) [m] of the fits of a moment, and what they are believed to be."""
+        """Return the errors (B,) [m] of the fits at a moment, and their standard deviations."""
         return fit_errors(self.cases, take(self.fits, place))
 
 
@@ -97,7 +95,7 @@ def plan_with_aims(
         some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
-        # NumPy arrays, for which there are programs already.
+        # NumPy arrays, since their programs are compiled already.
         aimed = jax.tree.map(np.asarray, aimed)
         asked = dataclasses.replace(some, case=aimed) if is_again else aimed
         found = jax.tree.map(np.array, plan(planner, asked))
@@ -125,22 +123,23 @@ def decide(
     """Simulate arms that observe their balls and decide at given moments.
 
     Args:
-        planner: of the first motion, and of those that the previous one does not lead to. One that
-            is no `OnlineBlock` decides once.
-        cases: a batch of B, with the true balls; arms are where they say until the first moment.
-        eye: that sees the balls.
-        moments: [s], at which flights are fitted, rising; frames until then count.
-        overhead: [s], from a moment until its motion may begin, planning included, >= 0.
-        seed: of the noise; or (B,), of each throw's own.
-        aims: how balls are to be met, tried in this order; offsets must not fall.
-        shortest: [s], least time that is left for a new motion.
-        patient: whether an arm that stands waits, and sees more, while it could meet the ball by
-            the first of the aims if it began at the next moment.
-        again: whether motions are decided anew; if not, an arm begins one motion.
+        planner: planner of the first motion, and of motions without a predecessor. A planner other
+            than `OnlineBlock` decides once.
+        cases: a batch of B, with the true balls; arms stay in the cases' states until the first
+            moment.
+        eye: the camera.
+        moments: [s], increasing times of the fits; earlier frames count.
+        overhead: [s], from a moment until its motion may start, planning included, >= 0.
+        seed: of the noise; or one seed per throw, (B,).
+        aims: reserves, tried in this order; offsets must not decrease.
+        shortest: [s], least remaining time for a new motion.
+        patient: whether an arm at rest waits for more observations while it could still meet the
+            ball by the first aim when starting at the next moment.
+        again: whether motions are decided again; if not, an arm starts one motion.
 
     Raises:
-        ValueError: moments that do not rise from 0 or later, or a negative overhead; one line.
-        TypeError: several moments for another planner than `OnlineBlock`.
+        ArgumentError: moments that do not increase from 0 or later, or a negative overhead.
+        TypeError: several moments for a planner other than `OnlineBlock`.
     """
     moments = [float(moment) for moment in moments]
     if len(moments) == 0 or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
@@ -152,13 +151,15 @@ def decide(
     cases = jax.tree.map(np.asarray, cases)
     dtype, num = cases.gravity.dtype, cases.batch_shape[0]
     times = jnp.asarray(frame_times(eye, moments[-1]), dtype)
-    places = _watch(cases, eye, times, _keys(seed))
+    places = watch(cases, eye, times, _keys(seed))
     begin = np.full(num, moments[0] + overhead, dtype)
     cases = dataclasses.replace(cases, delay=begin)
     arms = _Arms(cases)
     fits = []
     for moment, following in zip(moments, [*moments[1:], None], strict=True):
-        balls, fit = jax.tree.map(np.asarray, _fit(cases, eye, times, places, dtype.type(moment)))
+        balls, fit = jax.tree.map(
+            np.asarray, fit_throws(cases, eye, times, places, dtype.type(moment))
+        )
         begin = np.full(num, moment + overhead, dtype)
         known = dataclasses.replace(cases, ball=balls, delay=begin)
         fits.append(fit)
@@ -174,17 +175,17 @@ def decide(
                 some = take(dataclasses.replace(known, delay=later), lanes)
                 open_[lanes] = ~is_solved(plan_with_aims(planner, some, aims[:1]).status)
         arms.decide(planner, known, np.where(open_, useful, 0), aims)
-    plans = arms.composed()
+    plans = arms.compose()
     seen = np.asarray(fits[-1].status) == Sight.SEEN
     status = np.where(seen | is_solved(plans.status), plans.status, Status.NON_FINITE)
     plans = dataclasses.replace(plans, status=status.astype(np.int32))
     every = jax.tree.map(lambda *leaves: np.stack(leaves), *fits)
-    begun, motions = host_leaf(arms.first), host_leaf(arms.motions)
-    return Decided(cases=cases, plans=plans, fits=every, begun=begun, motions=motions)
+    start, motions = host_leaf(arms.first), host_leaf(arms.motions)
+    return Decided(cases=cases, plans=plans, fits=every, start=start, motions=motions)
 
 
 class _Arms:
-    """The arms of a batch: the motions that they carry out, and the pieces that they have."""
+    """The arms of a batch: their current motions, and the pieces they have executed."""
 
     def __init__(self, cases: BlockCase):
         num, dtype = cases.batch_shape[0], cases.gravity.dtype
@@ -201,7 +202,7 @@ class _Arms:
         self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """Count the aims (B,) with less offset than that of the contact now expected.
+        """Count the aims (B,) with a smaller offset than the currently expected contact.
 
         All aims count for an arm whose motion misses the ball, or that has no motion.
         """
@@ -220,13 +221,13 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Go over to new motions where there are any.
+        """Switch to new motions for all arms that get one.
 
         Args:
             planner: of motions.
-            known: the balls as they are known now, and when motions may begin.
-            useful: (B,) int, how many of the aims are worth trying.
-            aims: those that ask for less offset first.
+            known: the balls as estimated, and when motions may start.
+            useful: (B,) int, number of aims worth trying.
+            aims: in the order of increasing offsets.
         """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
@@ -238,13 +239,13 @@ class _Arms:
             found = plan_with_aims(warm, some, aims[:num])
             self._begin(begin, lanes, found)
             useful[lanes[is_solved(found.status)]] = 0
-        # A search from scratch takes long: only for a ball that is missed else.
+        # A search from scratch takes long, so that only missed balls get one.
         lanes = np.flatnonzero(useful == len(aims))
         if lanes.size:
             self._begin(begin, lanes, plan_with_aims(planner, take(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
-        """Go over to the plans found for some lanes (N,) that are solved."""
+        """Switch some lanes (N,) to their new plans, if these are solved."""
         good = is_solved(found.status)
         if not good.any():
             return
@@ -255,7 +256,9 @@ class _Arms:
         until = np.array(self.since)
         until[lanes] = begin[lanes]
         self.done.append(
-            jax.tree.map(np.asarray, _begun(self.cases, self.plans.motion, until - self.since))
+            jax.tree.map(
+                np.asarray, _cut_executed(self.cases, self.plans.motion, until - self.since)
+            )
         )
 
         def put(old: np.ndarray, new: np.ndarray) -> np.ndarray:
@@ -269,12 +272,12 @@ class _Arms:
         self.first[lanes] = np.minimum(self.first[lanes], begin[lanes])
         self.motions[lanes] += 1
 
-    def composed(self) -> BlockPlan:
-        """Return the past and planned motions of the arms, as one plan each."""
+    def compose(self) -> BlockPlan:
+        """Return the executed and planned pieces of each arm as one plan."""
         motions = [*self.done, self.plans.motion]
         coeffs = np.concatenate([motion.coeffs for motion in motions], axis=1)
         durations = np.concatenate([motion.durations for motion in motions], axis=1)
-        # Pieces of no length go behind the others, and there go on from the end.
+        # Pieces of zero duration go to the end and continue the final state.
         order = np.argsort(durations <= 0.0, axis=1, kind="stable")
         num = max(int((durations > 0.0).sum(axis=1).max()), 1)
         coeffs = np.take_along_axis(coeffs, order[:, :num, None, None], axis=1)
@@ -295,7 +298,7 @@ class _Arms:
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Return motions of no length, of so many pieces and powers, from where the arms are."""
+    """Return motions of zero duration with the given numbers of pieces and powers, at the arms."""
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
     coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
@@ -304,21 +307,8 @@ def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
 
 
 def _keys(seed: int | np.ndarray) -> Array:
-    """Return a key, or (B,) of them."""
+    """Return a random key, or (B,) keys."""
     return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
-
-
-_watch = jax.jit(watched)
-
-
-@jax.jit
-def _fit(
-    cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array
-) -> tuple[BallState, FlightFit]:
-    """Return balls at the time 0, and fits, of what was seen until a moment."""
-    fits = jax.vmap(fitted, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
-    start = jnp.zeros((), times.dtype)
-    return jax.vmap(believed_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
 
 
 @jax.jit
@@ -329,7 +319,7 @@ def _latest(case: BlockCase) -> Array:
 
 @jax.jit
 def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
-    """Return whether motions meet the balls of cases within these cases' limits, (B,) bool."""
+    """Return whether motions meet the balls of cases within the limits of the cases, (B,) bool."""
 
     def one(case: BlockCase, plan: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
@@ -343,8 +333,8 @@ def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
 
 @jax.jit
 @jax.vmap
-def _begun(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Return the pieces of a motion, its braking and the standstill after, up to a time () [s]."""
+def _cut_executed(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
+    """Return a motion's pieces, its braking and the standstill after it, up to a time () [s]."""
     motion = append_braking(case, motion)
     end = jnp.sum(motion.durations)
     stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))

@@ -1,4 +1,4 @@
-"""Arms that block balls which they only see, and what they saw."""
+"""Arms that block balls which they observe with a camera, and records of the observations."""
 
 import dataclasses
 import zlib
@@ -21,34 +21,34 @@ from planner_jax.task.block.plan import BlockPlan
 
 @struct.dataclass
 class SeenPlan(BlockPlan):
-    """What an arm does that sees its ball, up to the true contact; and how well it saw."""
+    """The executed motion of an arm up to the true contact, and the quality of its observations."""
 
     sight: Array  # () int32, a `Sight`, of the first fit
-    sightings: Array  # () int32, of the first fit
-    fit_error: Array  # () [m], of the first fit, across the flight midway between the boxes
-    fit_std: Array  # () [m], what it is believed to be
+    sightings: Array  # () int32, number of observations in the first fit
+    fit_error: Array  # () [m], of the first fit, normal to the flight midway between the boxes
+    fit_std: Array  # () [m], its estimated standard deviation
     last_fit_error: Array  # () [m], of the last fit
-    motions: Array  # () int32, that were begun
+    motions: Array  # () int32, number of started motions
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SeeingArms(Planner[BlockCase, SeenPlan]):
-    """Arms that plan with what a camera has seen, once or again and again."""
+    """Arms that plan from camera observations, once or repeatedly."""
 
     case_type: ClassVar[type] = BlockCase
     planner: Planner
     observe: float  # [s], until the first fit
-    overhead: float  # [s]
-    replan: float  # [Hz], rate of later fits; 0 for none
-    observe_longer: float  # [s], that an arm may watch longer before it begins
-    noise: float  # [m], round; 0 for that of a stereo camera
+    overhead: float  # [s], from a fit until its motion may start
+    replan: float  # [Hz], rate of later fits; 0 for no later fit
+    observe_longer: float  # [s], greatest delay of the first motion for more observations
+    noise: float  # [m], isotropic; 0 for the noise of a stereo camera
     frame_rate: float  # [Hz]
     seed: int
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> SeenPlan:
-        """Return what the arms of a batch do, up to where they meet the true balls."""
-        done = self.decided(cases)
+        """Return the executed motions of a batch, up to their contacts with the true balls."""
+        done = self.decide_batch(cases)
         (error, std), (last, _) = (done.fit_errors(place) for place in (0, -1))
         first = take(done.fits, 0)
         met = end_at_contact(done.cases, done.plans)
@@ -65,8 +65,8 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
             ),
         )
 
-    def decided(self, cases: BlockCase) -> Decided:
-        """Return what the arms of a batch do, wherever they meet their balls."""
+    def decide_batch(self, cases: BlockCase) -> Decided:
+        """Return the decisions of a batch of arms, without their contacts."""
         return decide(
             self.planner,
             cases,
@@ -79,7 +79,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """Return when flights are fitted [s]; again until the last ball of a batch is there."""
+        """Return the times of the fits [s], repeated until the last ball of a batch arrives."""
         moments = [self.observe]
         if self.observe_longer:
             num = int(self.observe_longer * self.frame_rate + 1e-6)
@@ -91,6 +91,6 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:
-        """Return a seed (B,) of each throw's noise, the same in whatever batch it is."""
+        """Return a seed (B,) for each throw's noise, independent of the batch."""
         balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
         return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)

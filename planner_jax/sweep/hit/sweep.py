@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
-from planner_jax.baselines.hit.published import published_rates
+from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.robot.quadrotor import QuadrotorPlan
@@ -179,7 +179,7 @@ class HitSweep(Sweep[HitSettings]):
         """Return success per scenario in percent, beside the published rates of `compared_with`."""
         planner, summary = manifest["parameters"]["planner"], manifest["summary"]
         other = compared_with(planner)
-        published, column = published_rates(), court.PLANNERS.index(other)
+        published, column = read_published_rates(), court.PLANNERS.index(other)
         beside = [rates[:, column] for rates in (published.paper, published.trials)]
         header = ["scenario", "cases", f"{planner} %", "95 % interval"]
         header += [f"{other}, paper %", f"{other}, trial files %"]

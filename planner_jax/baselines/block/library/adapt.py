@@ -1,11 +1,12 @@
-"""The planner that warps stored motions to the very ball.
+"""The planner that warps stored motions to a given ball.
 
-A library's motion ends where a nominal ball of its pair of cells comes along. Here the motions of
-the pairs around the ball's own are bent until they end where this ball does: the new end pose, by
-inverse kinematics on the branch of the old one, less the old end, times one shape in time, is
-added. Both are steps of `planner_jax.task.block.motion`, so limits at knots stay exact, and the
-motion takes all the time that there is. Those that turn the joints least are looked at first. Where
-none is free, least squares of `OnlineBlock` begin with them.
+A library's motion ends where the nominal ball of its pair of cells passes. Here the motions of the
+pairs around the ball's own pair are warped until they end where this ball passes. The new end pose,
+by inverse kinematics on the branch of the old pose, minus the old end pose, is multiplied by a
+fixed profile in time and added to the motion. Both terms are steps of
+`planner_jax.task.block.motion`, so that limits at knots stay exact, and the motion takes all the
+available time. Motions with the smallest warp are evaluated first. If none is collision-free, they
+start the least squares of `OnlineBlock`.
 """
 
 import dataclasses
@@ -22,7 +23,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.baselines.block.library.cells import Face, cells_around
 from planner_jax.baselines.block.library.file import load_library
 from planner_jax.baselines.block.library.planner import LibraryBlock
-from planner_jax.baselines.block.library.table import pieces_of, unpacked
+from planner_jax.baselines.block.library.table import pieces_of, unpack_rows
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, first_solved
@@ -36,25 +37,25 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
-# How far joints are to be turned, squared, counts less for those of the wrist, which carry little;
-# the joint at the flange stays as it is stored.
+# Weights of the squared joint changes. The wrist joints count less, since they carry little; the
+# flange joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-_AWAY = 0.02  # [rad^2], of a motion whose pair's cells are one cell off
-_LATE = 10.0  # [rad^2], of a whole limit exceeded
-_NEAR = 30.0  # [rad^2/m], of a pole that is too near at a sample
+_AWAY = 0.02  # [rad^2], penalty per squared cell between the motion's cells and the ball's
+_LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
+_NEAR = 30.0  # [rad^2/m], penalty of a sample within the pole margin
 
 
 @dataclasses.dataclass(frozen=True)
 class Effort(Attempt):
-    """An attempt: so many stored motions warped, some of them checked, some bent; static."""
+    """An attempt: numbers of stored motions to warp, to check and to refine; static."""
 
-    neighbours: int = 8  # motions that are warped, up to 16
-    points: int = 6  # of the ball's way, to each of which they are
-    screened: int = 8  # of the warped ones, whose distances from the pole are looked at
-    samples: int = 12  # of each then
-    checks: int = 1  # of them at most, closely, those first that promise most
-    checked: int = 48  # samples of a check
-    bent: int = 0  # least squares that begin with them at most
+    neighbours: int = 8  # stored motions that are warped, up to 16
+    points: int = 6  # points of the ball's trajectory to which each motion is warped
+    screened: int = 8  # warped motions whose distances from the pole are computed
+    samples: int = 12  # samples of such a motion
+    checks: int = 1  # greatest number of motions with a close check, most promising first
+    checked: int = 48  # samples of a close check
+    refined: int = 0  # greatest number of least-squares refinements
     solver: LevenbergConfig = LevenbergConfig(
         *(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
     )
@@ -62,20 +63,21 @@ class Effort(Attempt):
 
 @struct.dataclass
 class Warped:
-    """C warped motions, those first that promise most."""
+    """C warped motions, the most promising first."""
 
     points: Array  # (C, 6 K + 1), unknowns of `OnlineBlock`
-    promise: Array  # (C,) [rad^2], less is better; infinite without a motion
-    is_open: Array  # (C,) bool, whether limits hold at knots and, at a few samples, off the pole
+    penalty: Array  # (C,) [rad^2], expected quality, less is better; infinite without a motion
+    is_open: Array  # (C,) bool, whether limits hold at knots and the pole margin at a few samples
 
 
 @struct.dataclass
 class AdaptBlock(Planner):
-    """Meets the very ball with a stored motion that is warped; the cost is its duration [s].
+    """A planner that meets the ball with a warped stored motion; the cost is its duration [s].
 
-    Arm, limits and scene have to be those of the library, and the arm has to stand at one of its
-    homes: else the status is BLOCKED, as `check` says on the host. It is OUT_OF_REACH for a ball
-    that does not come through both boxes, and INFEASIBLE where no motion was found.
+    Arm, limits and scene must equal the library's, and the arm must stand at one of its homes;
+    otherwise the status is BLOCKED, and `check` reports the same on the host. The status is
+    OUT_OF_REACH for a ball that does not pass through both boxes, and INFEASIBLE if no motion was
+    found.
     """
 
     stored: LibraryBlock
@@ -84,7 +86,7 @@ class AdaptBlock(Planner):
         pytree_node=False,
         default=(
             Effort(),
-            Effort(neighbours=16, points=8, screened=16, checks=6, checked=96, bent=6),
+            Effort(neighbours=16, points=8, screened=16, checks=6, checked=96, refined=6),
         ),
     )
 
@@ -93,11 +95,11 @@ class AdaptBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Effort, ...]:
-        """The efforts: at once, and for longer."""
+        """The efforts: a quick one, and a longer one."""
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the first of the cases is what the library was built for."""
+        """Raise `ArgumentError` unless the library was built for the first of the cases."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
@@ -105,36 +107,36 @@ class AdaptBlock(Planner):
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)
-        warped = self.warped(case, flight, home, poses, attempt)
-        goes = flight.comes & fits
-        tries = jnp.where(goes, jnp.minimum(jnp.sum(warped.is_open), attempt.checks), 0)
+        candidates = self.warp(case, flight, home, poses, attempt)
+        is_possible = flight.comes & fits
+        tries = jnp.where(is_possible, jnp.minimum(jnp.sum(candidates.is_open), attempt.checks), 0)
         online = dataclasses.replace(self.online, checked=attempt.checked)
 
-        def as_warped(k: Array) -> BlockPlan:
-            return online.finish(case, flight, warped.points[k], jnp.zeros((), jnp.int32))
+        def check_one(k: Array) -> BlockPlan:
+            return online.finish(case, flight, candidates.points[k], jnp.zeros((), jnp.int32))
 
-        def bent(k: Array) -> BlockPlan:
-            return online.refine(case, flight, warped.points[k], attempt.solver)
+        def refine_one(k: Array) -> BlockPlan:
+            return online.refine(case, flight, candidates.points[k], attempt.solver)
 
-        best = first_solved(as_warped, tries, make_empty_plan(case, online.pieces))
-        if attempt.bent:
-            there = jnp.sum(jnp.isfinite(warped.promise))
-            most = jnp.where(goes, jnp.minimum(there, attempt.bent), 0)
-            best = first_solved(bent, most, best)
+        best = first_solved(check_one, tries, make_empty_plan(case, online.pieces))
+        if attempt.refined:
+            there = jnp.sum(jnp.isfinite(candidates.penalty))
+            most = jnp.where(is_possible, jnp.minimum(there, attempt.refined), 0)
+            best = first_solved(refine_one, most, best)
         status = explain_status(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
         return dataclasses.replace(best, status=status)
 
-    def warped(
+    def warp(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
     ) -> Warped:
-        """Return stored motions from a home, warped to end poses at points of the ball's way."""
+        """Return stored motions from a home, warped to end poses along the ball's trajectory."""
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
         total = jnp.asarray(sums(pieces, (1.0,))[1][0], dtype)
         ends = case.angles + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
-        # To the branch that is nearest to the stored end; a whole turn is none.
+        # The branch nearest to the stored end, modulo full turns.
         turn = angles - ends[:, None, None]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
         far = jnp.sum(jnp.asarray(_WEIGHTS, dtype) * turn**2, axis=-1)  # (N, P, 8)
@@ -150,29 +152,29 @@ class AdaptBlock(Planner):
         of_rise = jnp.max(jnp.abs(rise) / case.limits.acceleration, axis=(2, 3))
         share = jnp.maximum(of_rate, of_rise * (pieces / duration**2))
         late = jnp.maximum(share - (1.0 - online.slack), 0.0)
-        promise = jnp.min(far, axis=-1) + _AWAY * away[:, None] + _LATE * late
-        promise = jnp.where(found[:, None], promise, jnp.inf).reshape(-1)
-        least, place = lax.top_k(-promise, effort.screened)
+        penalty = jnp.min(far, axis=-1) + _AWAY * away[:, None] + _LATE * late
+        penalty = jnp.where(found[:, None], penalty, jnp.inf).reshape(-1)
+        least, place = lax.top_k(-penalty, effort.screened)
         moves = moves.reshape(-1, pieces, 6)[place]
-        short = self.short_of_pole(case, moves, effort.samples)
+        short = self.pole_shortfall(case, moves, effort.samples)
         cost = _NEAR * jnp.maximum(short, 0.0) - least
         order = lax.top_k(-cost, effort.screened)[1]
         place, moves = place[order], moves[order]
         points = moves.reshape(effort.screened, -1)
         return Warped(
             points=jnp.concatenate([points, time[place % num][:, None]], axis=1),
-            promise=-least[order],
+            penalty=-least[order],
             is_open=(late.reshape(-1)[place] <= 0.0) & (short[order] <= 0.0),
         )
 
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Return motions stored for the cells around the ball's own.
+        """Return the motions stored for the cells around the ball's own cells.
 
         Returns:
-            steps: (N, K, 6) [rad]; zero without one.
-            away: (N,), squares of how many cells they are off, in all directions.
+            steps: (N, K, 6) [rad]; zero without a motion.
+            away: (N,), squared distance in cells, summed over all directions.
             found: (N,) bool.
         """
         table = self.stored.library.table
@@ -188,14 +190,20 @@ class AdaptBlock(Planner):
         pairs = (first[:, None] * layout.num_inner + last).reshape(-1)
         away, nearest = lax.top_k(-away, num)
         rows = jnp.asarray(table.rows)
-        places = home * rows.shape[1] + pairs[nearest]
-        flat = rows.reshape(-1, rows.shape[2])  # gathered quicker than by two places
-        row = unpacked(flat.at[places].get(mode="promise_in_bounds"))
+        indices = home * rows.shape[1] + pairs[nearest]
+        flat = rows.reshape(-1, rows.shape[2])  # one index gathers faster than two
+        row = unpack_rows(flat.at[indices].get(mode="promise_in_bounds"))
         found = jnp.isfinite(row.duration) & is_first & is_last
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
-    def short_of_pole(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return how much nearer to the pole than they may some motions (C, K, 6) get, (C,) [m]."""
+    def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
+        """Return the shortfall of motions below the pole margin, (C,) [m]; <= 0 keeps the margin.
+
+        Args:
+            case: one case.
+            moves: (C, K, 6) [rad], steps of the motions.
+            samples: number of samples of each motion.
+        """
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
         angles = jax.vmap(lambda steps: angles_at(case.angles, rest, steps, shares))(moves)
@@ -206,11 +214,11 @@ class AdaptBlock(Planner):
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
     """Return the planner of a file that `planner-jax library build` wrote.
 
-    The table is read, and kept on the default device.
+    The table is read completely and stored on the default device.
 
     Raises:
-        ArgumentError: the file is no whole library, or one of motions with another number of
-            pieces than the planner's; one line.
+        ArgumentError: the file is not a complete library, or its motions have another number of
+            pieces than the planner's motions.
     """
     library, own = load_library(file), OnlineBlock().pieces
     if (pieces := pieces_of(library.table.rows)) != own:

@@ -1,4 +1,4 @@
-"""Libraries built, and repaired where an obstacle has moved."""
+"""Building libraries, and repairing them after an obstacle has moved."""
 
 import dataclasses
 import functools
@@ -30,10 +30,10 @@ from planner_jax.baselines.block.library.table import (
     Setting,
     fingerprint,
     library_of,
-    moved,
-    packed,
+    pack_rows,
     pieces_of,
-    unpacked,
+    unpack_rows,
+    with_scene,
 )
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
@@ -46,27 +46,27 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
-# Learned starts that are tried where there is a motion already; all where there is none. In a
-# repair, what began with the old motion is as good mostly, and one more will do.
+# Learned starts for pairs that have a motion already; pairs without one try all starts. In a repair
+# the old motion is mostly as good a start, and one learned start in addition suffices.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
-_WORTH = 0.03  # [s], earlier: what a search for a better motion has to promise
-_LOOKED_AT = 1024  # stored motions whose distances are worked out at once
+_WORTH = 0.03  # [s], least possible gain that justifies a search for a better motion
+_CHECKED_AT_ONCE = 1024  # stored motions whose distances are computed at once
 
 
 @dataclasses.dataclass(frozen=True)
 class Portions:
-    """How much is planned at a time."""
+    """Amounts of work at a time."""
 
-    pairs: int  # before the next part is written
-    lanes: tuple[int, int]  # of a device in a call, of few and of many
-    # Of one pair in a call. One, where those that come after a motion was found are work saved;
-    # all, where a few lanes take as long as thousands.
+    pairs: int  # pairs of a part that is written
+    lanes: tuple[int, int]  # cases per device in a call, small and large
+    # Starts of one pair in a call. One start at a time saves work after the first success; all at
+    # once suit devices on which a few cases take as long as thousands.
     starts: int
 
 
 _ON_CPU = Portions(256, (16, 16), 1)
 _ON_GPU = Portions(32768, (512, 8192), 16)
-_FEW = 6  # calls of few lanes that take about as long as one of many
+_FEW = 6  # small calls that take about as long as one large call
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,7 +74,7 @@ class _Motions:
     """The best motions of P pairs so far."""
 
     point: np.ndarray  # (P, 6 K + 1)
-    entry: np.ndarray  # (P,) [s]; infinite without one
+    entry: np.ndarray  # (P,) [s]; infinite without a motion
     quickest: np.ndarray  # (P,) [s]
 
 
@@ -88,18 +88,19 @@ def build(
 ) -> Library:
     """Plan for all pairs of cells that a ball can pass through, and write the library.
 
-    What has been planned is kept in a folder beside the file, with the ending ".parts", until the
-    library is whole: the same call after an interruption goes on from there, to the same library.
+    Planned parts are stored in a folder next to the file, with the ending ".parts", until the
+    library is complete. The same call after an interruption resumes from there and builds the same
+    library.
 
     Args:
         path: of the file.
         setting: NumPy leaves.
-        homes: (H, 6) [rad], where motions begin, one or more.
+        homes: (H, 6) [rad], where motions start, one or more.
         layout: of the cells.
         progress: show a bar on the standard error stream.
 
     Raises:
-        ValueError: the arm touches something at a home; one line.
+        ArgumentError: the arm touches something at a home.
         OSError: the file or the folder cannot be written.
     """
     homes = np.atleast_2d(np.asarray(homes, np.float32))
@@ -131,23 +132,23 @@ def build(
 def repair(
     library: Library, scene: Scene, *, retry: bool = False, progress: bool = True
 ) -> tuple[Library, np.ndarray]:
-    """Return the library in another scene: what is no longer free there is planned anew.
+    """Return the library for another scene: motions that collide there are planned again.
 
     Args:
-        library: of a scene with the same boxes.
-        scene: what stands around now.
-        retry: whether to plan for pairs that had no motion, too.
+        library: library of a scene with the same boxes.
+        scene: the new scene.
+        retry: also plan for pairs that have no motion.
         progress: show a bar on the standard error stream.
 
     Returns:
-        The library, NumPy leaves, and which motions were planned for anew, (H, P) bool. All
-        others are the old ones, bit for bit.
+        The library, NumPy leaves, and which motions were planned again, (H, P) bool. All other
+        motions are unchanged, bit for bit.
 
     Raises:
-        ValueError: a box of the scene is not that of the library, or the arm touches something at
-            a home.
+        ArgumentError: a box of the scene differs from the library's, or the arm touches something
+            at a home.
     """
-    table, setting = library.table, moved(library, scene).setting
+    table, setting = library.table, with_scene(library, scene).setting
     _require_free(setting, table.homes)
     rows = np.array(table.rows)
     tunnel = tunnels(table.layout, scene.inner, scene.outer)
@@ -174,7 +175,7 @@ def portions() -> Portions:
 
 
 def _require_free(setting: Setting, homes: ArrayLike) -> None:
-    """Raise `ValueError` where the arm touches something at a home."""
+    """Raise `ArgumentError` if the arm touches something at a home."""
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
         if not near > 0.0:
@@ -190,18 +191,18 @@ def plan_pairs(
     pairs: np.ndarray,
     old: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return rows (N, 6 K + 10) of a table for some pairs (N,), from one home.
+    """Return rows (N, 6 K + 10) of a table for pairs (N,), from one home.
 
-    Straight motions first. Then least squares from one learned start after another, for those
-    pairs that might be reached earlier or have nothing yet. All of it again, more coarsely, for
-    those that are left with nothing.
+    Straight motions come first. Then least squares start from one learned start after another, for
+    pairs that have no motion or might get an earlier one. Pairs that still have no motion go
+    through all of it again with a coarse tolerance.
 
     Args:
         setting: NumPy leaves.
         home: (6,) [rad].
         tunnel: of all pairs.
-        pairs: numbers of those to plan for.
-        old: their rows in another scene, from which to begin as well.
+        pairs: numbers of the pairs to plan for.
+        old: their rows in another scene, used as additional starts.
     """
     straight = StraightPair(setting, host_leaf(home))
     bent = BentPair(setting, host_leaf(home))
@@ -209,7 +210,7 @@ def plan_pairs(
     given = np.zeros((len(pairs), 6 * straight.online.pieces + 1), np.float32)
     has_old = np.zeros(len(pairs), bool)
     if old is not None:
-        row = unpacked(old)
+        row = unpack_rows(old)
         has_old = np.isfinite(row.duration)
         given[has_old, :-1] = row.steps[has_old].reshape(has_old.sum(), -1)
         given[has_old, -1] = row.duration[has_old]
@@ -238,12 +239,12 @@ def plan_pairs(
         found.quickest[some] = plans.quickest[first]
 
     improving = STARTS if old is None else (-1, *REPAIR_STARTS)
-    rest = [start for start in STARTS if start not in improving]
+    remaining = [start for start in STARTS if start not in improving]
     others = [start for start in range(len(read_learned_starts()[0])) if start not in STARTS]
     for is_coarse in (False, True):
         left = np.isinf(found.entry)
         improve(straight, np.flatnonzero(left), [0], is_coarse)
-        for starts in (*_groups(improving), *_groups(rest + others * is_coarse)):
+        for starts in (*_groups(improving), *_groups(remaining + others * is_coarse)):
             with np.errstate(invalid="ignore"):
                 hard = left & ~(found.entry - found.quickest <= _WORTH)
             if starts[0] not in improving:
@@ -254,25 +255,25 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Return starts in groups, each for one call."""
+    """Split starts into groups, one per call."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
 
 def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
-    """Return plans of a batch, in calls of few sizes, so that few programs are compiled."""
+    """Plan a batch in calls of a few sizes, so that few programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
     few, many = portions().lanes
     lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
-    # The last one again: on a CPU it is not solved again.
+    # The last case pads the batch; on a CPU it is not solved again.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
     plans = plan(planner, filled, chunk=lanes)
     return jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Return rows of a table for motions; those without one have an infinite duration."""
+    """Return rows of a table for motions; rows without a motion have an infinite duration."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
     steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
@@ -284,19 +285,19 @@ def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
     rotation, middle = parts
     duration = np.where(stored, found.point[:, -1], np.inf)
     leaves = (steps, duration, middle, rotation[:, :, 0], rotation[:, :, 1])
-    return packed(Row(*map(host_leaf, leaves)))
+    return pack_rows(Row(*map(host_leaf, leaves)))
 
 
 def _in_parts(array: np.ndarray) -> list[np.ndarray]:
-    """Return an array cut into equal parts along its first axis, the last one filled up."""
-    num = -(-len(array) // _LOOKED_AT) * _LOOKED_AT
+    """Split an array into equal parts along its first axis; the last row pads the last part."""
+    num = -(-len(array) // _CHECKED_AT_ONCE) * _CHECKED_AT_ONCE
     filled = array[np.minimum(np.arange(num), len(array) - 1)]
-    return list(filled.reshape(-1, _LOOKED_AT, *array.shape[1:]))
+    return list(filled.reshape(-1, _CHECKED_AT_ONCE, *array.shape[1:]))
 
 
 @jax.jit
 def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
-    """Return rotations (N, 3, 3) and middles (N, 3) [m] of the shield where motions end."""
+    """Return rotations (N, 3, 3) and centres (N, 3) [m] of the shield at the ends of motions."""
 
     def end(steps: Array) -> tuple[Array, Array]:
         angles = angles_at(home, jnp.zeros_like(home), steps, (1.0,))[0]
@@ -306,19 +307,21 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which of some stored motions keep the planner's margin from everything, (N,) bool."""
+    """Return which stored motions keep the planner's margin from everything, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
     shares = tuple(np.arange(1, online.checked + 1) / online.checked)
-    steps = unpacked(rows).steps
-    near = [_nearest_on_way(setting, home, some, shares) for some in _in_parts(np.asarray(steps))]
-    # Plans are accepted to rounding.
+    steps = unpack_rows(rows).steps
+    near = [
+        _nearest_on_motion(setting, home, some, shares) for some in _in_parts(np.asarray(steps))
+    ]
+    # Tolerance for rounding.
     return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
 
 
 @functools.partial(jax.jit, static_argnames="shares")
-def _nearest_on_way(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
+def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
     """Return least distances (N,) [m] along motions with steps (N, K, 6)."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
@@ -345,20 +348,20 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    """What has been planned of a library that is not whole yet, a file each, written atomically."""
+    """The planned parts of an incomplete library, one file each, written atomically."""
 
     def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
         self._folder = folder
-        what = {
+        header = {
             "version": BUILD_VERSION,
             "fingerprint": fingerprint(setting),
             "homes": homes.tolist(),
             "layout": dataclasses.asdict(layout),
-            "device": jax.default_backend(),  # on which the size of a part depends
+            "device": jax.default_backend(),  # the size of a part depends on it
         }
-        text = json.dumps(what, sort_keys=True)
+        text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"
-        # What is of another library or version is not gone on with.
+        # Parts of another library or version are discarded.
         if not known.exists() or known.read_text() != text:
             self.remove()
             folder.mkdir(parents=True)

@@ -1,9 +1,9 @@
-"""Cells on the faces of both boxes, the tunnels between them, and what a shield covers of these.
+"""Cells on the faces of both boxes, tunnels between them, and the part that a shield covers.
 
-[Natarajan2024] calls the boxes domes (Section IV-C). It gives neither the number of cells nor the
-faces that have any; `LAYOUTS` has those that are used here. A pair is a cell of the outer box and
-one of the inner box: pair `outer * num_inner + inner`. Cells are numbered face by face; on a face
-by its axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI units.
+[Natarajan2024] calls the boxes domes (Section IV-C). It specifies neither the number of cells nor
+the faces that have cells; `LAYOUTS` has the layouts of this library. A pair is a cell of the outer
+box and one of the inner box, numbered `outer * num_inner + inner`. Cells are numbered face by face;
+on a face by its axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI units.
 """
 
 import dataclasses
@@ -24,15 +24,15 @@ GRAVITY = 9.81  # [m/s^2]
 
 @dataclasses.dataclass(frozen=True)
 class Face:
-    """A face of a box that is cut into equal cells; static."""
+    """A face of a box that is divided into equal cells; static."""
 
-    axis: int  # of its normal: 0 x, 1 y, 2 z
-    side: int  # 1 where it faces along the axis, -1 where against it
-    cells: tuple[int, int]  # along the two other axes
+    axis: int  # axis of its normal: 0 x, 1 y, 2 z
+    side: int  # 1 if its normal points along the axis, -1 if against it
+    cells: tuple[int, int]  # number along each of the two other axes
 
     @property
     def num(self) -> int:
-        """How many cells."""
+        """The number of cells."""
         return self.cells[0] * self.cells[1]
 
     @property
@@ -43,43 +43,43 @@ class Face:
 
     @property
     def name(self) -> str:
-        """Such as +x."""
+        """The name, such as +x."""
         return f"{'-+'[self.side > 0]}{'xyz'[self.axis]}"
 
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Which faces of both boxes have cells; static."""
+    """The faces of both boxes that have cells; static."""
 
     outer: tuple[Face, ...]
     inner: tuple[Face, ...]
 
     @property
     def num_outer(self) -> int:
-        """Cells of the outer box."""
+        """The number of cells of the outer box."""
         return sum(face.num for face in self.outer)
 
     @property
     def num_inner(self) -> int:
-        """Cells of the inner box."""
+        """The number of cells of the inner box."""
         return sum(face.num for face in self.inner)
 
     @property
     def num_pairs(self) -> int:
-        """Pairs of cells, those among them that no ball can pass through, too."""
+        """The number of pairs of cells, including pairs that no ball can pass."""
         return self.num_outer * self.num_inner
 
 
 def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
-    """Return faces by names such as "+x +y", with as many cells each."""
+    """Return faces by names such as "+x +y", each with the same number of cells."""
     return tuple(
         Face("xyz".index(name[1]), 1 if name[0] == "+" else -1, cells) for name in names.split()
     )
 
 
-# The paper's authors plan for 5,760 pairs (a constant of their code); A to C are three ways to
-# come to as many. D has cells on all sides that balls from ahead can get to, the default on the
-# outer box's top besides, through which lobbed ones come.
+# The paper's authors plan for 5,760 pairs (a constant of their code); A to C are three layouts with
+# this number. D has cells on all sides that balls from ahead can reach. The default "full" also has
+# cells on the top of the outer box, through which lobbed balls come.
 LAYOUTS = {
     "full": Layout(_faces("+x +y -y +z", (8, 8)), _faces("+x +y -y", (4, 7))),
     "A": Layout(_faces("+x +y -y", (8, 8)), _faces("+x +z", (3, 5))),
@@ -90,19 +90,19 @@ LAYOUTS = {
 
 
 def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the cell in which a point of a box's surface lies, in closed form.
+    """Return the cell that contains a point of a box's surface, in closed form.
 
-    The point is of the face that it is farthest out towards, in shares of the box; where these are
-    equal, as on an edge, of the face across the first axis. What lies between two cells is of the
-    one with the greater coordinate.
+    The point belongs to the face towards which it is farthest out, relative to the size of the box.
+    On an edge, where these fractions are equal, it belongs to the face of the first axis. A point
+    between two cells belongs to the one with the greater coordinate.
 
     Args:
-        faces: that have cells.
+        faces: faces that have cells.
         box: the whole box.
-        point: three numbers () [m]; rounding may put it off the surface.
+        point: three numbers () [m]; rounding may move it off the surface.
 
     Returns:
-        cell: () int32, its number; 0 where there is none.
+        cell: () int32, its number; 0 without a cell.
         found: () bool, whether the face has cells.
     """
     share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
@@ -127,13 +127,13 @@ def cells_around(
     """Return the cells nearest to a point of a box's surface, up to two in each direction.
 
     Args:
-        faces: that have cells.
+        faces: faces that have cells.
         box: the whole box.
-        point: three numbers () [m]; its face is that of `cell_of`.
+        point: three numbers () [m]; `cell_of` selects its face.
 
     Returns:
-        cells: (4,) int32, their numbers; where a face has only one cell across, it is there twice.
-        away: (4,), square of the distance from the point to their middles, in cells.
+        cells: (4,) int32, their numbers; repeated if a face has only one cell in a direction.
+        away: (4,), squared distance from the point to their centres, in cells.
         found: () bool, whether the face has cells.
     """
     own, found = cell_of(faces, box, point)
@@ -142,7 +142,7 @@ def cells_around(
     for face in faces:
         places = []
         for axis, count in zip(face.across, face.cells, strict=True):
-            place = share[axis] * count - 0.5  # in cells, from the middle of the first
+            place = share[axis] * count - 0.5  # in cells, from the centre of the first cell
             lower = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
             pair = jnp.minimum(jnp.stack([lower, lower + 1.0]), count - 1.0)
             places.append((pair.astype(jnp.int32), (pair - place) ** 2))
@@ -159,19 +159,19 @@ def cells_around(
 class Tunnels:
     """The tunnels of all pairs of a layout, NumPy float64 leaves."""
 
-    outer: np.ndarray  # (P, 2, 3) [m], corners of the part of the outer cell that sees the inner
+    outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
-    is_feasible: np.ndarray  # (P,) bool, whether a ball can get from the one into the other
-    is_centred: np.ndarray  # (P,) bool, whether one from the middle of the outer cell can
+    is_feasible: np.ndarray  # (P,) bool, whether a ball can pass from one cell to the other
+    is_centred: np.ndarray  # (P,) bool, whether a ball from the centre of the outer cell can
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     """Return the tunnels between the cells of two boxes.
 
-    A ball gets to an inner cell only from in front of that cell's face. The outer cell is therefore
-    cut off at the plane of this face; what is left is again a rectangle, and as both boxes are
-    convex, every straight line from it to the inner cell is free. Where nothing is left, the pair
-    is one of those that the paper discards: its tunnel "snaps to zero".
+    A ball reaches an inner cell only from in front of that cell's face. The outer cell is therefore
+    cut off at the plane of this face. The remainder is a rectangle, and since both boxes are
+    convex, every straight line from it to the inner cell is free. A pair without a remainder is one
+    of the pairs that the paper discards: its tunnel "snaps to zero".
     """
     from_outer, _ = _corners(layout.outer, outer)
     to_inner, of_face = _corners(layout.inner, inner)
@@ -180,9 +180,9 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     axis = np.array([face.axis for face in layout.inner])[of_face[pairs[1]]]
     side = np.array([face.side for face in layout.inner])[of_face[pairs[1]]]
     rows = np.arange(len(begin))
-    plane = end[rows, 0, axis]  # both corners lie in it
+    plane = end[rows, 0, axis]  # coordinate of the inner cell's face
     middle = begin.mean(axis=1)[rows, axis]
-    # Towards a face along its axis the lower corner moves, else the higher one.
+    # The corner behind the plane is moved to the plane.
     near, far = np.where(side > 0, 0, 1), np.where(side > 0, 1, 0)
     begin[rows, near, axis] = side * np.maximum(side * begin[rows, near, axis], side * plane)
     feasible = side * (begin[rows, far, axis] - plane) > 1e-6
@@ -212,44 +212,44 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return the ball that represents a tunnel: from the middle of one cell to the other middle.
+    """Return the ball that represents a tunnel, from cell centre to cell centre.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.
-        inner: (2, 3) [m], of the inner one.
+        inner: (2, 3) [m], corners of the inner cell.
 
     Returns:
-        ball: as it gets into the outer box.
-        span: () [s], until it gets into the inner one, at `SPEED` along the straight line.
+        ball: as it enters the outer box.
+        span: () [s], until it enters the inner box, at `SPEED` along the straight line.
     """
     begin = jnp.mean(outer, axis=0)
-    way = jnp.mean(inner, axis=0) - begin
-    span = jnp.sqrt(jnp.sum(way**2)) / SPEED
-    vel = way / span + jnp.zeros_like(way).at[2].set(0.5 * GRAVITY * span)
+    path = jnp.mean(inner, axis=0) - begin
+    span = jnp.sqrt(jnp.sum(path**2)) / SPEED
+    vel = path / span + jnp.zeros_like(path).at[2].set(0.5 * GRAVITY * span)
     return BallState(pos=begin, vel=vel), span
 
 
 def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array) -> Array:
-    """Return how far from a shield's middle the balls of a tunnel cross its plane.
+    """Return how far from a shield's centre the balls of a tunnel cross its plane at most.
 
     All straight lines from a rectangle to another one cross a plane between the two within the
-    convex hull of the crossings of the lines from corner to corner: with one end held, the crossing
-    is a projection of the other, which keeps convex sets convex. Balls are taken to be above these
-    lines by as much as the nominal ball there.
+    convex hull of the crossings of the lines from corner to corner: for one fixed end, the crossing
+    is a projection of the other end, and projections keep convex sets convex. Balls are assumed to
+    be as far above these lines as the nominal ball is above its line.
 
     Args:
-        outer: (2, 3) [m], corners of a rectangle along the axes, lowest and highest.
-        inner: (2, 3) [m], likewise.
-        middle: (3,) [m], of the shield's face.
+        outer: (2, 3) [m], corners of an axis-aligned rectangle, lowest and highest.
+        inner: (2, 3) [m], corners of the other rectangle.
+        middle: (3,) [m], centre of the shield's face.
         rotation: (3, 3), of the shield: its normal and its edges are the columns.
 
     Returns:
-        () [m], along the shield's edges, the greatest of both; infinite where the plane is not
-        between the rectangles. A shield whose half edge is longer blocks the whole tunnel.
+        () [m], the maximum over both edge directions of the shield; infinite if the plane is not
+        between the rectangles. A shield with a longer half edge blocks the whole tunnel.
     """
     ball, span = nominal_ball(outer, inner)
-    way = jnp.mean(inner, axis=0) - ball.pos
-    time = span * jnp.clip(jnp.sum((middle - ball.pos) * way) / jnp.sum(way**2), 0.0, 1.0)
+    path = jnp.mean(inner, axis=0) - ball.pos
+    time = span * jnp.clip(jnp.sum((middle - ball.pos) * path) / jnp.sum(path**2), 0.0, 1.0)
     middle = middle.at[2].add(-0.5 * GRAVITY * time * (span - time))
     begin, end = ((_corners_of(each) - middle) for each in (outer, inner))
     begin, end = (product(each, rotation) for each in (begin, end))  # (8, 3), along the shield's
@@ -260,6 +260,6 @@ def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array
 
 
 def _corners_of(box: Array) -> Array:
-    """Return the corners (8, 3) of a box along the axes (2, 3); a flat box has each one twice."""
+    """Return the corners (8, 3) of an axis-aligned box (2, 3); a flat box repeats each corner."""
     high = np.indices((2, 2, 2)).reshape(3, 8).T == 1
     return jnp.where(high, box[1], box[0])

@@ -1,4 +1,4 @@
-"""The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
+"""The command `planner-jax library`: build, show, check and repair libraries of blocks."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
 from planner_jax.task.block.scene import Box, paper_scene
 
-_CASE_BYTES = 60_000  # memory that a ball takes while motions for it are refereed
+_CASE_BYTES = 60_000  # memory per ball while the referee judges its motions
 
 
 def build_library(
@@ -41,18 +41,18 @@ def build_library(
     arm: str | None = None,
     home: Sequence[float] | None = None,
 ) -> None:
-    """Build a library in the scene of [Natarajan2024], or go on with one that was interrupted.
+    """Build a library in the scene of [Natarajan2024], or resume an interrupted build.
 
     Args:
         path: of its file.
         layout: a key of `LAYOUTS`.
         regime: a key of `REGIMES`.
-        pole: whether the pole stands.
-        arm: path of an MJCF file; the IRB 1600 if not given.
-        home: angles [rad], six for each home; the arm's own if not given.
+        pole: whether the scene has the pole.
+        arm: path of an MJCF file; None for the IRB 1600.
+        home: angles [rad], six for each home; None for the arm's own home.
 
     Raises:
-        ArgumentError: an argument breaks a rule; one line.
+        ArgumentError: an argument breaks a rule.
     """
     require_one_of(LAYOUTS, "layout", layout)
     require_one_of(REGIMES, "regime", regime)
@@ -65,7 +65,7 @@ def build_library(
     finite = home is None or all(map(math.isfinite, home))
     require(finite, "home", "finite angles", shown=" ".join(map(str, home or ())))
     if Path(path).exists():
-        load_library(path)  # lest a file of another kind be lost
+        load_library(path)  # raises for a file of another kind, which must not be overwritten
     require_backend()
     try:
         body = irb1600() if arm is None else read_arm(arm)
@@ -95,7 +95,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Let the referee judge the motions for random balls, so many for each home."""
+    """Let the referee judge the motions for `num` random balls per home."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
@@ -106,16 +106,16 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
         blocked = found.verdict.success
         wrong = found.claimed & ~blocked
         print(
-            f"Home {home}: {num} balls through tunnels with a motion; the referee says that "
-            f"{100 * blocked.mean():.2f} % are blocked. Of {found.claimed.sum()} claims it refuses "
-            f"{wrong.sum()}."
+            f"Home {home}: {num} balls through tunnels with a motion; by the referee "
+            f"{100 * blocked.mean():.2f} % are blocked. It rejects {wrong.sum()} of "
+            f"{found.claimed.sum()} claims."
         )
         for k in np.flatnonzero(wrong)[:5]:
             print(f"  pair {found.pairs[k]}: {found.verdict.sentence(int(k))}")
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan anew what touches a pole that has moved to (2,) [m]; write a new file."""
+    """Plan again all motions that touch a pole moved to (2,) [m]; write a new file."""
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
@@ -127,7 +127,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     repaired, touched = repair(library, scene, retry=retry)
     save_library(out, repaired)
     print(
-        f"Planned {touched.sum()} of {library.found.sum()} motions anew in "
+        f"Planned {touched.sum()} of {library.found.sum()} motions again in "
         f"{time.perf_counter() - began:.1f} s, compilation included."
     )
     _print(out, repaired, coverage(repaired))
@@ -156,7 +156,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
     )
     sure = covered.is_sure.sum(axis=1) / np.maximum(covered.found.sum(axis=1), 1)
     print(
-        f"Balls can pass through {covered.is_feasible.sum()} pairs, from the middle of the outer "
+        f"Balls can pass through {covered.is_feasible.sum()} pairs, from the centre of the outer "
         f"cell through {covered.is_centred.sum()}."
     )
     for home, angles in enumerate(np.asarray(table.homes)):
@@ -204,7 +204,7 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
 
 
 def _ends(face: Face, box: Box) -> tuple[float, float, float, float]:
-    """Return where a face begins and ends along its two axes [m]."""
+    """Return where a face starts and ends along its two axes [m]."""
     (left, bottom), (right, top) = (
         (float(side[face.across[0]]), float(side[face.across[1]]))
         for side in (box.lower, box.upper)

@@ -1,11 +1,11 @@
-"""Files of libraries: a header of text, then arrays that are mapped into memory; no pickle.
+"""Library files: a text header, then arrays that are memory-mapped; no pickle.
 
     planner-jax block library 1
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
-The second line is JSON: the setting's hash, faces with cells, links of the arm's capsules, type,
-shape and offset of every array by name, and the file's size. Blanks fill it up to the first array.
-Arrays are little-endian, in C order, and begin at multiples of 64 bytes.
+The second line is JSON: the hash of the setting, the faces and their cells, the links of the arm's
+capsules, type, shape and offset of every array by name, and the file's size. Blanks pad it to the
+first array. Arrays are little-endian, in C order, and start at multiples of 64 bytes.
 """
 
 import dataclasses
@@ -29,49 +29,49 @@ from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
-BUILD_VERSION = 1  # of how libraries are planned: a build does not continue another version's
+BUILD_VERSION = 1  # of the planning method; a build does not resume the parts of another version
 _MAGIC = "planner-jax block library"
 _ALIGNED, _LONGEST = 64, 1 << 20  # bytes
 
 
 def save_library(path: str | os.PathLike, library: Library) -> None:
-    """Write a library, whole or not at all.
+    """Write a library atomically.
 
     Raises:
         OSError: the file cannot be written.
     """
     table, setting = library.table, library.setting
     arrays = {"rows": np.asarray(table.rows, "<f4"), "homes": np.asarray(table.homes, "<f4")}
-    arrays |= {name: _plain(leaf) for name, leaf in leaves_by_name(setting).items()}
+    arrays |= {name: _to_stored(leaf) for name, leaf in leaves_by_name(setting).items()}
     header: dict[str, object] = {
         "fingerprint": fingerprint(setting),
         "layout": dataclasses.asdict(table.layout),
         "links": list(setting.arm.capsule_link),
     }
-    places, end = {}, 0
+    offsets, end = {}, 0
     for name, array in arrays.items():
-        places[name] = end
-        end = _up(end + array.nbytes)
+        offsets[name] = end
+        end = _align(end + array.nbytes)
     kinds = {name: [array.dtype.str, list(array.shape)] for name, array in arrays.items()}
 
     def text(begin: int) -> bytes:
-        header["arrays"] = {name: [*kinds[name], begin + places[name]] for name in arrays}
+        header["arrays"] = {name: [*kinds[name], begin + offsets[name]] for name in arrays}
         header["size"] = begin + end
         return f"{_MAGIC} {VERSION}\n{json.dumps(header)}\n".encode()
 
-    begin = _up(len(text(1 << 40)))
+    begin = _align(len(text(1 << 40)))
     with replacing(path) as scratch, open(scratch, "wb") as file:
         lines = text(begin)
         file.write(lines[:-1] + b" " * (begin - len(lines)) + b"\n")
         for array in arrays.values():
-            file.write(array.tobytes() + bytes(_up(array.nbytes) - array.nbytes))
+            file.write(array.tobytes() + bytes(_align(array.nbytes) - array.nbytes))
 
 
 def load_library(path: str | os.PathLike) -> Library:
-    """Load the library that `save_library` wrote; its table is mapped, and read when it is used.
+    """Load the library that `save_library` wrote; its table is memory-mapped and read on access.
 
     Raises:
-        ArgumentError: the file is not there, is something else, of another version, or cut off.
+        ArgumentError: the file is missing, truncated, of another version, or not a library.
     """
     shown = repr(os.fspath(path))
     try:
@@ -110,7 +110,7 @@ def load_library(path: str | os.PathLike) -> Library:
 
 
 def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
-    """Return the library that a header describes, its rows mapped."""
+    """Return the library that a header describes, with memory-mapped rows."""
     arrays: dict[str, PyTree] = {}
     for name, (kind, shape, place) in header["arrays"].items():
         mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))
@@ -127,13 +127,13 @@ def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
     return library_of(rows, homes, layout, setting)
 
 
-def _plain(leaf: ArrayLike) -> np.ndarray:
-    """Return a leaf as the array that is written."""
+def _to_stored(leaf: ArrayLike) -> np.ndarray:
+    """Convert a leaf to the array type of the file."""
     value = np.ascontiguousarray(leaf)
     return value.astype({"f": "<f4", "b": "|b1"}.get(value.dtype.kind, "<i4")).reshape(
         np.shape(leaf)
     )
 
 
-def _up(size: int) -> int:
+def _align(size: int) -> int:
     return -(-size // _ALIGNED) * _ALIGNED

@@ -1,9 +1,9 @@
 """Least-time motions to the shield poses of one pair of cells [Natarajan2024, Algorithm 1].
 
-The paper plans to equidistant points of the centreline and stores the plan of least time. A nominal
-ball flies here from the middle of the one cell to that of the other. Of two motions the better one
-is that for which the ball may come earlier: a pose farther in gives the arm more time. This is
-the paper's least time for a ball that is infinitely fast.
+The paper plans to equidistant points of the centreline and stores the plan of least time. Here a
+nominal ball flies from the centre of one cell to the centre of the other. Of two motions the better
+one allows the earlier entry of the ball: a pose farther inside gives the arm more time. For an
+infinitely fast ball this equals the paper's least time.
 """
 
 import dataclasses
@@ -36,27 +36,28 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
 from planner_jax.task.block.motion import angles_at, bump_steps, sums
 
-# How far a stored pose may be off the nominal ball's way, [m] and [rad]: the paper allows "a small
-# tolerance". Where no pose within it is reached, a shield that blocks a part is better than none.
+# Tolerance of a stored pose relative to the nominal ball, [m] and [rad]: the paper allows "a small
+# tolerance". If no pose is within it, a shield that blocks a part of the tunnel is better than no
+# shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-_PATIENCE = 0.8  # [s], later than the quickest motion if nothing were in the way, at most
-_ROLL = np.deg2rad(1.0)  # [rad], greatest of a shield that is to block a whole tunnel
-_TOUCHING = 10.0  # [s], added to the entry times of poses that touch something: they come last
-# How near to both cells a shield may be, as shares of the way between: fine and coarse. Across an
-# oblique tunnel, planes farther out cut a cell.
+_PATIENCE = 0.8  # [s], latest entry after the quickest motion without obstacles
+_ROLL = np.deg2rad(1.0)  # [rad], greatest roll of a shield that must block a whole tunnel
+_TOUCHING = 10.0  # [s], added to the entry times of poses that collide, so that they come last
+# Least distance of a shield from both cells, as a fraction of the distance between them: fine and
+# coarse. In an oblique tunnel, planes closer to a cell would cut it.
 _NEAREST = (0.1, 0.02)
 
 
 @struct.dataclass
 class PairCase:
-    """A pair of cells to plan for, and where to begin."""
+    """A pair of cells to plan for, and an initial guess."""
 
-    outer: Array  # (2, 3) [m], corners of the outer cell's part that sees the inner one
+    outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
-    is_coarse: Array  # () bool, whether a shield will do that blocks only a part of the tunnel
-    best: Array  # () [s], entry time that has been reached; infinite if none has
-    start: Array  # () int32, number of a learned start; -1 begins with `given`
-    given: Array  # (6 K + 1,), unknowns of a motion that may no longer be free
+    is_coarse: Array  # () bool, whether blocking a part of the tunnel suffices
+    best: Array  # () [s], best entry time so far; infinite without a motion
+    start: Array  # () int32, number of a learned start; -1 starts from `given`
+    given: Array  # (6 K + 1,), unknowns of a motion that may collide
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -69,27 +70,28 @@ class PairPlan(Plan):
     """A motion to a pose of the shield; the cost is the ball's earliest entry time [s]."""
 
     point: Array  # (6 K + 1,), unknowns of `OnlineBlock`: steps and duration of the motion
-    quickest: Array  # () [s], the entry time that a motion through obstacles would reach
+    quickest: Array  # () [s], entry time of the quickest motion without obstacles
 
 
 @struct.dataclass
 class PairPlanner(Planner):
-    """What both planners of pairs share: where the arm starts, and its surroundings.
+    """Base of both planners of pairs: the arm's start, and its surroundings.
 
-    The shield's edges lie along those of the frame whose second axis is horizontal, as those of
-    cells on upright faces do; of the four equal rolls the nearest to the arm's own is taken.
+    The shield's edges are parallel to the frame whose second axis is horizontal, as are the edges
+    of cells on upright faces. Of the four equivalent rolls the one nearest to the arm's own is
+    used.
     """
 
     setting: Setting
     home: Array  # (6,) [rad]
     online: OnlineBlock = struct.field(pytree_node=False, default=OnlineBlock())
-    points: int = struct.field(pytree_node=False, default=5)  # of the centreline
+    points: int = struct.field(pytree_node=False, default=5)  # points of the centreline
 
     case_type: ClassVar[type] = PairCase
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return the nominal ball as a case, getting into the outer box at a time () [s]."""
+        """Return the nominal ball, entering the outer box at a time () [s], as case and flight."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -115,9 +117,9 @@ class PairPlanner(Planner):
 
         Returns:
             Poses whose `time` is the duration of the quickest straight motion [s], and whose
-            `effort` is the entry time [s] that it leaves the ball, `_TOUCHING` later where the
-            arm would touch something; infinite where there is no pose, or where the shield does
-            not block the whole tunnel though it is to.
+            `effort` is the entry time [s] that this motion allows. The effort is `_TOUCHING`
+            greater if the arm would touch something. It is infinite if the pose does not exist, or
+            if its shield does not block the whole tunnel as required.
         """
         online, arm, limits = self.online, self.setting.arm, self.setting.limits
         ball, span = nominal_ball(pair.outer, pair.inner)
@@ -156,7 +158,7 @@ class PairPlanner(Planner):
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return `OnlineBlock.model`, and the shield's roll against the frame of `face_ball`."""
+        """Return `OnlineBlock.model` plus a cost of the shield's roll relative to `face_ball`."""
         online = self.online
         model = online.model(point, case, flight)
         moves, first, _ = online.decode(case, point)
@@ -180,8 +182,8 @@ class PairPlanner(Planner):
             violation=jnp.maximum(model.violation, off),
         )
 
-    def planned(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the plan of a point, checked as in `OnlineBlock`, that blocks the whole tunnel."""
+    def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
+        """Return the plan of a point after the checks of `OnlineBlock` and of the whole tunnel."""
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)
@@ -201,14 +203,14 @@ class PairPlanner(Planner):
 
 @struct.dataclass
 class StraightPair(PairPlanner):
-    """The straight motion of the joints that is free and lets the ball come earliest.
+    """A planner that selects the free straight joint motion with the earliest ball entry.
 
-    It looks at one after another, those of the earliest balls first.
+    It checks motions one after another, in the order of entry times.
     """
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One."""
+        """The only attempt."""
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
@@ -223,7 +225,7 @@ class StraightPair(PairPlanner):
             place = order[k]
             point = self.online.encode_straight(case, poses, place)
             entry = jnp.where(k < possible, poses.effort[place], 0.0)
-            return k + 1, self.planned(pair, point, entry, jnp.zeros((), jnp.int32))
+            return k + 1, self.plan_at(pair, point, entry, jnp.zeros((), jnp.int32))
 
         def is_open(state: tuple) -> Array:
             k, plan = state
@@ -256,7 +258,7 @@ def _entry(effort: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """Least squares, again and again with less time or with more; static."""
+    """Repeated least squares with less or more time; static."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -266,21 +268,21 @@ class Bends(Attempt):
 
 @struct.dataclass
 class BentPair(PairPlanner):
-    """A motion around what is in the way, by least squares of `OnlineBlock` from a learned start.
+    """A planner that avoids obstacles by the least squares of `OnlineBlock` from a learned start.
 
-    By bisection between the entry time of the best motion so far and that of the quickest one, were
-    nothing in the way; without any, from `_PATIENCE` later than the latter.
+    It bisects the entry time between the best motion so far and the quickest motion without
+    obstacles. Without a motion so far, the upper bound is `_PATIENCE` after the quickest one.
     """
 
     search: Bends = struct.field(pytree_node=False, default=Bends())
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """The one search."""
+        """The only search."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair from its start, with the status of the last solved round."""
+        """Return the plan of one pair from its start: the last solved round."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -295,23 +297,23 @@ class BentPair(PairPlanner):
         learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
-        # A given motion ends on the nominal ball's way about where its own pose did.
+        # A given motion meets the nominal ball approximately in the middle of the tunnel.
         span = nominal_ball(pair.outer, pair.inner)[1]
         entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
         none = jnp.isinf(pair.best)
         high = jnp.where(none, quickest + _PATIENCE, pair.best)
         first = jnp.where(none, high, 0.5 * (quickest + high))
 
-        def at(point: Array, old: Array, new: Array) -> Array:
-            """Return the same motion for a ball that enters at another time [s]."""
+        def shift(point: Array, old: Array, new: Array) -> Array:
+            """Shift a motion to a ball that enters at another time [s]."""
             return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
 
         def one_round(k: Array, state: tuple) -> tuple:
             low, high, tried, point, of_point, best = state
             case, flight = self.case_of(pair, tried)
             model = lambda point: self.model(pair, point, case, flight)  # noqa: E731
-            end = least_squares(model, at(point, of_point, tried), attempt.solver)
-            plan = self.planned(pair, end.point, tried, end.steps)
+            end = least_squares(model, shift(point, of_point, tried), attempt.solver)
+            plan = self.plan_at(pair, end.point, tried, end.steps)
             good = is_solved(plan.status)
             best = jax.tree.map(lambda new, old: jnp.where(good, new, old), plan, best)
             low, high = jnp.where(good, low, tried), jnp.where(good, tried, high)
@@ -329,8 +331,8 @@ class BentPair(PairPlanner):
 
         def is_open(state: tuple) -> Array:
             k, (_, _, _, _, _, best) = state
-            goes_on = (k == 0) | ~none | is_solved(best.status)
-            return (k < attempt.rounds) & goes_on & (possible > 0)
+            continues = (k == 0) | ~none | is_solved(best.status)
+            return (k < attempt.rounds) & continues & (possible > 0)
 
         state = (quickest, high, first, start, entry, nothing)
         _, state = lax.while_loop(

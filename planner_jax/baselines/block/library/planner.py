@@ -1,4 +1,4 @@
-"""The planner that looks motions up; see `planner_jax.baselines.block.library.table`."""
+"""The planner that looks up motions; see `planner_jax.baselines.block.library.table`."""
 
 import os
 from typing import ClassVar
@@ -8,19 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
-from jax.typing import ArrayLike
 
-from planner_jax.ball.flight import BallState
 from planner_jax.baselines.block.library.file import load_library
 from planner_jax.baselines.block.library.table import (
-    Answer,
     Library,
     Setting,
     Table,
     fingerprint,
     lookup,
     setting_of,
-    unpacked,
 )
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
@@ -30,19 +26,19 @@ from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan, has_nan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_SAME_START = 1e-4  # [rad] and [rad/s], how exactly the arm has to be where stored motions begin
+_SAME_START = 1e-4  # [rad] and [rad/s], tolerance of the arm's state at a home
 
 
 @struct.dataclass
 class LibraryBlock(Planner):
-    """Answers with the stored motion of a ball's pair of cells; the cost is its duration [s].
+    """A planner that answers with the stored motion of a ball's pair of cells.
 
-    The arm stands at a home of the library. A motion that must end at rest begins when the arm may
-    start, and the shield then waits; any other one begins so late that it ends at the contact.
-    Where nothing is stored for a ball the status is OUT_OF_REACH; it is BLOCKED where the arm does
-    not stand at a home, or where the case has another arm, other limits or another scene than the
-    library, as `check` says on the host. A stored motion that comes too late, or a ball farther off
-    the shield's middle than the case allows, is INFEASIBLE.
+    The cost is the motion's duration [s]. The arm stands at a home of the library. A motion that
+    must end at rest starts as soon as the arm may start, and the shield then waits; any other
+    motion starts so late that it ends at the contact. The status is OUT_OF_REACH if nothing is
+    stored for a ball. It is BLOCKED if the arm does not stand at a home, or if arm, limits or scene
+    differ from the library's; `check` reports the same on the host. It is INFEASIBLE if the stored
+    motion is too late, or if the ball passes farther from the shield's centre than the case allows.
     """
 
     library: Library
@@ -51,24 +47,24 @@ class LibraryBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One: an answer does not get better."""
+        """The only attempt: a lookup cannot be improved."""
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the first of the cases is what the library was built for.
+        """Raise `ArgumentError` unless the library was built for the first of the cases.
 
         Args:
-            cases: one, or a batch.
+            cases: one case, or a batch.
         """
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)
-        own, asked = fingerprint(self.library.setting), fingerprint(setting_of(first))
-        if own != asked:
+        own, other = fingerprint(self.library.setting), fingerprint(setting_of(first))
+        if own != other:
             raise ArgumentError(
                 "library",
                 "of the cases' arm, limits and scene",
-                shown=f"one of {own} for cases of {asked}",
+                shown=f"one of {own} for cases of {other}",
             )
         homes = np.asarray(self.library.table.homes)
         off = np.abs(homes - first.angles).max(axis=1).min()
@@ -80,7 +76,7 @@ class LibraryBlock(Planner):
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plan of one case; pure."""
         home, fits = self.home_of(case)
-        plan = _answered(self.library.table, case, home)
+        plan = _plan_from_answer(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
         status = jnp.where(has_nan(case), Status.NON_FINITE, status)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
@@ -93,50 +89,10 @@ class LibraryBlock(Planner):
         return home, fits & _is_same(self.library.setting, setting_of(case))
 
 
-class OneBall:
-    """Looks up one ball after another at the least latency, by a program compiled for the CPU.
-
-    A ball goes in as one vector and its answer comes back as one: every array that crosses into a
-    compiled program, or out of it, costs a microsecond. The motion is left as it is stored.
-    """
-
-    def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
-        """Compile the lookup of a library, for an arm that waits at one of its homes."""
-        own = library.table
-
-        def packed(rows: Array, vector: Array) -> Array:
-            table = Table(
-                rows=rows, homes=own.homes, inner=own.inner, outer=own.outer, layout=own.layout
-            )
-            ball = BallState(pos=vector[:3], vel=vector[3:])
-            found = lookup(table, ball, jnp.asarray(gravity, vector.dtype), home)
-            numbers = (found.pair, found.stored, found.time, found.slack, *found.beside)
-            numbers = jnp.stack([jnp.asarray(x, vector.dtype) for x in (*numbers, found.cosine)])
-            return jnp.concatenate([rows[home, found.pair], numbers])
-
-        self._rows = jax.device_put(own.rows, jax.local_devices(backend="cpu")[0])
-        vector = jax.ShapeDtypeStruct((6,), np.float32)
-        self._lookup = jax.jit(packed).lower(self._rows, vector).compile()
-
-    def answer(self, pos: ArrayLike, vel: ArrayLike) -> Answer:
-        """Look up a ball; return the answer in NumPy arrays and plain numbers.
-
-        Args:
-            pos: (3,) [m], when it is first seen.
-            vel: (3,) [m/s].
-        """
-        vector = np.empty(6, np.float32)
-        vector[:3], vector[3:] = pos, vel
-        found = np.asarray(self._lookup(self._rows, vector))
-        pair, stored, time, slack, along, across, cosine = found[-7:].tolist()
-        row = unpacked(found[:-7])
-        return Answer(row, int(pair), bool(stored), time, slack, (along, across), cosine)
-
-
-def _is_same(own: Setting, asked: Setting) -> Array:
-    """Return whether two settings are equal, () bool; false where their shapes differ."""
-    mine, theirs = jax.tree.leaves(own), jax.tree.leaves(asked)
-    if jax.tree.structure(own) != jax.tree.structure(asked) or any(
+def _is_same(own: Setting, other: Setting) -> Array:
+    """Return whether two settings are equal, () bool; False if their shapes differ."""
+    mine, theirs = jax.tree.leaves(own), jax.tree.leaves(other)
+    if jax.tree.structure(own) != jax.tree.structure(other) or any(
         np.shape(a) != np.shape(b) for a, b in zip(mine, theirs, strict=True)
     ):
         return jnp.zeros((), bool)
@@ -149,12 +105,12 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
     """Return the planner of a file that `planner-jax library build` wrote.
 
     Raises:
-        ArgumentError: the file is no whole library; one line.
+        ArgumentError: the file is not a complete library.
     """
     return LibraryBlock(load_library(file))
 
 
-def _answered(table: Table, case: BlockCase, home: Array) -> BlockPlan:
+def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     """Return the plan of a case whose arm stands at a home."""
     answer = lookup(table, case.ball, case.gravity, home)
     row, stored = answer.row, answer.stored
@@ -162,12 +118,12 @@ def _answered(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     duration = jnp.where(stored, row.duration, 1.0).astype(dtype)
     steps = jnp.where(stored, row.steps, 0.0).astype(dtype)
     contact = jnp.where(stored, answer.time, case.delay + duration)
-    room = contact - case.delay - duration
-    wait = jnp.where(case.ends_at_rest, 0.0, jnp.maximum(room, 0.0))
+    spare = contact - case.delay - duration
+    wait = jnp.where(case.ends_at_rest, 0.0, jnp.maximum(spare, 0.0))
     start = jnp.asarray(table.homes)[home].astype(dtype)
     motion = polynomial(start, jnp.zeros_like(start), steps, duration)
     waits = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(start)
-    # What counts is whether it is on time; a limit of the contact may be met to a tolerance.
+    # Arrival must be in time exactly; limits of the contact have a tolerance.
     early = (1.0 + FEASIBILITY_TOLERANCE) * duration / jnp.maximum(contact - case.delay, 1e-6)
     beside = jnp.stack(answer.beside)
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))

@@ -1,9 +1,9 @@
-"""The library: a stored motion for every pair of cells, and how a ball's is looked up.
+"""The library: a stored motion for every pair of cells, and the lookup of a ball's motion.
 
-A lookup is two intersections of the ball's parabola with the boxes, two cells, and one row of a
-table [Natarajan2024, Section IV-D2]. It takes as long for every ball and searches nothing. What is
-added to the paper's is the moment at which this very ball crosses the plane of the shield that
-waits for it, and where on the shield.
+A lookup intersects the ball's parabola with both boxes, which gives two cells, and reads one row of
+a table [Natarajan2024, Section IV-D2]. Its time is the same for every ball, without a search. In
+addition to the paper's lookup, this one computes when and where the ball crosses the plane of the
+shield.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from planner_jax.task.block.scene import Box, Scene, entry_time
 
 @struct.dataclass
 class Setting:
-    """What motions are planned for, besides a ball and where the arm starts."""
+    """Everything that motions are planned for, except the ball and the arm's start."""
 
     arm: Arm
     limits: ArmLimits
@@ -43,7 +43,7 @@ def setting_of(case: BlockCase) -> Setting:
 
 
 def fingerprint(setting: Setting) -> str:
-    """Return twelve hexadecimal digits that identify a setting, of all its float32 numbers."""
+    """Return twelve hexadecimal digits, a hash of all numbers of a setting in float32."""
     digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
         value = np.asarray(leaf)
@@ -55,24 +55,24 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """What a lookup reads. Row p of a home is `Row`s fields for pair p, one after another."""
+    """The data of a lookup. Row p of a home has the fields of `Row` for pair p."""
 
     rows: Array | np.ndarray  # (H, P, 6 K + 10) float32
-    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions begin, at rest
+    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions start, at rest
     inner: Box
     outer: Box
     layout: Layout = struct.field(pytree_node=False)
 
 
 class Row(NamedTuple):
-    """A stored motion and the shield at its end; also a batch, with leading axes.
+    """A stored motion and the shield's pose at its end; also a batch, with leading axes.
 
-    A tuple, as is `Answer`: on the host it is made in a tenth of the time of a dataclass.
+    `Row` and `Answer` are tuples, which are created on the host in a tenth of a dataclass's time.
     """
 
     steps: Array | np.ndarray  # (K, 6) [rad], see `planner_jax.task.block.motion`
-    duration: Array | np.ndarray  # () [s]; infinite where no motion is stored
-    middle: Array | np.ndarray  # (3,) [m], of the shield's face
+    duration: Array | np.ndarray  # () [s]; infinite if no motion is stored
+    middle: Array | np.ndarray  # (3,) [m], centre of the shield's face
     normal: Array | np.ndarray  # (3,) unit
     edge: Array | np.ndarray  # (3,) unit, along one of its edges
 
@@ -82,16 +82,16 @@ def pieces_of(rows: Array | np.ndarray) -> int:
     return (rows.shape[-1] - 10) // 6
 
 
-def packed(row: Row) -> np.ndarray:
-    """Return rows (..., 6 K + 10) of a table, float32."""
+def pack_rows(row: Row) -> np.ndarray:
+    """Pack rows into a table's format (..., 6 K + 10), float32."""
     steps, duration = np.asarray(row.steps), np.asarray(row.duration)
     flat = steps.reshape(*steps.shape[:-2], -1)
     parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
     return np.concatenate(parts, axis=-1).astype(np.float32)
 
 
-def unpacked(values: Array | np.ndarray) -> Row:
-    """Return the fields of rows (..., 6 K + 10) of a table."""
+def unpack_rows(values: Array | np.ndarray) -> Row:
+    """Split rows (..., 6 K + 10) of a table into their fields."""
     pieces = pieces_of(values)
     rest = values[..., 6 * pieces :]
     return Row(
@@ -104,34 +104,33 @@ def unpacked(values: Array | np.ndarray) -> Row:
 
 
 class Answer(NamedTuple):
-    """What the table has for a ball, and how the ball meets the shield at the motion's end."""
+    """The table's entry for a ball, and where the ball crosses the shield at the motion's end."""
 
     row: Row
-    pair: Array | int  # () int32, number of the pair of cells; 0 without one
+    pair: Array | int  # () int32, number of the pair of cells; 0 without a pair
     stored: Array | bool  # () bool, whether the ball goes through two cells with a stored motion
-    time: Array | float  # () [s], when it crosses the plane of the shield
-    slack: Array | float  # () [s], since it is in the outer box, or until it is in the inner one
-    beside: tuple[
-        Array | float, Array | float
-    ]  # () [m] each, along the shield's edges from its middle
-    cosine: Array | float  # (), of the angle between the shield's normal and the ball's way
+    time: Array | float  # () [s], when the ball crosses the plane of the shield
+    slack: Array | float  # () [s], time since the outer or until the inner box, the lesser one
+    # () [m] each, distance of the crossing from the shield's centre along its edges
+    beside: tuple[Array | float, Array | float]
+    cosine: Array | float  # (), of the angle between shield normal and reversed ball velocity
 
 
 def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
     """Look up one ball, in constant time and without a search; pure.
 
-    By components, so that a compiled program of one ball has few loops.
+    It computes with scalars, so that the compiled program of one ball has few loops.
 
     Args:
         table: of a library.
-        ball: when it is first seen.
+        ball: at time 0.
         gravity: () [m/s^2], magnitude.
-        home: () int32, from which of the homes.
+        home: () int32, index of the home.
     """
     layout = table.layout
 
     def at(time: Array) -> tuple[list[Array], list[Array]]:
-        """Return where the ball is [m], and its velocity [m/s]."""
+        """Return the position [m] and the velocity [m/s] of the ball at a time."""
         x, y, z = (ball.pos[k] + ball.vel[k] * time for k in range(3))
         fall = gravity * time
         return [x, y, z - 0.5 * fall * time], [ball.vel[0], ball.vel[1], ball.vel[2] - fall]
@@ -143,8 +142,8 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     last, is_last = cell_of(layout.inner, table.inner, at(inside)[0])
     passes = enters & hits & is_first & is_last & (inside > outside)
     pair = jnp.where(passes, first * layout.num_inner + last, 0)
-    row = unpacked(table.rows[home, pair])
-    # The nearer root of the way to the plane, a parabola in time.
+    row = unpack_rows(table.rows[home, pair])
+    # The earlier root of the distance to the plane, a parabola in time.
     middle, normal, edge = (tuple(each) for each in (row.middle, row.normal, row.edge))
     away = _dot(normal, _minus(place, middle))
     toward = -_dot(normal, velocity)
@@ -179,19 +178,19 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 @struct.dataclass
 class Library:
-    """Stored motions, and all that they were planned for."""
+    """Stored motions with their setting."""
 
     table: Table
     setting: Setting
 
     @property
     def found(self) -> np.ndarray:
-        """Which pairs have a motion, (H, P) bool."""
-        return np.isfinite(np.asarray(unpacked(self.table.rows).duration))
+        """Whether each pair has a motion, (H, P) bool."""
+        return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the table."""
+        """The memory of the table in bytes."""
         return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.table))
 
 
@@ -204,11 +203,11 @@ def library_of(
     return Library(table=table, setting=setting)
 
 
-def moved(library: Library, scene: Scene) -> Library:
-    """Return the same motions in another scene with the same boxes.
+def with_scene(library: Library, scene: Scene) -> Library:
+    """Return the same motions with another scene that has the same boxes.
 
     Raises:
-        ValueError: a box is another one, so that cells would be others.
+        ArgumentError: a box differs, so that the cells would differ.
     """
     own = library.setting.scene
     for name, old, new in (("inner", own.inner, scene.inner), ("outer", own.outer, scene.outer)):
