@@ -12,7 +12,7 @@ import numpy as np
 
 from planner_jax.robot.arm import Arm, link_frames
 from planner_jax.sims.calibrate import Calibration, calibrate, pose
-from planner_jax.studies.block.camera import Camera, in_view, placed, to_camera
+from planner_jax.studies.block.camera import Camera, in_view, move_camera, to_camera
 from planner_jax.studies.block.noise import StereoNoise, depth_std
 
 _CORNERS = 6  # each way
@@ -77,4 +77,4 @@ def calibrated(
 ) -> tuple[Camera, Calibration]:
     """The camera where `num` views of the board say that it stands, and the calibration itself."""
     found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
-    return placed(camera, found.camera), found
+    return move_camera(camera, found.camera), found

@@ -165,7 +165,7 @@ def corridors(lines):
 @pytest.mark.parametrize("kind", ["tilted", "edges", "flat"])
 def test_nothing_between_the_lines_of_a_corridor_is_inside_of_a_polygon(lines, corridors, kind):
     problems, found = lines
-    # Bounds are convex: linear interpolation between SHARES stays within them.
+    # Lower bounds are convex and upper ones concave, so that interpolation stays within them.
     fine = np.linspace(0.0, 1.0, 401)
     grid = np.array([np.interp(fine, SHARES, unit) for unit in np.eye(9)])
     lower, upper = (np.clip(bound, 0.0, 6.0) @ grid for bound in corridors[kind][1])

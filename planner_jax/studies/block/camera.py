@@ -71,6 +71,12 @@ def looking_at(
     return from_numbers(pinhole, rotation=rotation, position=position, focal=focal)
 
 
+def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
+    """Return a camera at a pose (4, 4), such as the result of a calibration."""
+    moved = functools.partial(Camera, focal=camera.focal, size=camera.size)
+    return from_numbers(moved, rotation=pose[:3, :3], position=pose[:3, 3])
+
+
 def to_camera(camera: Camera, points: Array) -> Array:
     """Convert points (..., 3) [m] from the world frame to the camera frame."""
     away = points - camera.position
