@@ -97,7 +97,7 @@ def test_a_recovery_that_does_not_rest_fails_by_name(hits, braked):
     moving.durations[:, -1] *= 0.5
     verdict = pj.hit.judge(hits, dataclasses.replace(braked, recovery=moving))
     assert (verdict.failed_limit == "recovery").all()
-    assert "way to rest" in verdict.sentence(0)
+    assert "does not end at standstill" in verdict.sentence(0)
 
 
 def test_limits_hold_behind_the_contact_too(hits, braked):

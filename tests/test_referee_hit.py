@@ -459,10 +459,10 @@ def test_processes_judge_as_threads_do(monkeypatch):
     monkeypatch.setattr(judging, "_MANY_CORES", 1)
     monkeypatch.setattr(judging, "_MANY_LANES", 1)
     in_processes = judging.judge_in_chunks(_halved, case, 256)
-    assert workers.workers.cache_info().currsize == 1
+    assert workers._start_workers.cache_info().currsize == 1
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
-        workers.workers().map(_refuse, [1, 2])
+        workers.map_in_processes(_refuse, [1, 2])
 
 
 @pytest.mark.parametrize(("told", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])

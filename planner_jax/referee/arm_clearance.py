@@ -1,12 +1,13 @@
-"""How far a six-axis arm with a shield stays from what it must not touch, in float64 NumPy.
+"""Clearance of a six-axis arm with a shield from obstacles and from itself, in float64 NumPy.
 
-It shares no code with the planners. Base frame of the arm, z up, SI units. Arrays of B lanes and
-S samples have the components of their vectors first, (3, B, S); what stands still has S = 1.
+Base frame of the arm, z up, SI units. Arrays of B lanes and S samples have the components of their
+vectors first, (3, B, S), with S = 1 for solids at rest. Links are modelled by capsules, and the
+shield by a square plate, 0.01 m thick behind its face. The pairs of solids are:
 
-The links are their capsules, the shield is a square plate, 0.01 m thick behind its face. Every
-moving link and the shield keep off the floor, the pole and the beams of the rig; all of these but
-link 1, which stands on it, off the base; links 3 to 6 and the shield off link 1; and the shield
-off links 2 to 4, of which link 4 is thinner there (`_beside_shield`). Links 5 and 6 carry it.
+- floor, pole and beams of the rig: every moving link, and the shield;
+- base: links 2 to 6 and the shield, since link 1 stands on the base;
+- link 1: links 3 to 6 and the shield;
+- shield: links 2 to 4, with a thinner link 4 (`_beside_shield`); links 5 and 6 carry the shield.
 """
 
 import dataclasses
@@ -21,108 +22,106 @@ from planner_jax.referee.solids import (
     dot,
     from_segment,
     length,
+    rotate,
+    rotate_back,
     segment_to_box,
-    turned,
-    turned_back,
 )
 
 KINDS = ("floor", "pole", "rig", "base", "self")
 THICKNESS = 0.01  # [m], of the shield
-_POLE_HALF = 1e3  # [m], half the length of the pole, which is to have no end
-# What rounding may do to a bound [m].
-_SLACK = 1e-9
-# Links 1 to 6 are 0 to 5 in an arm, and this is the base.
-_BASE = -1
+_POLE_HALF = 1e3  # [m], half the length of the pole, practically infinite
+_SLACK = 1e-9  # [m], rounding error of a bound
+_BASE = -1  # index of the base, where links 1 to 6 have indices 0 to 5
 
 
 @dataclasses.dataclass(frozen=True)
 class _Capsule:
-    """One capsule at every sample."""
+    """A capsule at every sample."""
 
     name: str
     link: int
-    first: np.ndarray  # (3, B, S) [m], one end of its axis
-    second: np.ndarray  # (3, B, S) [m], the other one
+    first: np.ndarray  # (3, B, S) [m], first end of the axis
+    second: np.ndarray  # (3, B, S) [m], second end of the axis
     radius: np.ndarray  # (B, 1) [m]
 
     @property
     def middle(self) -> np.ndarray:
-        """(3, B, S) [m]."""
+        """Middle (3, B, S) [m]."""
         return 0.5 * (self.first + self.second)
 
     @property
     def reach(self) -> np.ndarray:
-        """Radius (B, 1) [m] of the sphere around it."""
+        """Radius (B, 1) [m] of the bounding sphere."""
         return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
-        """Return height (B, S) [m] of its lowest point."""
+        """Return the height (B, S) [m] of the lowest point."""
         return np.minimum(self.first[2], self.second[2]) - self.radius
 
-    def from_point(self, point: np.ndarray) -> np.ndarray:
-        """Return distances (B, S) [m] of points (3, B, S)."""
+    def distance_to_point(self, point: np.ndarray) -> np.ndarray:
+        """Return the distances (B, S) [m] to points (3, B, S)."""
         return from_segment(point, self.first, self.second) - self.radius
 
-    def from_capsule(self, other: "_Capsule") -> np.ndarray:
-        """Return distances (P,) [m] of capsules, of both at P samples."""
+    def distance_to_capsule(self, other: "_Capsule") -> np.ndarray:
+        """Return the distances (P,) [m] to capsules at the same P samples."""
         apart = between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
-        """Return the capsules at P samples of lanes, (3, P) and (P,)."""
-        first, second = (_picked(end, lane, sample) for end in (self.first, self.second))
+        """Select P samples of lanes: ends (3, P) and radii (P,)."""
+        first, second = (_pick_samples(end, lane, sample) for end in (self.first, self.second))
         return _Capsule(self.name, self.link, first, second, self.radius[lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Box:
-    """One box at every sample."""
+    """A box at every sample."""
 
     name: str
     middle: np.ndarray  # (3, B, S) [m]
-    turn: np.ndarray  # (3, 3, B, S), out of its frame
+    turn: np.ndarray  # (3, 3, B, S), rotation from the frame of the box
     half: np.ndarray  # (3, B, 1) [m], half edges
 
     @property
     def reach(self) -> np.ndarray:
-        """Radius (B, 1) [m] of the sphere around it."""
+        """Radius (B, 1) [m] of the bounding sphere."""
         return length(self.half)
 
     def lowest(self) -> np.ndarray:
-        """Return height (B, S) [m] of its lowest point."""
+        """Return the height (B, S) [m] of the lowest point."""
         return self.middle[2] - sum(np.abs(self.turn[2, k]) * self.half[k] for k in range(3))
 
-    def from_point(self, point: np.ndarray) -> np.ndarray:
-        """Return distances (B, S) [m] of points (3, B, S)."""
-        inside = turned_back(self.turn, point - self.middle)
+    def distance_to_point(self, point: np.ndarray) -> np.ndarray:
+        """Return the distances (B, S) [m] to points (3, B, S)."""
+        inside = rotate_back(self.turn, point - self.middle)
         return length(np.maximum(np.abs(inside) - self.half, 0.0))
 
-    def from_capsule(self, other: _Capsule) -> np.ndarray:
-        """Return distances (P,) [m] of capsules, of both at P samples."""
+    def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
+        """Return the distances (P,) [m] to capsules at the same P samples."""
         first, second = (
-            turned_back(self.turn, end - self.middle) for end in (other.first, other.second)
+            rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
         return segment_to_box(first, second, self.half) - other.radius
 
-    def from_box(self, other: "_Box") -> np.ndarray:
-        """Return distances (P,) [m] of boxes, of both at P samples."""
-        middle = turned_back(self.turn, other.middle - self.middle)
-        turn = np.stack([turned_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
+    def distance_to_box(self, other: "_Box") -> np.ndarray:
+        """Return the distances (P,) [m] to boxes at the same P samples."""
+        middle = rotate_back(self.turn, other.middle - self.middle)
+        turn = np.stack([rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
         return between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
-        """Return the boxes at P samples of lanes, (3, P) and (3, 3, P)."""
-        middle, turn = (_picked(each, lane, sample) for each in (self.middle, self.turn))
+        """Select P samples of lanes: middles (3, P) and rotations (3, 3, P)."""
+        middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pair:
-    """Two solids, or one and the floor."""
+    """Two solids, or a solid and the floor."""
 
-    name: str  # of what comes too close
-    bound: np.ndarray  # (B, S) [m], which their distance is not below
-    exact: Callable[[np.ndarray, np.ndarray], np.ndarray]  # lanes and samples (P,) -> (P,) [m]
+    name: str  # of the parts of the arm
+    bound: np.ndarray  # (B, S) [m], lower bound of the distance
+    exact: Callable[[np.ndarray, np.ndarray], np.ndarray]  # lanes, samples (P,) -> distances (P,)
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
@@ -133,8 +132,8 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
         origin, quaternion, axis = (
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
-        place = place + turned(turn, origin)
-        # The joint's own turn, then Rodrigues' formula about its axis.
+        place = place + rotate(turn, origin)
+        # The fixed rotation of the joint's frame, then Rodrigues' formula about the joint's axis.
         cos, sin = np.cos(angles[k]), np.sin(angles[k])
         own, along = _rotation(quaternion), axis[:, None] * axis[None]
         still = _product(own, along)
@@ -145,27 +144,26 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
 
 
 def shield_middle(case: dict, turns: list, places: list) -> np.ndarray:
-    """Return middle (3, B, S) [m] of the shield's face; its outward normal is the last link's x."""
-    return places[5] + turned(turns[5], case["arm.shield_centre"].T[..., None])
+    """Return the middle (3, B, S) [m] of the shield's face, whose outward normal is link 6's x."""
+    return places[5] + rotate(turns[5], case["arm.shield_centre"].T[..., None])
 
 
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
-    """Return least distances of an arm from what it must not touch, by `KINDS`.
+    """Return the least distances between an arm and its obstacles, for each of `KINDS`.
 
-    Those of overlapping solids are less than zero: minus the depth, but for a capsule not less
-    than minus its radius, and for two not less than minus both. Pairs of solids and samples that
-    a sphere around one of the two shows to be farther apart than another pair of their kind and
-    lane are left out; the others are exact.
+    The distance of overlapping solids is minus the penetration depth, but for a capsule not below
+    minus its radius, and for two capsules not below minus the sum. Distances are exact; bounding
+    spheres exclude pairs of solids and samples that cannot have the least distance.
 
     Args:
-        case: leaves of B lanes.
+        case: arrays of B lanes.
         links: of the capsules, 0 to 5 for links 1 to 6, -1 for the base.
         angles: (6, B, S) [rad].
-        sampled: (B, S) bool, the samples that are looked at, at least one in each lane.
+        sampled: (B, S) bool, samples that count, at least one in each lane.
 
     Returns:
-        By kind: the least distance (B,) [m], infinite where there is nothing to touch; its sample
-        (B,); and the name (B,) of what comes so close.
+        By kind, the least distance (B,) [m], infinite without an obstacle; its sample (B,); and
+        the name (B,) of the part of the arm.
     """
     capsules, shield = _arm(case, links, angles)
     moving = [each for each in capsules if each.link != _BASE]
@@ -179,7 +177,7 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
     folded = [(body, part) for body in moving if body.link > 1 for part in first]
     guarded = [(part, shield) for part in (*first, *_beside_shield(case, links, capsules))]
     pairs = {
-        "floor": [_Pair(name, above, partial(_picked, above)) for name, above in heights],
+        "floor": [_Pair(name, above, partial(_pick_samples, above)) for name, above in heights],
         "pole": [_pair(body, pole, body.name) for body in bodies],
         "rig": [_pair(body, beam, body.name) for body in bodies for beam in beams],
         "base": [_pair(body, part, body.name) for body in off_base for part in base],
@@ -195,7 +193,7 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
     for k, link in enumerate(links):
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
         if link != _BASE:
-            first, second = (places[link] + turned(turns[link], end) for end in (first, second))
+            first, second = (places[link] + rotate(turns[link], end) for end in (first, second))
         name = "the base" if link == _BASE else f"link {link + 1}"
         radius = case["arm.capsule_radius"][:, k, None]
         capsules.append(_Capsule(name, link, first, second, radius))
@@ -206,12 +204,11 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
 
 
 def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
-    """Return the capsules of links 2 to 4, whose distance from the shield is tested like link 1's.
+    """Return the capsules of links 2 to 4 for the test against the shield.
 
-    A capsule around the whole of link 4, as thick as the forearm is wide, reaches through the
-    shield however the wrist is bent. The shield only ever comes at the forearm's narrow sides,
-    about the axis of joint 5: here the capsule is at most so thick that the shield touches it
-    when joint 5 is at 0.
+    Link 4 is wider than thick. A capsule as wide as link 4 would overlap the shield at any angle of
+    joint 5, but the shield approaches link 4 only at its narrow sides. Its radius is therefore
+    reduced to the value at which the shield touches it with joint 5 at 0.
     """
     num_lanes = len(case["arm.shield_half"])
     straight, shield = _arm(case, links, np.zeros((6, num_lanes, 1)))
@@ -228,7 +225,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """Return the pole; where there is none, one that nothing can touch."""
+    """Return the pole, with radius minus infinity where there is none."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -236,7 +233,6 @@ def _pole(case: dict) -> _Capsule:
 
 
 def _beams(case: dict) -> list[_Capsule]:
-    """Return the beams of the rig."""
     beams = []
     for k, radius in enumerate(case["scene.beam_radius"].T):
         first, second = case["scene.beam_ends"][:, k].transpose(1, 2, 0)[..., None]
@@ -245,30 +241,33 @@ def _beams(case: dict) -> list[_Capsule]:
 
 
 def _base_box(case: dict) -> _Box:
-    """Return the base."""
     lower, upper = (case["arm.base_box"][:, k].T[..., None] for k in range(2))
     turn = np.broadcast_to(np.eye(3)[..., None, None], (3, *lower.shape))
     return _Box("the base", 0.5 * (lower + upper), turn, 0.5 * (upper - lower))
 
 
 def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
-    """Return two solids, of which the first has the smaller sphere around it."""
+    """Return the pair of a small solid and a larger one, bounded by the sphere around the first."""
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
 
-    return _Pair(name, other.from_point(one.middle) - one.reach, exact)
+    return _Pair(name, other.distance_to_point(one.middle) - one.reach, exact)
 
 
 def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
-    """Return distances (P,) [m] of two solids at P samples."""
+    """Return the distances (P,) [m] between two solids at P samples."""
     if isinstance(one, _Capsule):
-        return other.from_capsule(one)
-    return one.from_capsule(other) if isinstance(other, _Capsule) else other.from_box(one)
+        return other.distance_to_capsule(one)
+    return (
+        one.distance_to_capsule(other)
+        if isinstance(other, _Capsule)
+        else other.distance_to_box(one)
+    )
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return least distance (B,) of all pairs, its sample (B,) and the pair's name (B,)."""
+    """Return the least distance (B,) of all pairs, its sample (B,) and the pair's name (B,)."""
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")
@@ -276,44 +275,44 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     bounds = bounds.reshape(num_lanes, -1)
     distances = np.full_like(bounds, np.inf)
 
-    def work_out(wanted: np.ndarray) -> None:
-        """Return the distances of the pairs and samples that are wanted (B, pairs x samples)."""
+    def compute(selected: np.ndarray) -> None:
+        """Compute the distances of selected entries (B, pairs x samples)."""
         for k, pair in enumerate(pairs):
             here = slice(k * num_samples, (k + 1) * num_samples)
-            lane, sample = np.nonzero(wanted[:, here])
+            lane, sample = np.nonzero(selected[:, here])
             if len(lane):
                 distances[:, here][lane, sample] = pair.exact(lane, sample)
 
     lanes = np.arange(num_lanes)
-    wanted = np.zeros(bounds.shape, bool)
-    # One pair at one sample bounds the least distance from above.
-    wanted[lanes, bounds.argmin(axis=1)] = True
-    work_out(wanted)
+    first = np.zeros(bounds.shape, bool)
+    # The distance of any pair at any sample is an upper bound of the least distance.
+    first[lanes, bounds.argmin(axis=1)] = True
+    compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK
-    work_out((bounds <= upper) & np.isfinite(bounds) & ~wanted)
+    compute((bounds <= upper) & np.isfinite(bounds) & ~first)
     place = distances.argmin(axis=1)
     which, sample = np.divmod(place, num_samples)
     return distances[lanes, place], sample, np.array([pair.name for pair in pairs])[which]
 
 
-def _picked(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return values (..., P) of values (..., B, S) at P samples of lanes; S = 1 if constant."""
+def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
+    """Select P samples of lanes from values (..., B, S), where S = 1 for constant values."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return products (3, 3, ...) of matrices (3, 3, ...)."""
-    return np.stack([turned(first, second[:, k]) for k in range(3)], axis=1)
+    """Multiply matrices (3, 3, ...)."""
+    return np.stack([rotate(first, second[:, k]) for k in range(3)], axis=1)
 
 
 def _cross(axis: np.ndarray) -> np.ndarray:
-    """Return matrices (3, 3, ...) that multiply vectors to cross products with axes (3, ...)."""
+    """Return the matrices (3, 3, ...) of the cross product with axes (3, ...)."""
     (x, y, z), none = axis, np.zeros_like(axis[0])
     return np.array([[none, -z, y], [z, none, -x], [-y, x, none]])
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
-    """Return rotations (3, 3, ...) of unit quaternions (4, ...), w x y z."""
+    """Convert unit quaternions (4, ...), w x y z, to rotations (3, 3, ...)."""
     w, v = quaternion[0], quaternion[1:]
     upright = np.eye(3).reshape(3, 3, *(1,) * w.ndim)
     return (w * w - dot(v, v)) * upright + 2.0 * (v[:, None] * v[None] + w * _cross(v))

@@ -1,10 +1,9 @@
-"""Float64 NumPy referee of blocks: the kinematics alone decides whether a plan succeeds.
+"""Float64 NumPy referee of blocks: decides by kinematics whether a plan succeeds.
 
-It shares no code with the planners. The joints' polynomials are compared with their limits at
-their extrema, the arm and its shield with their obstacles at every sample, and the ball falls
-along its parabola [Natarajan2024, eqs 5 to 7]. A plan's own claims (status, cost) are not trusted;
-only its time of contact is read. Robot base frame, z up, SI units. Times count from the moment at
-which the ball is first seen.
+The referee shares no code with the planners. It compares the joints' polynomials with their limits
+at their extrema, measures the clearance of arm and shield at samples, and computes the ball's
+parabola [Natarajan2024, eqs 5 to 7]. It ignores the plan's status and cost, but reads its contact
+time. Robot base frame, z up, SI units. Times count from the first observation of the ball.
 """
 
 import dataclasses
@@ -25,7 +24,7 @@ from planner_jax.referee.judging import (
     judge_in_chunks,
     read_leaves,
 )
-from planner_jax.referee.solids import turned_back
+from planner_jax.referee.solids import rotate_back
 
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
@@ -45,16 +44,14 @@ _SENTENCES = {
     "self": "{failed_part} are {excess:.3g} m inside each other at {time:.3f} s",
     "ball": "the ball is {height:.3g} m off the plane of the shield's face and {miss:.3g} m from "
     "its middle in that plane at {time:.3f} s",
-    "tilt": "the shield's normal is {excess:.3g} rad off the way that the ball comes from at "
-    "{time:.3f} s",
+    "tilt": "the shield's normal is {excess:.3g} rad off minus the ball's velocity at {time:.3f} s",
     "tunnel": "the contact at {time:.3f} s is {excess:.3g} s off the time that the ball is in the "
     "outer box before it gets into the inner one",
 }
 LIMITS = tuple(_SENTENCES)
-# Leaves that may be infinite, besides the limits of the joints.
+# May be infinite, besides the limits of the joints.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
-# Of one case, besides capsules and beams.
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
     **{"ball.pos": (3,), "ball.vel": (3,), "angles": (6,), "rates": (6,), "gravity": ()},
     **{"delay": (), "ends_at_rest": (), "offset": (), "tilt": ()},
@@ -67,42 +64,42 @@ _CASE_SHAPES: dict[str, tuple[int, ...]] = {
 _JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
 
 LONGEST_STEP = 0.002  # [s], between two samples
-LARGEST_TURN = 0.017  # [rad], of all joints together, between two samples
-_FASTEST = 100.0  # [rad/s], of all joints together, beyond which samples get no denser
+LARGEST_TURN = 0.017  # [rad], norm of the change of all joint angles between two samples
+_FASTEST = 100.0  # [rad/s], norm of all joint rates, above which samples get no denser
 LONGEST_PLAN = 60.0  # [s], until the contact
-REST = 0.01  # [rad/s], fastest joint of an arm at rest
-# Halvings of a piece in the search for a root; samples of arms at once, few enough for the cache.
-_HALVINGS, _SAMPLES = 45, 16384
+REST = 0.01  # [rad/s], fastest joint of an arm at standstill
+_HALVINGS = 45  # of an interval in the search for a root
+_SAMPLES = 16384  # poses whose clearances are computed at once: they fit the cache
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockVerdict(Verdict):
-    """Verdict on blocks, one entry a lane.
+    """Verdict on blocks, one entry a plan.
 
     Measurements are NaN where the inputs are not finite or the plan's times are wrong. Clearances
-    are least distances at the samples: minus the depth where solids overlap, though for a capsule
-    no less than minus its radius; infinite without an obstacle.
+    are least distances over the samples: minus the penetration depth where solids overlap, but for
+    a capsule not below minus its radius; infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
     UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
 
-    failed_part: np.ndarray  # (B,) str, the joint, link or shield that fails; "" without any
+    failed_part: np.ndarray  # (B,) str, the joint, link or shield that fails, or ""
     contact_time: np.ndarray  # (B,) [s]
     execution_time: np.ndarray  # (B,) [s], of the motion
-    velocity_share: np.ndarray  # (B,) of a joint's limit, greatest
-    acceleration_share: np.ndarray  # (B,) likewise
+    velocity_share: np.ndarray  # (B,) greatest |rate| of a joint / its limit
+    acceleration_share: np.ndarray  # (B,) greatest |acceleration| of a joint / its limit
     floor_clearance: np.ndarray  # (B,) [m], least
     pole_clearance: np.ndarray  # (B,) [m], least
     rig_clearance: np.ndarray  # (B,) [m], least
     base_clearance: np.ndarray  # (B,) [m], least
     self_clearance: np.ndarray  # (B,) [m], least
-    miss: np.ndarray  # (B,) [m], from the shield's middle to the ball at the contact, in its plane
-    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face then
-    tilt: np.ndarray  # (B,) [rad], of the shield's normal to the way that the ball comes from
+    miss: np.ndarray  # (B,) [m], ball to the shield's middle at the contact, in the face's plane
+    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face
+    tilt: np.ndarray  # (B,) [rad], shield's normal to minus the ball's velocity
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.contact_time)[k]
         return f"the ball is {miss:.2g} m from the shield's middle at {time:.3g} s"
 
@@ -119,30 +116,30 @@ def referee_blocks(
     """Judge every plan of a batch.
 
     Angles, rates and accelerations are compared with their limits at the ends of each piece and at
-    their extrema inside. These are roots of the next derivative, which lie between its own extrema,
-    and so on up to the derivative that is constant; each root is found by bisection.
+    their extrema inside. An extremum is a root of the next derivative. Roots are bracketed by the
+    extrema of that derivative, recursively up to the constant derivative, and found by bisection.
 
-    Clearances are computed at samples: the ends of the pieces, and between them at most `step` and
-    `LARGEST_TURN` apart, though never under 0.17 ms. There the distances of capsules, the shield's
-    plate and boxes (`referee.arm_clearance` lists the pairs) are exact to rounding.
+    Clearances are computed at the ends of the pieces and at samples between them, at most `step`
+    and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the distances between
+    capsules, the shield's plate and boxes (listed in `referee.arm_clearance`) are exact.
 
-    The motion begins at the case's delay, and the arm stays where it ends: it has to be at rest
-    there if the case requires that, or if the contact comes later.
+    The motion starts at the case's delay, and the arm then stays at the motion's end. It must be at
+    standstill there if the case requires it, or if the contact is later.
 
     Args:
         cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
         plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients
             (B, M, D + 1, 6), durations (B, M).
         tolerance: relative, of velocities, accelerations, the case's offset and its tilt; [rad]
-            and [rad/s] of the start and of jumps between pieces, [rad] of positions.
-        contact_tolerance: [m], how far the ball's centre may be off the plane of the shield's
-            face and outside of its square, the arm inside of an obstacle, and the ball outside of
-            the outer box or inside of the inner one.
+            and [rad/s] of the start and of jumps between pieces; [rad] of positions.
+        contact_tolerance: [m], of the ball's distance from the plane and the square of the
+            shield's face, of the arm's depth in an obstacle, and of the ball's distance from the
+            boxes of the tunnel.
         step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: as of `referee_hits`.
+        chunk: see `referee_hits`.
 
     Returns:
-        A `BlockVerdict` as of `referee_hits`; the offset and the tilt may be infinite too.
+        A `BlockVerdict`; see `referee_hits`. The offset and the tilt may be infinite too.
 
     Raises:
         ValueError: a leaf has the wrong shape, `step` is not in (0, LONGEST_STEP] or `chunk` < 1.
@@ -157,7 +154,7 @@ def referee_blocks(
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Read all arrays, check their shapes, and return the capsules' links too."""
+    """Read all arrays, check their shapes, and return them and the links of the capsules."""
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
@@ -184,10 +181,10 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, step: float, relative: float, contact: float) -> dict:
-    """Return the fields of `BlockVerdict` for one chunk of lanes."""
+    """Return the fields of `BlockVerdict` for one chunk of plans."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
-    # How long the arm stays where its motion ends.
+    # Time from the end of the motion to the contact.
     stays = case["plan.contact_time"] - case["delay"] - execution
     wrong_times = _times(case, stays)
     sound = finite & ~wrong_times[0]
@@ -222,7 +219,7 @@ def _judge(case: dict, links: tuple, step: float, relative: float, contact: floa
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test the plan's times: failed, how far off the worst is, the contact."""
+    """Test the contact time and the durations; return (failed, greatest error [s], contact)."""
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -231,7 +228,7 @@ def _times(case: dict, stays: np.ndarray) -> tuple:
 
 @dataclasses.dataclass(frozen=True)
 class _Motion:
-    """Angles of the joints of B lanes in M pieces."""
+    """Joint angles of B arms as polynomials in M pieces."""
 
     coeffs: np.ndarray  # (D + 1, 6, B, M), rising powers of the time [s] since the piece's start
     durations: np.ndarray  # (B, M) [s]
@@ -239,9 +236,10 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return angles, rates and accelerations (K, 6, B, M) at their extrema and the pieces' ends.
+    """Return angles, rates and accelerations at their extrema and at the ends of the pieces.
 
-    Each comes with its times (K, 6, B, M) [s] since the piece's start; K differs.
+    Each of the three is a pair of values and times [s] since the piece's start, both
+    (K, 6, B, M). K differs among the three.
     """
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
@@ -250,8 +248,8 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
         values = derivative(motion.coeffs, times, order)
         found.append((values, times))
         if order >= degree:
-            continue  # it is constant, and has no roots
-        # Between two neighbours the derivative rises or falls: it has one root at most.
+            continue  # constant, without roots
+        # Between two extrema the derivative is monotonic, and has at most one root.
         low, high, is_below = times[:-1], times[1:], values[:-1] < 0.0
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
@@ -262,7 +260,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,) str."""
+    """Find the greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,) str."""
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -271,14 +269,14 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Return shares of the joints' limits, tests, and the worst joint (B,) str of each test."""
+    """Return measurements, tests, and the joint (B,) str with the greatest excess of each test."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
         worst, time, parts[name] = _worst(excess, times)
         tests[name] = (worst > allowed, worst, time)
 
-    # Angles and rates where each piece begins, and what they were before.
+    # Angles and rates at the start of each piece, less the values before it.
     begin, end = (
         np.stack([derivative(motion.coeffs, times, order) for order in range(2)])
         for times in (np.zeros_like(motion.durations), motion.durations)
@@ -300,7 +298,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test the rates where the motion ends; return the fastest joint (B,) str too."""
+    """Test the rates at the end of the motion; return the fastest joint (B,) str too."""
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -311,7 +309,7 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
     """Return the angles (6, B) [rad] at the contact.
 
-    A motion that ends within the tolerance of the contact is extended or cut to it.
+    A motion that ends within the tolerance of the contact time is evaluated at that time.
     """
     beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
@@ -322,13 +320,13 @@ def _clearances(
 ) -> dict[str, tuple]:
     """Return least distances (B,) [m] by kind, their times (B,) [s], and the parts (B,) str.
 
-    No piece turns all joints together faster than `turning` (B, M) [rad/s].
+    The norm of the joint rates in each piece is at most `turning` (B, M) [rad/s].
     """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(step, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
     most = count.sum(axis=1).astype(int) + 1
-    # Lanes with similar numbers of samples are judged together.
+    # Lanes with similar numbers of samples are computed together.
     order, begin = np.argsort(-most), 0
     nothing = np.zeros(0), np.zeros(0), np.zeros(0, str)
     found = {kind: [nothing] for kind in KINDS}
@@ -351,9 +349,9 @@ def _clearances(
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at samples numbered (S,).
+    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at sample numbers (S,).
 
-    Lanes with fewer samples, by `count` (B, M) in each piece, stay at their end.
+    Each piece has `count` (B, M) samples. Lanes with fewer than S samples repeat the last one.
     """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
@@ -366,13 +364,13 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Measure how the ball meets the shield at angles (6, B), and test ball, tilt and tunnel."""
+    """Measure the ball relative to the shield at angles (6, B); test ball, tilt and tunnel."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     place = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, places = links_of(case, angles[..., None])
     turn, middle = turns[5][..., 0], shield_middle(case, turns, places)[..., 0]
-    height, *beside = turned_back(turn, place - middle)
-    toward, *across = turned_back(turn, fall * time - case["ball.vel"].T)
+    height, *beside = rotate_back(turn, place - middle)
+    toward, *across = rotate_back(turn, fall * time - case["ball.vel"].T)
     miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
     is_off = np.abs(height) > contact
     is_beside = (miss > case["offset"] * (1.0 + relative)) | (
@@ -387,11 +385,11 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test the contact's time against the ball's times in both boxes."""
+    """Test that at the contact the ball is in the outer box, and has not entered the inner one."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """Return the error (B,) [s] with boxes grown by a length [m] at both ends."""
+        """Return the error (B,) [s], with the outer box enlarged and the inner one reduced [m]."""
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)
@@ -402,15 +400,15 @@ def _tunnel(case: dict, contact: float) -> tuple:
 
 
 def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return when balls enter and leave a box grown on all sides [m], (2, B) [s] each.
+    """Return the times (2, B) [s] at which balls enter and leave a box enlarged on all sides [m].
 
-    The first entry is on the way up, the second on the way down. A ball that is never inside
-    enters at infinity and leaves at minus infinity.
+    The first row is of the ball's rise, the second of its fall. A ball that is never inside enters
+    at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown
     upper = case[f"scene.{name}.upper"].T - pos + grown
-    # Along z: between the bottom and the top, on either side of the highest point.
+    # Times between the bottom and the top, before and after the highest point.
     highest = vel[2] / gravity
     over, under = (
         np.sqrt(vel[2] ** 2 - 2.0 * gravity * side[2]) / gravity for side in (upper, lower)
@@ -425,5 +423,5 @@ def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.nd
         begin = np.where(stands, begin, np.maximum(begin, crossings.min(axis=0)))
         end = np.where(stands, end, np.minimum(end, crossings.max(axis=0)))
         never |= stands & ((lower[k] > 0.0) | (upper[k] < 0.0))
-    never = never | (begin > end)  # of each of the two
+    never = never | (begin > end)
     return np.where(never, np.inf, begin), np.where(never, -np.inf, end)

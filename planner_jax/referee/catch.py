@@ -1,13 +1,12 @@
-"""Float64 NumPy referee of catch plans: the physics alone decides whether a plan succeeds.
+"""Float64 NumPy referee of catches: decides by physics whether a plan succeeds.
 
-No code is shared with the planners but the case's own extra limits (`referee.extras`):
-`referee.quadrotor` samples the returned polynomial and recomputes attitude and body rate from
-flatness; here the targets are followed along their paths and compared with the net. A plan's own
-claims (status, cost) are not trusted; its order is checked, and its times of the catches are
-compared with those at which its pieces end. World frame, z up, SI units.
+The referee shares no code with the planners, except the case's extra limits (`referee.extras`).
+`referee.quadrotor` checks the flight. This module computes the targets' positions and compares
+them with the net. It ignores the plan's status and cost, checks its order of the targets, and
+compares its catch times with the ends of its pieces. World frame, z up, SI units.
 
-[Yu2023catch] is "Catch Planner": eq. 9 ball with linear drag (with its constant), eq. 22 net centre
-p + l z_d, eq. 25 angle between z_d and minus the ball's velocity; z_d is the thrust direction.
+Equations of [Yu2023catch]: eq. 9 ball with linear drag (with its constant), eq. 22 net centre
+p + l z_d, eq. 25 angle between z_d and minus the ball's velocity, with the thrust direction z_d.
 """
 
 import dataclasses
@@ -21,7 +20,7 @@ from planner_jax.referee.judging import (
     CONTACT_TIME_TOLERANCE,
     FlightVerdict,
     above,
-    checked_leaf,
+    check_leaf,
     derivative,
     finite_lanes,
     first_failures,
@@ -32,7 +31,7 @@ from planner_jax.referee.quadrotor import (
     MOTION_SENTENCES,
     MOTION_UNBOUNDED,
     append_recovery,
-    checked_coeffs,
+    check_coeffs,
     intervals_of,
     judge_motion,
     pieces_of,
@@ -57,30 +56,29 @@ _SENTENCES = {
 }
 LIMITS = tuple(_SENTENCES)
 
-# A target slower than this [m/s] is at rest: what is left of its velocity is rounding.
-SLOWEST_TARGET = 1e-6
+SLOWEST_TARGET = 1e-6  # [m/s]: the velocity of a slower target is rounding, without a direction
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchVerdict(FlightVerdict):
-    """What the referee found, one entry a lane.
+    """Verdict on catches, one entry a plan.
 
-    Entries (B, N) are in the order of catching, as `order` and `times` of the plan, and NaN
-    at an index where no target is left to be caught or a wrong one is named.
+    Entries (B, N) are in the order of the catches, as the plan's `order` and `times`. They are NaN
+    behind the last catch, and where the plan names a wrong target.
     """
 
     SENTENCES = _SENTENCES
     UNBOUNDED = MOTION_UNBOUNDED
 
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
-    net_offset: np.ndarray  # (B, N) [m], its part along z_d: the target above the hoop's plane
-    angle: np.ndarray  # (B, N) [rad], net's axis to target's way back; NaN for one at rest too
-    catch_times: np.ndarray  # (B, N) [s], where the pieces up to each catch end
-    caught: np.ndarray  # (B, N) bool: order, catch time, net and angle hold for that target
+    net_offset: np.ndarray  # (B, N) [m], component along z_d: height above the hoop's plane
+    angle: np.ndarray  # (B, N) [rad], z_d to minus the velocity; NaN for a target at standstill
+    catch_times: np.ndarray  # (B, N) [s], end of the pieces up to each catch
+    caught: np.ndarray  # (B, N) bool, the tests of order, catch time, net and angle pass
     num_caught: np.ndarray  # (B,) int
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         if not (number := int(np.asarray(self.num_caught)[k])):
             return "there is no target to catch"
         farthest = np.nanmax(self.net_distance[k])
@@ -101,61 +99,57 @@ def referee_catches(
 ) -> CatchVerdict:
     """Judge every plan of a batch.
 
-    Catch i (i = 0, 1, ... in the plan's order) is the end of piece (i + 1) M - 1. Pieces after
-    the last present target that have no duration are not looked at, and neither is anything
-    that belongs to an absent target; with a duration they are flown, and judged like the rest.
-    Where targets are optional a plan catches as many as it has pieces for: each of these catches
-    is judged, and `num_caught` says how many hold.
-    The flight is judged as `referee_hits` judges it. A lane without targets has nothing to fail.
+    Catch i = 0, 1, ... in the plan's order is the end of piece (i + 1) M - 1. Absent targets are
+    ignored. Pieces behind the last catch are ignored if their duration is zero, and otherwise
+    judged like the others. If targets are optional, the number of catches follows from the pieces
+    with a duration; each of these catches is judged. A plan without targets cannot fail a catch.
 
-    The target's place is worked out here, in float64, for a path with the fields of `BallPath`
-    (known by `ball`), of `HarmonicPath` (`amplitude`) or of `PathTable` (`resolution`; between
-    the nodes a cubic convolution, beyond the table on at its last velocity).
+    Target positions are computed in float64 for paths with the fields of `BallPath` (recognised by
+    `ball`), `HarmonicPath` (`amplitude`) or `PathTable` (`resolution`).
 
-    The shared protocol of [Yu2023catch] is `tolerance=0.05, net_test="ball"`.
+    The protocol of [Yu2023catch] is `tolerance=0.05, net_test="ball"`.
 
     Args:
-        cases: object with the fields of `CatchCase`, leaves with leading axis B; those
-            of `targets` with (B, N). Its order and times are not read, and without `optional`
-            all present targets are to be caught.
+        cases: object with the fields of `CatchCase`, leaves with leading axis B; leaves of
+            `targets` have (B, N). Unless `optional`, all present targets must be caught. The
+            case's own order and times are not read.
         plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients
             (B, N * M, D + 1, 3), durations (B, N * M).
-        target_states: for targets of any other class:
-            `(targets, order (B, N) int, times (B, N) [s]) -> pos (B, N, 3), vel (B, N, 3)`,
-            [m] and [m/s], of target `order[b, i]` of case b at `times[b, i]`, also of absent
-            targets, whose values are not read. It then serves the known classes as well.
-        net_test: "plane": the target is in the hoop's plane to `contact_tolerance`, and there
-            within the net's radius of its centre. "ball": it is within that radius of the
-            centre in any direction.
-        tolerance: relative, of every limit of the case, the net's radius and angle included.
-        contact_tolerance: [m], distance of the target from the hoop's plane at the catch.
-        continuity_tolerance: as of `referee_hits`.
-        samples: fewest samples between one catch and the next, >= 200.
-        chunk: as of `referee_hits`.
+        target_states: function `(targets, order, times) -> (pos, vel)` for targets of other
+            classes, with order (B, N) int, times (B, N) [s], pos and vel (B, N, 3) [m], [m/s].
+            Entry [b, i] is of target `order[b, i]` of case b at `times[b, i]`. Values for absent
+            targets are ignored. If passed, the function is called for the known classes too.
+        net_test: "plane" requires the target in the hoop's plane, to `contact_tolerance`, and
+            within the net's radius there. "ball" requires it within the radius of the centre.
+        tolerance: relative, of every limit of the case, including the net's radius and angle.
+        contact_tolerance: [m], of the distance between target and hoop's plane at the catch.
+        continuity_tolerance: see `referee_hits`.
+        samples: least number of samples between two catches, >= 200.
+        chunk: see `referee_hits`.
 
     Returns:
-        A `CatchVerdict` as of `referee_hits`; the net's radius and angle and a horizon may be
+        A `CatchVerdict`; see `referee_hits`. The net's radius, its angle and a horizon may be
         infinite too.
 
     Raises:
-        ValueError: as of `referee_hits`, the class of the targets is not known, or `net_test` is
-            another word.
+        ValueError: see `referee_hits`; or the class of the targets is not known, or `net_test` is
+            neither "plane" nor "ball".
     """
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
     leaves = _read(cases, plans)
     shape = leaves["present"].shape
-    # A broken lane is told by its verdict, not by a warning.
+    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
     with np.errstate(all="ignore"):
         order = np.nan_to_num(leaves["order"].astype(np.float64))
         order = np.clip(np.rint(order), 0, shape[1] - 1).astype(np.int64)
         times = _ends(leaves["durations"].astype(np.float64), shape[1])
         if target_states is None:
-            pos, vel = _known_states(cases.targets, order, times)
+            pos, vel = _follow_targets(cases.targets, order, times)
         else:
             pos, vel = target_states(cases.targets, order, times)
-    leaves["target pos"] = checked_leaf("target_states' pos", pos, (*shape, 3))
-    leaves["target vel"] = checked_leaf("target_states' vel", vel, (*shape, 3))
+    leaves["target pos"] = check_leaf("target_states' pos", pos, (*shape, 3))
+    leaves["target vel"] = check_leaf("target_states' vel", vel, (*shape, 3))
     judge = functools.partial(
         _judge,
         extras=cases.extras,
@@ -172,8 +166,8 @@ def referee_catches(
 
 
 def _read(cases, plans) -> dict[str, np.ndarray]:
-    """Read all arrays but those of the targets, and check their shapes."""
-    coeffs, present = checked_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
+    """Read all arrays of cases and plans except the targets, and check their shapes."""
+    coeffs, present = check_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
         raise ValueError(f"present must be ({batch[0]}, N), got {present.shape}")
@@ -188,18 +182,18 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Return times (B, N) [s] at which the pieces (B, N * M) up to each catch end."""
+    """Return the catch times (B, N) [s] from the durations (B, N * M) of the pieces."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 
 
-def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity (B, N, 3) of the targets `order` at `times`, both (B, N)."""
+def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N)."""
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        """Return one leaf (B, N, ...) of the targets, in the order of catching."""
-        value = checked_leaf(f"targets.{name}", value, order.shape + trailing)
+        """Return a leaf (B, N, ...) of the targets in the order of the catches."""
+        value = check_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
         return value
@@ -237,12 +231,11 @@ def _known_states(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.nda
 
 
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
-    """Return position and velocity (B, N, 3) of balls with linear drag K [1/s] on each axis.
+    """Return positions and velocities (B, N, 3) of balls with linear drag K [1/s] on each axis.
 
     [Yu2023catch, eq. 9] with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
-    which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. Both are
-    smooth at x = 0, where they are 1 and 1/2: the parabola. For small x, h is summed as
-    1/2! - x/3! + x^2/4! - ..., to rounding.
+    which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. For small x,
+    h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
     """
     times = times[..., None]
     x = drag * times
@@ -259,10 +252,10 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 
 
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate position and velocity (B, N, 3) in tables with node k at (k - 1) resolution.
+    """Interpolate positions and velocities (B, N, 3) in tables with node k at (k - 1) resolution.
 
-    Keys' cubic convolution with a = -1/2 is the cubic between two nodes whose slopes there are
-    the central differences. Beyond the table the target goes on at its last velocity.
+    Keys' cubic convolution with a = -1/2 [Keys1981] is the cubic between two nodes whose slopes are the
+    central differences there. Outside the table the target keeps its first or last velocity.
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)
@@ -284,7 +277,7 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 def _judge(
     case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
 ) -> dict:
-    """Return the fields of `CatchVerdict` for one chunk of lanes."""
+    """Return the fields of `CatchVerdict` for one chunk of plans."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)
@@ -296,12 +289,12 @@ def _judge(
     due = np.arange(num) < number
     flown = np.repeat(due, each, axis=1) | (durations != 0.0)
     pieces = pieces_of(case["coeffs"], durations, flown)
-    right, target = _places(case["order"], present, due, optional)
+    right, target = _test_order(case["order"], present, due, optional)
     lanes = np.arange(len(due))
     wrong = (~right).sum(axis=1).astype(np.float64)
     order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
     held = due & right
-    # In the order of catching; what belongs to no catch may hold anything.
+    # In the order of the catches; values of other entries are not read, and may be anything.
     case = case | {
         "coeffs": np.moveaxis(pieces.coeffs, 0, -1),
         "order": np.where(due, case["order"], 0.0),
@@ -330,13 +323,13 @@ def _judge(
     return verdict | motion | measured | {"caught": caught, "num_caught": caught.sum(axis=1)}
 
 
-def _places(
+def _test_order(
     order: np.ndarray, present: np.ndarray, due: np.ndarray, optional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return places (B, N) of the order that are right, and the target that each one names.
+    """Test the entries (B, N) of the plan's order; return which are right, and their targets.
 
-    The first places, those that are due, name present targets, the others absent ones (or any
-    that are left where targets are optional), and none names a target that has been named before.
+    Entries that are `due` (B, N) must name present targets, and the others absent ones (any target
+    if targets are optional). No entry may repeat an earlier one.
     """
     num = due.shape[1]
     order = np.nan_to_num(order, nan=-1.0)
@@ -350,7 +343,7 @@ def _places(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure and test the catches: name -> failed, excess, time (B, N)."""
+    """Return measurements of the catches, and (failed, excess, time) (B, N) by test."""
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
@@ -358,7 +351,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
     pos, acc = (np.moveaxis(derivative(tail, spans, order), 0, -1) for order in (0, 2))
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
-    # Without thrust there is no axis: z_d stays zero, and the angle is the worst there is.
+    # Without thrust z_d is zero, and the angle counts as pi.
     axis = thrust / np.maximum(size, np.finfo(float).tiny)
     centre = pos + case["net.height"][:, None, None] * axis
     miss, vel = case["target pos"] - centre, case["target vel"]
@@ -388,9 +381,9 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test of the catch times: positive and rising, as claimed, not after the horizon.
+    """Test the catch times: positive and rising, as claimed, and not after the horizon.
 
-    Every piece up to a catch has a positive duration, and none after the last a negative one.
+    Every piece up to a catch must have a positive duration, and none behind a negative one.
     """
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
@@ -402,7 +395,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """Return the test (B,) of each lane's worst catch from a test (B, N) of all catches."""
+    """Reduce a test (B, N) of all catches to the worst catch (B,) of each plan."""
     failed, excess, time = test
     failed = failed & held
     counts = failed | (held & np.isnan(excess))

@@ -1,22 +1,20 @@
-"""How far a rectangle that drives stays from convex polygons, in float64 NumPy.
+"""Clearance of a moving rectangle from convex polygons, in float64 NumPy.
 
-It shares no code with the planners. World frame in the plane, SI units.
+World frame in the plane, SI units.
 """
 
 import numpy as np
 
-# Pairs of a pose and a polygon whose distance is worked out at once: few enough for the cache.
-_PAIRS = 16384
-# What rounding may do to a bound, and shorter than any edge [m].
-_SLACK = 1e-9
+_PAIRS = 16384  # of a pose and a polygon whose distance is computed at once: they fit the cache
+_SLACK = 1e-9  # [m], rounding error of a bound, and shorter than any edge
 
 
 def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarray) -> tuple:
-    """Return least distance (B,) [m] of rectangles from polygons, when (B,) [s], and of which (B,).
+    """Return the least distance (B,) [m] of rectangles from polygons, its time and polygon (B,).
 
-    Pairs of a sample and an obstacle that bounds show to be farther apart than another pair of
-    their lane are left out: first by circles around both, then by the lines of the polygon's
-    edges and a circle around the rectangle.
+    Lower bounds exclude pairs of a sample and a polygon that cannot have the least distance: first
+    by circles around both, then by the lines of the polygon's edges and a circle around the
+    rectangle.
 
     Args:
         group: "centre" and "velocity" (B, N, 2), "corners" (B, N, V, 2), "present" (B, N).
@@ -39,23 +37,23 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     apart = np.sqrt(apart) - reach[:, None]  # infinite for absent ones
 
     def exact(lane: np.ndarray, sample: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return distances (P,) of so many pairs."""
-        found = [np.zeros(0)]
+        """Return the distances (P,) of P pairs."""
+        parts = [np.zeros(0)]
         for part in (slice(k, k + _PAIRS) for k in range(0, len(lane), _PAIRS)):
             b, s, n = lane[part], sample[part], which[part]
             centre = group["centre"][b, n] + group["velocity"][b, n] * times[b, s, None]
             corners, pose = centre[:, None] + group["corners"][b, n], poses[b, s]
-            found.append(_separation(corners, normals[b, n], pose, half[b]))
-        return np.concatenate(found)
+            parts.append(_separation(corners, normals[b, n], pose, half[b]))
+        return np.concatenate(parts)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the index of the least `bound` (P,) of each lane in `of`, whose lanes rise."""
+        """Return the index of the least `bound` (P,) of each lane; lanes `of` (P,) ascend."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])
         return hits[np.unique(of[hits], return_index=True)[1]]
 
-    # One pair of each lane bounds its least distance from above; then a better one.
+    # The distance of any pair is an upper bound of the least distance; a second pair lowers it.
     lanes = np.arange(num_lanes)
     sample, which = np.divmod(apart.reshape(num_lanes, num_samples * num).argmin(axis=1), num)
     upper = exact(lanes, sample, which) + _SLACK
@@ -80,10 +78,10 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outward unit normals (..., V, 2) of polygons (..., V, 2), and the edges' heights.
+    """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons.
 
-    The height (..., V) [m] of an edge is how far out along its normal it lies. One without
-    length, between repeated corners, has no normal, and lies infinitely far out.
+    The offset is normal . corner. An edge of zero length, between repeated corners, has a zero
+    normal and an infinite offset.
     """
     edge = np.roll(corners, -1, axis=-2) - corners
     area = (corners[..., 0] * edge[..., 1] - corners[..., 1] * edge[..., 0]).sum(axis=-1)
@@ -97,18 +95,18 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _separation(corners, normals, pose, half) -> np.ndarray:
     """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
 
-    The greatest gap along the normal of an edge is negative where the two overlap, and is the
-    shortest way out. Elsewhere the distance is from a corner of one of them to the other. An edge
-    without length has a zero normal; `half` (P, 2) [m] are half sides.
+    If the greatest gap along the normals of all edges is negative, the two overlap, and the gap is
+    minus the depth. Otherwise the distance is between a corner of one and an edge of the other.
+    Edges of zero length have zero normals. Half sides `half` are (P, 2) [m].
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 
-    def turned(vectors: np.ndarray) -> np.ndarray:
-        """Return vectors (P, V, 2) in the rectangle's frame."""
+    def rotate(vectors: np.ndarray) -> np.ndarray:
+        """Rotate vectors (P, V, 2) into the rectangle's frame."""
         x, y = vectors[..., 0], vectors[..., 1]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=2)
 
-    place, out = turned(corners - pose[:, None, :2]), turned(normals)
+    place, out = rotate(corners - pose[:, None, :2]), rotate(normals)
     height = (out * place).sum(axis=2)
     beyond = -height - (np.abs(out) * half[:, None]).sum(axis=2)
     beyond = np.where(out.any(axis=2), beyond, -np.inf).max(axis=1)

@@ -1,13 +1,12 @@
-"""Float64 NumPy referee of hit plans: the physics alone decides whether a plan succeeds.
+"""Float64 NumPy referee of hits: decides by physics whether a plan succeeds.
 
-No code is shared with the planners but the case's own extra limits (`referee.extras`):
-`referee.quadrotor` samples the returned polynomial and recomputes attitude and body rate from
-flatness; here the ball is integrated, the impact applied and the ball followed to the ground. A
-plan's own claims (status, cost, stroke) are not trusted; only its impact time is compared. World
-frame, z up, ground at z = 0, SI units.
+The referee shares no code with the planners, except the case's extra limits (`referee.extras`).
+`referee.quadrotor` checks the flight. This module integrates the ball up to the impact, applies
+the impact, and integrates the ball to its landing. It ignores the plan's status, cost and stroke,
+except the impact time, which must be the end of the trajectory. World frame, z up, ground at
+z = 0, SI units.
 
-[Yu2023bat] is "Bat Planner": eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits. Body
-rates are those of the Hopf fibration at zero heading [Watterson2020].
+Equations of [Yu2023bat]: eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits.
 """
 
 import dataclasses
@@ -55,17 +54,14 @@ _CASE_SHAPES = {
     **{"hit_limits.hitting_speed": (3,), "hit_limits.min_apex": (), "hit_limits.max_apex": ()},
 }
 
-# Runge-Kutta: steps up to the impact; step and longest flight [s] after it.
-_INCOMING_STEPS = 60
-_OUTGOING_STEP = 0.01
-_LONGEST_FLIGHT = 20.0
-# Share of the racket's radius within which the ball has to meet it; the rest is margin.
-RIM = 0.9
+_INCOMING_STEPS = 60  # of Runge-Kutta up to the impact
+_OUTGOING_STEP, _LONGEST_FLIGHT = 0.01, 20.0  # [s], after the impact
+RIM = 0.9  # share of the racket's radius within which the ball must meet it
 
 
 @dataclasses.dataclass(frozen=True)
 class HitVerdict(FlightVerdict):
-    """What the referee found, one entry a lane."""
+    """Verdict on hits, one entry a plan."""
 
     SENTENCES = _SENTENCES
     UNBOUNDED = MOTION_UNBOUNDED | {
@@ -79,7 +75,7 @@ class HitVerdict(FlightVerdict):
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         return f"the ball lands {np.asarray(self.landing_error)[k]:.2g} m from the target"
 
 
@@ -97,29 +93,27 @@ def referee_hits(
 ) -> HitVerdict:
     """Judge every plan of a batch.
 
-    `referee.quadrotor` measures the flight: `peaks` its speed, acceleration, thrust, body rate and
-    height, `joint_errors` its errors at time 0 and between pieces as displacement, and
-    `referee.extras` the excess over the case's extra limits. Eight minimum-snap pieces computed in
-    float32 with coordinates up to 4.5 m have at most 1.3e-4 m of displacement, under a third of the
-    default tolerance. The impact is the end of the trajectory.
+    The impact is the end of the trajectory. Errors at time 0 and between pieces count as
+    displacement (`referee.quadrotor.joint_errors`). Eight minimum-snap pieces computed in float32
+    with coordinates up to 4.5 m have at most 1.3e-4 m, under a third of the default tolerance.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.
         plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients
             (B, M, D + 1, 3), durations (B, M).
-        drag_after_impact: let the drag act on the returned ball too.
+        drag_after_impact: the ball has drag after the impact too.
         tolerance: relative, of every limit of the case.
-        landing_tolerance: [m], horizontal distance of the landing from the target.
-        contact_tolerance: [m], distance of the racket centre from the ball at the impact. Where the
-            case says the racket's radius, it is at most `RIM` of that, however large the tolerance.
-        continuity_tolerance: times the largest coordinate [m] at the piece ends (at least
-            1 m), allowed displacement of head state and joints.
-        samples: fewest samples of a trajectory, >= 200.
-        chunk: most lanes that a thread judges at once; it bounds the memory.
+        landing_tolerance: [m], of the horizontal distance between landing and target.
+        contact_tolerance: [m], of the distance between racket centre and ball at the impact. It is
+            reduced to `RIM` times the racket's radius if the case has a smaller racket.
+        continuity_tolerance: of the displacement of head state and joints, relative to the largest
+            coordinate at the ends of the pieces (at least 1 m).
+        samples: least number of samples of a trajectory, >= 200.
+        chunk: greatest number of plans that a thread judges at once; it bounds the memory.
 
     Returns:
-        A `HitVerdict` of float64 arrays. A lane that is not finite fails as "not finite"
-        and leaves the others alone. A limit may be infinite.
+        A `HitVerdict` of float64 arrays. A plan that is not finite fails as "not finite", without
+        an effect on the others. Limits may be infinite.
 
     Raises:
         ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
@@ -146,7 +140,7 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    """Return the fields of `HitVerdict` for one chunk of lanes."""
+    """Return the fields of `HitVerdict` for one chunk of plans."""
     pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
@@ -156,16 +150,16 @@ def _judge(
 
 
 def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return acceleration (3, B) of a ball of velocity (3, B):  v' = g - K_D |v| v."""
+    """Return the acceleration (3, B) of a ball of velocity (3, B): v' = g - K_D |v| v."""
     acc = -drag * np.sqrt((vel * vel).sum(axis=0)) * vel
     acc[2] -= gravity
     return acc
 
 
 def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    """Return one Runge-Kutta step of order 4, its length (B,) [s], of position and velocity (6, B).
+    """Advance position and velocity (6, B) by one Runge-Kutta step (B,) [s] of order 4.
 
-    The acceleration does not depend on the position, whose own sum of velocities is therefore
+    As the acceleration does not depend on the position, the mean velocity of the step is
     v + step / 6 (a_1 + a_2 + a_3).
     """
     half, sixth, vel = 0.5 * step, step / 6.0, state[3:]
@@ -182,10 +176,10 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 
 
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time (B,) in an outgoing step when an entry falls to a level, and the ball then.
+    """Find the time (B,) [s] within a step at which an entry falls to a level, and the state then.
 
-    Newton from the far end of the step: height and vertical speed are concave or falling
-    there, so that it comes to the later crossing.
+    Newton's method starts at the end of the step. Height and vertical speed are concave or falling
+    there, so it converges to the later crossing.
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):
@@ -196,7 +190,7 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
 
 
 def _return_in_air(state, height, drag, gravity) -> tuple:
-    """Return apex, its time, landing point (3, B) and flight time with quadratic drag."""
+    """Return apex, its time, landing point (3, B) and flight time, with quadratic drag."""
     before_top, before_end, state = state.copy(), state.copy(), state.copy()
     top_time, end_time = np.zeros_like(height), np.zeros_like(height)
     flying = np.arange(len(height))
@@ -225,7 +219,7 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
 
 
 def _return_in_vacuum(state, height, gravity) -> tuple:
-    """Return apex, its time, landing point (3, B) and flight time under gravity alone."""
+    """Return apex, its time, landing point (3, B) and flight time, without drag."""
     pos, vel = state[:3], state[3:]
     apex_time = np.maximum(vel[2], 0.0) / gravity
     apex = pos[2] + 0.5 * gravity * apex_time**2
@@ -237,9 +231,9 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """Return the ball up to the landing, and the tests of it: name -> failed, excess, time.
+    """Follow the ball to its landing; return measurements, and (failed, excess, time) by test.
 
-    In here vectors are (3, B), states of the ball (6, B).
+    In this function vectors are (3, B), and states of the ball (6, B).
     """
     durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
     end = durations.sum(axis=1)
@@ -249,7 +243,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
     pos, vel, normal = (derivative(tail, durations[:, -1], order) for order in range(3))
     normal[2] += gravity
-    # Without thrust there is no face: the normal stays zero, and "wrong face" fails.
+    # Without thrust the normal is zero, so the test "wrong face" fails.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), np.finfo(float).tiny)
     racket = pos + case["racket_height"] * normal
     approach = ((state[3:] - vel) * normal).sum(axis=0)
@@ -278,7 +272,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
-    """Return tests of contact, hitting speed, apex and landing: name -> failed, excess, time."""
+    """Test contact, hitting speed, apex and landing; return (failed, excess, time) by name."""
     relative = tolerances["relative"]
     contact, landing = measured["contact_error"], measured["landing_error"]
     widest = np.minimum(tolerances["contact"], RIM * case.get("racket_radius", np.inf))
@@ -297,10 +291,10 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 
 
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
-    """Test of the impact time: positive, the trajectory's end, before the ball lands.
+    """Test the impact time: positive, the end of the trajectory, and before the ball lands.
 
-    The height of a ball in flight has no minimum inside, so that both ends are enough; a ball
-    below the ground came there about its depth over its vertical speed ago.
+    The height of a ball in flight has no local minimum, so both ends bound it from below. A ball
+    below the ground landed about depth / |vertical speed| seconds earlier.
     """
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)

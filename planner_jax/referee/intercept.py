@@ -1,10 +1,10 @@
-"""Float64 NumPy referee of interceptions: the kinematics alone decides whether a plan succeeds.
+"""Float64 NumPy referee of interceptions: decides by kinematics whether a plan succeeds.
 
-It shares no code with the planners, except for targets of a user's own class: the car's equations
-of motion [Qu2022, eq. 1] are integrated here from the plan's start along its speed and
-curvature, the rectangle of its body is held against every obstacle at every sample by separating
-axes, and the target is followed along its path. A plan's own claims (status, cost, meeting point)
-are not trusted. World frame in the plane, SI units, headings counter-clockwise from the x axis.
+The referee integrates the car's equations of motion [Qu2022, eq. 1] from the plan's start along
+its speed and curvature, measures the clearance of the body's rectangle at samples, and computes
+the target's position. It shares no code with the planners, except targets of a user's own class.
+It ignores the plan's status, cost and meeting point. World frame in the plane, SI units, headings
+counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from planner_jax.referee.judging import (
     SMALLEST_LIMIT,
     Verdict,
     above,
-    checked_leaf,
+    check_leaf,
     finite_lanes,
     first_failures,
     judge_in_chunks,
@@ -44,43 +44,42 @@ _SENTENCES = {
     "heading": "the heading is {excess:.3g} rad off the one asked for at {time:.3f} s",
 }
 LIMITS = tuple(_SENTENCES)
-# Leaves that may be infinite, besides the limits of the car.
+# May be infinite, besides the limits of the car.
 _UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
 
-# Longest time [s] between two samples, and longest plan [s] that is judged.
-LONGEST_STEP = 0.02
-LONGEST_PLAN = 3600.0
-# Gauss-Legendre nodes and weights on (0, 1), exact to order 5; used between every two samples.
+LONGEST_STEP = 0.02  # [s], between two samples
+LONGEST_PLAN = 3600.0  # [s]
+# Gauss-Legendre nodes and weights on (0, 1), exact to order 5; used between two samples.
 _NODES = np.polynomial.legendre.leggauss(3)
 _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class InterceptVerdict(Verdict):
-    """What the referee found, one entry a lane.
+    """Verdict on interceptions, one entry a plan.
 
-    What is measured is NaN where the inputs are not finite or the plan's time is not in
-    (0, an hour]. Clearances are those at the samples: the distance of the body from the nearest
-    obstacle, and where it is inside of one minus the shortest way out; infinite without any.
+    Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s.
+    Clearances are least distances of the body from an obstacle over the samples: minus the
+    penetration depth where they overlap, and infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
 
     max_speed: np.ndarray  # (B,) [m/s]
-    max_acceleration: np.ndarray  # (B,) [m/s^2], along the way, magnitude
-    rms_acceleration: np.ndarray  # (B,) [m/s^2], along the way: sqrt(1/T int v'^2 dt)
+    max_acceleration: np.ndarray  # (B,) [m/s^2], |dv/dt|
+    rms_acceleration: np.ndarray  # (B,) [m/s^2], sqrt(1/T int (dv/dt)^2 dt)
     max_curvature: np.ndarray  # (B,) [1/m], magnitude
     max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of atan(wheelbase * curvature)
     max_lateral_acceleration: np.ndarray  # (B,) [m/s^2], magnitude, of the rear axle
     wall_clearance: np.ndarray  # (B,) [m], least
     mover_clearance: np.ndarray  # (B,) [m], least
-    nearest_wall: np.ndarray  # (B,) int, place of the wall that comes nearest; -1 without any
-    nearest_mover: np.ndarray  # (B,) int, likewise
+    nearest_wall: np.ndarray  # (B,) int, index of the nearest wall, or -1
+    nearest_mover: np.ndarray  # (B,) int, index of the nearest mover, or -1
     miss: np.ndarray  # (B,) [m], from the body's middle to the target when the plan ends
     meeting_time: np.ndarray  # (B,) [s], when the plan ends
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.meeting_time)[k]
         return f"the body's middle is {miss:.2g} m from the target after {time:.3g} s"
 
@@ -98,42 +97,38 @@ def referee_intercepts(
 ) -> InterceptVerdict:
     """Judge every plan of a batch.
 
-    Between two knots speed and curvature are lines, so that the heading is a cubic; the position
-    is integrated between every two samples by Gauss-Legendre quadrature, to rounding. Speed,
-    acceleration, curvature, steering rate and lateral acceleration are held against their limits
-    at their extrema inside of each piece, not at samples.
+    Speed and curvature are linear between knots, so the heading is a cubic. The position is
+    integrated between samples by Gauss-Legendre quadrature, to rounding. Speed, acceleration,
+    curvature, steering rate and lateral acceleration are compared with their limits at their
+    extrema, not at samples.
 
-    The map, the walls and the movers are tested at samples alone: the knots, and between them at
-    most `step` apart. There the test of rectangle against convex polygon is exact. At 1.5 m/s the
-    car drives 3 cm in a step of 20 ms.
+    Map, walls and movers are tested at the knots and at samples between them, at most `step`
+    apart: 3 cm at 1.5 m/s by default. At a sample the distance between rectangle and convex
+    polygon is exact.
 
-    The position of the target is computed here, in float64, for a path with the fields of
-    `TurningPath` (known by `turn_rate`), of `PolynomialPath` (`coeffs`), or of a `LaterPath`
-    (`path` and `begin`) of either. For a target of any other class the caller passes
-    `target_positions`; `pj.intercept.judge` then calls the method `at` of that class, which the
-    planner has used too.
+    Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
+    by `turn_rate`), `PolynomialPath` (`coeffs`), or a `LaterPath` (`path` and `begin`) of either.
+    For other classes `pj.intercept.judge` calls the target's own method `at`, which the planner
+    calls too.
 
     Args:
         cases: object with the fields of `InterceptCase`, leaves with leading axis B. Polygons
-            are convex, in either sense, and may repeat corners. What belongs to an absent
-            obstacle is not looked at.
+            are convex, in either orientation, and may repeat corners. Values of absent obstacles
+            are ignored.
         plans: object with the fields of `InterceptPlan`, leaves with leading axis B; speed and
-            curvature (B, K + 1). The meeting point that it claims is not read.
-        truth: path of what the target really does, of the kind of `cases.target`, with leading
-            axis B; it takes the place of `cases.target`, which may be a prediction.
-        target_positions: for targets of any other class:
-            `(target, times (B,) [s]) -> positions (B, 2) [m]`. If given, it answers for the
-            known classes as well.
+            curvature (B, K + 1).
+        truth: true path of the target, with leading axis B; it replaces `cases.target`, which may
+            be a prediction.
+        target_positions: function `(target, times (B,) [s]) -> positions (B, 2) [m]` for targets
+            of other classes. If passed, it is called for the known classes too.
         tolerance: relative, of every limit of the car, of the case's tolerance and its heading
-            tolerance; and how far the plan's first pose, speed and curvature may be from the
-            case's, in their own units.
-        contact_tolerance: [m], how far the body may be inside an obstacle, and its middle off
-            the map.
+            tolerance; absolute, in their own units, of the plan's first pose, speed and curvature.
+        contact_tolerance: [m], of the body's depth in an obstacle, and of its middle off the map.
         step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: as of `referee_hits`.
+        chunk: see `referee_hits`.
 
     Returns:
-        An `InterceptVerdict` as of `referee_hits`; tolerances and the map's bounds may be infinite.
+        An `InterceptVerdict`; see `referee_hits`. Tolerances and the map's bounds may be infinite.
 
     Raises:
         ValueError: a leaf has the wrong shape, the class of the target is not known, `step` is
@@ -144,15 +139,14 @@ def referee_intercepts(
     leaves = _leaves(cases, plans)
     times = leaves["plan.time"].astype(np.float64)
     target = cases.target if truth is None else truth
-    # A broken lane is told by its verdict, not by a warning.
+    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
     with np.errstate(all="ignore"):
         where = (target_positions or target_positions_of)(target, times)
-    leaves["target"] = checked_leaf("target_positions", where, (*times.shape, 2))
+    leaves["target"] = check_leaf("target_positions", where, (*times.shape, 2))
     judge = functools.partial(_judge, step=step, relative=tolerance, contact=contact_tolerance)
     return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk))
 
 
-# Leaves of a case -> shape in one lane.
 _SHAPES: dict[str, tuple[int, ...]] = {
     **{"start": (3,), "lower": (2,), "upper": (2,), "speed": (), "curvature": (), "time": ()},
     **{"tolerance": (), "end_heading": (), "heading_tolerance": ()},
@@ -163,7 +157,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Read every array of cases and plans but the target's, and check their shapes."""
+    """Read all arrays of cases and plans except the target, and check their shapes."""
     speed = np.asarray(plans.speed)
     if speed.ndim != 2 or speed.shape[1] < 2:
         raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
@@ -176,14 +170,14 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
-    """Return the arrays of walls or movers by name; the arrays of absent ones are zero."""
+    """Return the arrays of walls or movers by name, zero for absent ones."""
     corners = np.asarray(group.corners)
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
     shape = corners.shape[:2]
-    present = checked_leaf(f"{name}.present", group.present, shape)
-    centre = checked_leaf(f"{name}.centre", group.centre, (*shape, 2))
-    velocity = checked_leaf(f"{name}.velocity", group.velocity, (*shape, 2))
+    present = check_leaf(f"{name}.present", group.present, shape)
+    centre = check_leaf(f"{name}.centre", group.centre, (*shape, 2))
+    velocity = check_leaf(f"{name}.velocity", group.velocity, (*shape, 2))
     return {
         f"{name}.present": present,
         f"{name}.centre": np.where(present[..., None], centre, 0.0),
@@ -193,22 +187,22 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
 
 
 def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
-    """Return positions (B, 2) [m] at times (B,) [s] of targets of the classes known here."""
+    """Return positions (B, 2) [m] of targets of the known classes at times (B,) [s]."""
     given, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
-        value = checked_leaf(f"target.{name}", given[name], batch + trailing)
+        value = check_leaf(f"target.{name}", given[name], batch + trailing)
         return value.astype(np.float64)
 
     if given.keys() >= {"path", "begin"}:
         return target_positions_of(given["path"], leaf("begin") + times)
     if "turn_rate" in given:
-        # The chord of an arc: shorter than it by the sinc of half the angle, and turned by that.
+        # The chord of an arc is arc length x sinc(angle / 2), rotated by angle / 2.
         half = 0.5 * leaf("turn_rate") * times
         (x, y), chord = leaf("vel", 2).T, times * np.sinc(half / np.pi)
         cos, sin = np.cos(half), np.sin(half)
-        way = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
-        return leaf("pos", 2) + chord[:, None] * way
+        direction = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
+        return leaf("pos", 2) + chord[:, None] * direction
     if "coeffs" in given:
         shape = np.shape(given["coeffs"])
         if len(shape) != 3:
@@ -219,18 +213,18 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
 
 
 def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
-    """The fields of `InterceptVerdict` for one chunk of lanes."""
+    """Return the fields of `InterceptVerdict` for one chunk of plans."""
     end = case["plan.time"]
     finite = finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
     span = np.where(driven, end, 0.0) / (case["plan.speed"].shape[1] - 1)
     measured, tests = _judge_limits(case, span, relative)
-    times, poses = _driven(case, span, step)
-    found, more = _judge_way(case, times, poses, contact)
+    times, poses = _integrate_poses(case, span, step)
+    found, more = _judge_clearance(case, times, poses, contact)
     measured, tests = measured | found, tests | more
     middle, heading = poses[:, -1, :2], poses[:, -1, 2]
     miss = np.linalg.norm(middle - case["target"], axis=1)
-    off = np.abs(_wrapped(heading - case["end_heading"]))
+    off = np.abs(_wrap(heading - case["end_heading"]))
     tests["start"] = _start(case, relative)
     tests["meeting"] = (miss > case["tolerance"] * (1.0 + relative), miss, end)
     tests["heading"] = (off > case["heading_tolerance"] * (1.0 + relative), off, end)
@@ -252,7 +246,7 @@ def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
 
 
 def final_poses(plans, body) -> np.ndarray:
-    """Return the final poses (B, 3) of the rear axles of plans, with the fields of `CarPlan`."""
+    """Return the final poses (B, 3) of the rear axles for plans with the fields of `CarPlan`."""
     case = {
         "plan.start": plans.start,
         "plan.speed": plans.speed,
@@ -262,28 +256,28 @@ def final_poses(plans, body) -> np.ndarray:
     }
     case = {name: np.asarray(leaf, np.float64) for name, leaf in case.items()}
     end = np.asarray(plans.time, np.float64)
-    # What is not driven ends where it begins.
+    # A plan whose time is out of range ends at its start.
     end = np.where((end > 0.0) & (end <= LONGEST_PLAN), end, 0.0)
     span = end / (case["plan.speed"].shape[1] - 1)
     with np.errstate(all="ignore"):
-        pose = _driven(case, span, LONGEST_STEP)[1][:, -1]
+        pose = _integrate_poses(case, span, LONGEST_STEP)[1][:, -1]
     ahead = 0.5 * case["body.length"] - case["body.rear_overhang"]
     pose[:, 0] -= ahead * np.cos(pose[:, 2])
     pose[:, 1] -= ahead * np.sin(pose[:, 2])
     return pose
 
 
-def _wrapped(angle: np.ndarray) -> np.ndarray:
-    """Angles [rad] as those in (-pi, pi]."""
+def _wrap(angle: np.ndarray) -> np.ndarray:
+    """Wrap angles [rad] to (-pi, pi]."""
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def _start(case: dict, allowed: float) -> tuple:
-    """Test of the plan's first pose, speed and curvature: failed, largest error, time."""
+    """Test the plan's first pose, speed and curvature; return (failed, largest error, time)."""
     away = case["plan.start"] - case["start"]
     errors = [
         np.linalg.norm(away[:, :2], axis=1),
-        np.abs(_wrapped(away[:, 2])),
+        np.abs(_wrap(away[:, 2])),
         np.abs(case["plan.speed"][:, 0] - case["speed"]),
         np.abs(case["plan.curvature"][:, 0] - case["curvature"]),
     ]
@@ -292,18 +286,21 @@ def _start(case: dict, allowed: float) -> tuple:
 
 
 def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The greatest of values (B, M), and when (B,) it is reached."""
+    """Find the greatest of values (B, M), and its time (B,) [s]."""
     lanes, top = np.arange(len(values)), values.argmax(axis=1)
     return values[lanes, top], np.broadcast_to(times, values.shape)[lanes, top]
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure the car's motion in pieces of (B,) [s], and test it: name -> failed, excess, time."""
+    """Measure and test the motion in pieces of duration (B,) [s].
+
+    Returns measurements, and (failed, excess, time) by test.
+    """
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
     rise, bend = np.diff(v) / h, np.diff(k) / h
-    # delta = atan(L k) turns fastest where the curvature is least.
+    # delta = atan(L k) changes fastest where |k| is least.
     zero = np.clip(np.where(bend == 0.0, 0.0, -k0 / bend), 0.0, h)
     zero = np.where(k0 * k1 < 0.0, zero, np.where(np.abs(k0) <= np.abs(k1), 0.0, h))
     least = np.where(k0 * k1 < 0.0, 0.0, np.minimum(np.abs(k0), np.abs(k1)))
@@ -329,7 +326,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
         name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
         for name, (value, time) in peaks.items()
     }
-    # It does not reverse either: below zero is as wrong as above the limit.
+    # The car may not reverse: a speed below zero counts like one above the limit.
     limit = case["limits.speed"][:, None]
     scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
     excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)
@@ -337,33 +334,33 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     return measured, tests
 
 
-def _driven(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and poses (B, S, 3) of the body's middle, for pieces of (B,) [s].
+def _integrate_poses(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times (B, S) [s] and poses (B, S, 3) of the body's middle, in pieces of (B,) [s].
 
-    Lanes with fewer samples than others stay at the end of each piece until all have theirs.
+    Lanes with fewer samples than others repeat the end of each piece.
     """
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
     v0, k0 = v[:, :-1], k[:, :-1]
     rise, bend = (np.where(h > 0.0, np.diff(each, axis=1) / h, 0.0) for each in (v, k))
 
-    def turned(tau: np.ndarray) -> np.ndarray:
-        """Angle (B, K, ...) since the beginning of each piece: the integral of v k."""
+    def heading_change(tau: np.ndarray) -> np.ndarray:
+        """Integrate v k (B, K, ...) since the start of each piece."""
         return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
 
     count = np.maximum(np.ceil(span / step - 1e-9), 1.0)
     most = int(count.max(initial=1.0))
     tau = span[:, None] * np.minimum(np.arange(most + 1) / count[:, None], 1.0)  # (B, most + 1)
-    whole = turned(h)[..., 0]
+    whole = heading_change(h)[..., 0]
     before = case["plan.start"][:, 2:] + np.cumsum(whole, axis=1) - whole  # (B, K)
     moved = np.zeros((len(v), num, most, 2))
     for node, weight in zip(_NODE, _WEIGHT, strict=True):
         at = (tau[:, :-1] + node * np.diff(tau, axis=1))[:, None]
-        angle = before[..., None] + turned(at)
+        angle = before[..., None] + heading_change(at)
         length = weight * np.diff(tau, axis=1)[:, None] * (v0 + rise * at)
         moved[..., 0] += length * np.cos(angle)
         moved[..., 1] += length * np.sin(angle)
-    headings = (before[..., None] + turned(tau[:, None, :-1])).reshape(len(v), num * most)
+    headings = (before[..., None] + heading_change(tau[:, None, :-1])).reshape(len(v), num * most)
     last = before[:, -1:] + whole[:, -1:]
     times = (span[:, None] * np.arange(num))[..., None] + tau[:, None, :-1]
     times = np.concatenate([times.reshape(len(v), num * most), num * span[:, None]], axis=1)
@@ -376,7 +373,7 @@ def _driven(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.n
     return times, poses
 
 
-def _judge_way(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
+def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
     """Measure clearances at poses (B, S, 3) of the body's middle; test map, walls and movers."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])

@@ -1,7 +1,7 @@
-"""Float64 NumPy referee of groups: every leg is judged as an interception, and legs must join.
+"""Float64 NumPy referee of group interceptions, in which a car meets several targets in turn.
 
-When and where a leg begins is worked out here from the legs before it, as the referee of
-interceptions integrates them; a plan's own beginnings are not read. World frame in the plane, SI
+The drive to one target is a leg. Each leg is judged as an interception that starts where and when
+the preceding leg ends, by the integration of `referee.intercept`. World frame in the plane, SI
 units.
 """
 
@@ -18,15 +18,15 @@ from planner_jax.referee.intercept import (
     referee_intercepts,
     target_positions_of,
 )
-from planner_jax.referee.judging import checked_leaf
+from planner_jax.referee.judging import check_leaf
 
 
 @dataclasses.dataclass(frozen=True)
 class GroupVerdict(InterceptVerdict):
-    """What the referee found, one entry a group.
+    """Verdict on groups of interceptions, one entry a group.
 
-    What is measured is that of the first leg that fails, or of the last leg of a success. Times
-    count from the beginning of the first leg.
+    Measurements are of the first leg that fails, or of the last leg of a success. Times count
+    from the start of the first leg.
     """
 
     SENTENCES = {
@@ -34,11 +34,11 @@ class GroupVerdict(InterceptVerdict):
         **{name: f"leg {{leg}}: {text}" for name, text in InterceptVerdict.SENTENCES.items()},
     }
 
-    leg: np.ndarray  # (B,) int, of which all this is said
-    num_met: np.ndarray  # (B,) int, targets that are met before that leg, with it if it succeeds
+    leg: np.ndarray  # (B,) int, index of the leg that the other fields describe
+    num_met: np.ndarray  # (B,) int, number of targets that are met up to this leg
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         num, time = np.asarray(self.num_met)[k], np.asarray(self.meeting_time)[k]
         return f"{num} targets are met, the last after {time:.3g} s"
 
@@ -46,15 +46,21 @@ class GroupVerdict(InterceptVerdict):
 def referee_groups(
     cases: Any, plans: Any, *, target_positions: Callable | None = None, **settings: Any
 ) -> GroupVerdict:
-    """Judge every plan of a batch; arguments and errors are those of `referee_intercepts`.
+    """Judge every plan of a batch.
 
-    Leg k has to begin where leg k - 1 ends: pose, speed and curvature, within the tolerance that
-    the first one has for the car's own. Its time is what is left of the case's. Nothing is read of
-    legs to absent targets.
+    Leg k must start with the pose, speed and curvature at the end of leg k - 1, within the
+    tolerance of `referee_intercepts`. It must end within the remainder of the case's time. Legs to
+    absent targets are not read.
+
+    Args:
+        cases: object with the fields of `InterceptGroup`, leaves with leading axis B.
+        plans: object with the fields of `GroupPlan`, leaves with leading axis B.
+        target_positions: see `referee_intercepts`.
+        **settings: other arguments of `referee_intercepts`, which also lists the errors.
     """
     present = np.asarray(cases.present, bool)
     batch, num = present.shape
-    order = checked_leaf("plan.order", plans.order, (batch, num))
+    order = check_leaf("plan.order", plans.order, (batch, num))
     is_order = (np.sort(order, axis=1) == np.arange(num)).all(axis=1)
     order = np.where(is_order[:, None], order, np.arange(num)).astype(int)
     there = np.take_along_axis(present, order, axis=1)
@@ -64,9 +70,9 @@ def referee_groups(
     car = (shared.start, shared.speed, shared.curvature)
     found = []
     for k in range(num):
-        leg = _entries(plans.legs, (lanes, np.full(batch, k)))
-        case = _leg(shared, _entries(shared.target, (lanes, order[:, k])), begin, car)
-        where = _later(target_positions or target_positions_of, begin)
+        leg = _index(plans.legs, (lanes, np.full(batch, k)))
+        case = _leg(shared, _index(shared.target, (lanes, order[:, k])), begin, car)
+        where = _delay(target_positions or target_positions_of, begin)
         verdict = referee_intercepts(case, leg, target_positions=where, **settings)
         found.append(dict(vars(verdict)))
         for name in ("failed_time", "meeting_time"):
@@ -81,42 +87,31 @@ def referee_groups(
     fails = ~together["success"] & there
     last = np.maximum(there.sum(axis=1) - 1, 0)
     leg = np.where(fails.any(axis=1), fails.argmax(axis=1), last)
-    said = {name: leaf[lanes, leg] for name, leaf in together.items()}
-    said["success"] = is_order & ~fails.any(axis=1)
-    said["failed_limit"] = np.where(is_order, said["failed_limit"], "order")
+    fields = {name: leaf[lanes, leg] for name, leaf in together.items()}
+    fields["success"] = is_order & ~fails.any(axis=1)
+    fields["failed_limit"] = np.where(is_order, fields["failed_limit"], "order")
     for name in ("failed_time", "failed_excess"):
-        said[name] = np.where(is_order, said[name], 0.0)
-    return GroupVerdict(**said, leg=leg, num_met=leg + ~fails.any(axis=1))
+        fields[name] = np.where(is_order, fields[name], 0.0)
+    return GroupVerdict(**fields, leg=leg, num_met=leg + ~fails.any(axis=1))
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """What `referee_intercepts` reads of the interceptions that begin at times (B,) [s]."""
+    """Return the interceptions that start at times (B,) [s] with a pose, speed and curvature."""
     movers, (start, speed, curvature) = shared.movers, car
-    passed = begin[:, None, None] * np.asarray(movers.velocity, np.float64)
-    names = ("tolerance", "end_heading", "heading_tolerance", "walls", "lower", "upper")
-    return SimpleNamespace(
-        **{name: vars(shared)[name] for name in (*names, "body", "limits")},
-        start=start,
-        speed=speed,
-        curvature=curvature,
-        target=target,
-        time=np.asarray(shared.time, np.float64) - begin,
-        movers=SimpleNamespace(
-            centre=movers.centre + passed,
-            corners=movers.corners,
-            velocity=movers.velocity,
-            present=movers.present,
-        ),
-    )
+    centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
+    own = {"start": start, "speed": speed, "curvature": curvature, "target": target}
+    own |= {"time": np.asarray(shared.time, np.float64) - begin}
+    own |= {"movers": SimpleNamespace(**{**vars(movers), "centre": centre})}
+    return SimpleNamespace(**{**vars(shared), **own})
 
 
-def _later(where: Callable, begin: np.ndarray) -> Callable:
-    """Positions of targets at times that count from moments (B,) [s]."""
+def _delay(where: Callable, begin: np.ndarray) -> Callable:
+    """Return the function `where` of times that count from `begin` (B,) [s]."""
     return lambda target, times: where(target, begin + times)
 
 
-def _entries(tree: Any, at: tuple) -> Any:
-    """Entries of every leaf of a dataclass of arrays, or of such dataclasses."""
+def _index(tree: Any, at: tuple) -> Any:
+    """Index every array of a dataclass, whose fields may be dataclasses too."""
     if not dataclasses.is_dataclass(tree):
         return np.asarray(tree)[at]
-    return type(tree)(**{name: _entries(leaf, at) for name, leaf in vars(tree).items()})
+    return type(tree)(**{name: _index(leaf, at) for name, leaf in vars(tree).items()})

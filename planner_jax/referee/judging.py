@@ -1,4 +1,4 @@
-"""Verdicts, and what every referee does with lanes: read them, share them, name failures."""
+"""Verdicts, and the steps of every referee: read arrays, distribute plans, name failures."""
 
 import dataclasses
 import functools
@@ -18,28 +18,26 @@ ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"  # sentence for a f
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """The referee's decision on plans, one entry a plan; without an axis for a single plan.
+    """The referee's decision on a batch of B plans, or on one plan, whose fields have no axis.
 
-    Measurements of a lane with inputs that are not finite may be NaN.
+    Measurements are NaN where the plan or its case is not finite.
     """
 
-    # Limit -> sentence for its failure, with `time`, `excess` and any field of the verdict; in the
-    # order of the tests: a failed plan is named after its first failure.
+    # Sentence for the failure of each limit, in the order of the tests. It may name `time`,
+    # `excess` and any field of the verdict. A failed plan is named after its first failed test.
     SENTENCES: ClassVar[dict[str, str]]
-    # Limit -> sentence for an excess that is infinite.
-    UNBOUNDED: ClassVar[dict[str, str]] = {}
+    UNBOUNDED: ClassVar[dict[str, str]] = {}  # sentences for an infinite excess
 
     success: np.ndarray  # (B,) bool
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
-    failed_time: np.ndarray  # (B,) [s], where that limit is worst; NaN for a success
-    # (B,), in the unit of the limit's sentence, tolerance included; NaN for a success.
+    failed_time: np.ndarray  # (B,) [s], when that limit is exceeded most; NaN for a success
+    # (B,), in the unit of the limit's sentence, tolerance not subtracted; NaN for a success.
     failed_excess: np.ndarray
 
     def sentence(self, k: int | None = None) -> str:
-        """Return one line for a human: which limit failed, when, and the excess.
+        """Describe in one line which limit plan `k` exceeds, when, and the excess.
 
-        Args:
-            k: index of the plan; None for a verdict on one plan.
+        For a verdict on one plan, `k` is None.
         """
         at = () if k is None else k
         name = str(np.asarray(self.failed_limit)[at])
@@ -52,40 +50,35 @@ class Verdict:
         return f"{name}: {text}"
 
     def praise(self, k: int | tuple) -> str:
-        """Return the end of the sentence for a success."""
+        """Describe the success of plan `k`."""
         return "every limit holds"
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightVerdict(Verdict):
-    """Verdict on plans of a quadrotor, with the measurements of the whole flight."""
+    """Verdict on plans of a quadrotor, with measurements of the whole flight."""
 
     max_speed: np.ndarray  # (B,) [m/s]
     max_acceleration: np.ndarray  # (B,) [m/s^2]
-    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is not defined
+    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is undefined
     min_height: np.ndarray  # (B,) [m]
     min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
-    # (B,) [N], of one rotor; NaN where the case has no limits of rotors.
-    min_rotor_thrust: np.ndarray
-    max_rotor_thrust: np.ndarray
-    continuity_error: np.ndarray  # (B,) [m], worst jump between pieces, as displacement
-    head_error: np.ndarray  # (B,) [m], error at time 0, as displacement
-    worst_extra: np.ndarray  # (B,) int, index of the extra with the worst excess; -1 without any
+    min_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
+    max_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
+    continuity_error: np.ndarray  # (B,) [m], greatest jump between pieces, as displacement
+    head_error: np.ndarray  # (B,) [m], error of the state at time 0, as displacement
+    worst_extra: np.ndarray  # (B,) int, index of the extra limit with the greatest excess, or -1
 
 
-# Largest difference [s] between the claimed time of a contact and the one that is flown.
-CONTACT_TIME_TOLERANCE = 1e-4
-# Limits smaller than this (in their own unit) are compared as if relative to it.
-SMALLEST_LIMIT = 1e-3
-# Fewest lanes that are worth a thread.
-_FEWEST_LANES = 256
-# From these on processes judge instead of threads.
-_MANY_LANES, _MANY_CORES = 16384, 4
+CONTACT_TIME_TOLERANCE = 1e-4  # [s], between the claimed time of a contact and the planned one
+SMALLEST_LIMIT = 1e-3  # smallest divisor of a relative excess, in the limit's own unit
+_FEWEST_LANES = 256  # of a thread: fewer do not repay it
+_MANY_LANES, _MANY_CORES = 16384, 4  # least numbers for which processes judge instead of threads
 
 
-def checked_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return a leaf as an array; raise ValueError unless it has this shape."""
+def check_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
+    """Return `value` as an array; raise ValueError unless it has this shape."""
     leaf = np.asarray(value)
     if leaf.shape != shape:
         raise ValueError(f"{name} must be {shape}, got {leaf.shape}")
@@ -95,45 +88,45 @@ def checked_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndar
 def read_leaves(
     tree: object, shapes: Mapping[str, tuple[int, ...]], num_lanes: int, prefix: str = ""
 ) -> dict[str, np.ndarray]:
-    """Read arrays of a case or a plan, and check their shapes.
+    """Read arrays of cases or plans by name, and check their shapes.
 
     Args:
-        tree: object whose leaves have a leading axis of lanes.
-        shapes: path of field names, such as "ball.pos", -> shape in one lane.
+        tree: object whose arrays have a leading axis B.
+        shapes: shape of each array without that axis, by the path of its fields, as "ball.pos".
         num_lanes: B.
-        prefix: put before each path in the names of the arrays and in errors.
+        prefix: of each name in the result and in errors.
 
     Returns:
-        Arrays by name. A field that is None is left out.
+        Arrays by name, without fields that are None.
 
     Raises:
         ValueError: an array has another shape.
     """
     values = {path: operator.attrgetter(path)(tree) for path in shapes}
     return {
-        prefix + path: checked_leaf(prefix + path, value, (num_lanes, *shapes[path]))
+        prefix + path: check_leaf(prefix + path, value, (num_lanes, *shapes[path]))
         for path, value in values.items()
         if value is not None
     }
 
 
 def flat(values: np.ndarray) -> np.ndarray:
-    """Return (B, ...) as (B, N); the empty batch too."""
+    """Reshape (B, ...) to (B, N), also for B = 0."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def cut(num_lanes: int, size: int) -> list[slice]:
-    """Cut lanes into slices of a size; one empty slice if there are no lanes."""
+    """Cut lanes into slices of at most `size`; return one empty slice if there are no lanes."""
     return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
 
 
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """Return the fields of a verdict from leaves with leading axis B, by chunks of lanes.
+    """Judge arrays with leading axis B in chunks, and return the fields of the verdict.
 
-    Threads share the lanes, one for each core: NumPy releases the interpreter inside its loops.
-    Processes share them if there are many lanes and many cores, and `judge` can be pickled.
+    One thread a core judges the chunks, since NumPy releases the interpreter inside its loops.
+    Processes judge them if there are many lanes and many cores, and `judge` can be pickled.
 
     Raises:
         ValueError: `chunk` < 1.
@@ -147,9 +140,9 @@ def judge_in_chunks(
     if min(len(cases), num_cores) == 1:
         parts = [judge_part(case) for case in cases]
     elif num_cores >= _MANY_CORES and num_lanes >= _MANY_LANES and _can_be_sent(judge):
-        from planner_jax.referee.workers import workers  # few batches are so large
+        from planner_jax.referee.workers import map_in_processes  # few batches are so large
 
-        parts = workers().map(judge_part, cases)
+        parts = map_in_processes(judge_part, cases)
     else:
         with ThreadPoolExecutor(num_cores) as pool:
             parts = list(pool.map(judge_part, cases))
@@ -157,7 +150,7 @@ def judge_in_chunks(
 
 
 def _judge_in_float64(judge: Callable[[dict], dict], case: dict[str, np.ndarray]) -> dict:
-    # A broken or absurd lane may overflow; its verdict reports that, not a warning.
+    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
     with np.errstate(all="ignore"):
         return judge({name: leaf.astype(np.float64) for name, leaf in case.items()})
 
@@ -171,10 +164,10 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def cores() -> int:
-    """Return the number of cores to use: NPROC, as for XLA, or all that the process may use."""
-    told = os.environ.get("NPROC", "")
-    if told.isdecimal():
-        return max(int(told), 1)
+    """Return the number of cores to use: `NPROC`, as XLA does, or all that the process may use."""
+    setting = os.environ.get("NPROC", "")
+    if setting.isdecimal():
+        return max(int(setting), 1)
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # another system than Linux
@@ -182,7 +175,7 @@ def cores() -> int:
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
-    """Return which lanes (B,) are finite; limits and `unbounded` may be infinite, but not NaN."""
+    """Test which lanes (B,) are finite; limits and `unbounded` may be infinite, but not NaN."""
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded
@@ -192,16 +185,17 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
 
 
 def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
-    """Return success, failed limit, its time and its excess of every lane.
+    """Return the fields of `Verdict`: success, and the first failed limit, its time and excess.
 
-    Tests are name -> failed, excess, time, each (B,), and `finite` (B,) bool says whether inputs
-    are finite. `limits` are "not finite", then the names in the order of the tests; names without a
-    test are skipped.
+    Args:
+        tests: (failed, excess, time) by name, each (B,).
+        limits: "not finite", then names in the order of the tests; some may have no test.
+        finite: (B,) bool, the inputs are finite.
     """
     limits = (limits[0], *(name for name in limits[1:] if name in tests))
-    failed = np.stack([tests[name][0] for name in limits[1:]], axis=1)
-    excess = np.stack([tests[name][1] for name in limits[1:]], axis=1)
-    time = np.stack([tests[name][2] for name in limits[1:]], axis=1)
+    failed, excess, time = (
+        np.stack([tests[name][k] for name in limits[1:]], axis=1) for k in range(3)
+    )
     finite = finite & ~np.isnan(excess).any(axis=1)
     success = finite & ~failed.any(axis=1)
     first = failed.argmax(axis=1)
@@ -217,14 +211,14 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
 
 
 def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarray) -> tuple:
-    """Test value <= limit: failed, relative excess, time."""
+    """Test value <= limit; return (failed, relative excess, time)."""
     scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
     excess = (value - limit) / scale
     return excess > tolerance, excess, time
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Return a derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) [s]."""
+    """Evaluate a derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) [s]."""
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

@@ -1,8 +1,8 @@
-"""Tests of a quadrotor's trajectory in float64: motion, peaks, head state, joints, rest.
+"""Tests of a quadrotor's trajectory in float64 NumPy, for the referees of hits and catches.
 
-No code is shared with the planners but the case's own extra limits (`referee.extras`). Polynomial
-pieces are sampled; attitude and body rate come from flatness (the Hopf fibration at zero heading
-[Watterson2020]). World frame, z up, SI units.
+Polynomial pieces are sampled. Attitude and body rate follow from differential flatness (Hopf
+fibration at zero heading [Watterson2020]). World frame, z up, SI units. Only the case's extra limits
+(`referee.extras`) are code that the planners run too.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from planner_jax.referee.judging import (
     ABOVE_LIMIT,
     above,
-    checked_leaf,
+    check_leaf,
     cut,
     derivative,
     flat,
@@ -24,9 +24,9 @@ from planner_jax.referee.judging import (
 
 @dataclasses.dataclass(frozen=True)
 class Pieces:
-    """Polynomial pieces in float64; one that is not flown repeats the last one that is.
+    """Polynomial pieces of B trajectories in float64.
 
-    A repeated piece changes no greatest and no least value.
+    A piece that is not flown is a copy of the last one that is, which changes no extremum.
     """
 
     coeffs: np.ndarray  # (3, B, M, D + 1)
@@ -41,9 +41,9 @@ class Pieces:
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
-    """Return the pieces of trajectories of coefficients (B, M, D + 1, 3) and durations (B, M) [s].
+    """Return the pieces with coefficients (B, M, D + 1, 3) and durations (B, M) [s].
 
-    Pieces that are not `flown` (B, M) bool must have no duration; by default all are flown.
+    By default all pieces are flown. The others, by `flown` (B, M) bool, must have zero duration.
     """
     coeffs = np.moveaxis(coeffs, -1, 0)
     starts = np.cumsum(durations, axis=1) - durations
@@ -59,7 +59,7 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
 
 
 def append_recovery(pieces: Pieces, case: dict) -> Pieces:
-    """Return the pieces of trajectories and of their recoveries, if there are any."""
+    """Append the pieces of the recovery trajectories, if the plans have any."""
     if "recovery.coeffs" not in case:
         return pieces
     durations = case["recovery.durations"]
@@ -80,7 +80,6 @@ def append_recovery(pieces: Pieces, case: dict) -> Pieces:
     )
 
 
-# Limit -> sentence for its failure.
 MOTION_SENTENCES = {
     "head state": "the trajectory starts {excess:.3g} m off the head state",
     "continuity": "the trajectory jumps by {excess:.3g} m at {time:.3f} s",
@@ -91,23 +90,22 @@ MOTION_SENTENCES = {
     "rotor high": "{excess:.2%} above the greatest thrust of a rotor at {time:.3f} s",
     "ground": "{excess:.2%} below the least height at {time:.3f} s",
     "extra": "{excess:.2%} beyond extras[{worst_extra}] of the case at {time:.3f} s",
-    "recovery": "the way to rest ends with what makes {excess:.3g} m of displacement",
+    "recovery": "the recovery trajectory does not end at standstill: velocity, acceleration or "
+    "jerk make {excess:.3g} m of displacement",
 }
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
-# Jumps of derivatives count as displacement over one piece, or over this time [s] if longer.
-SHORTEST_PIECE = 0.1
-# Fewest intervals between the samples of one piece.
-_FEWEST_INTERVALS = 16
-# Multiplications of one matrix product that samples lanes, and lanes whose peaks are searched at
-# once: many to a call of NumPy, and few enough for the cache. Up to 2^18 of them OpenBLAS starts
-# no threads of its own, which would get in the way of those here.
+SHORTEST_PIECE = 0.1  # [s], least time over which an error of a derivative counts as displacement
+_FEWEST_INTERVALS = 16  # between samples of a piece
+# Multiplications of one matrix product, and lanes whose peaks are searched at once: many to a call
+# of NumPy, but few enough for the cache. Up to 2^18 multiplications OpenBLAS starts no threads of
+# its own, which would compete with the referee's threads.
 _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(samples: int, num_pieces: int) -> int:
-    """Return the intervals between samples of one piece, if pieces share `samples`.
+    """Return the number of sample intervals of a piece, if all pieces together have `samples`.
 
     Raises:
         ValueError: the samples are fewer than 200.
@@ -117,8 +115,8 @@ def intervals_of(samples: int, num_pieces: int) -> int:
     return max(math.ceil(samples / num_pieces), _FEWEST_INTERVALS)
 
 
-def checked_coeffs(value: ArrayLike) -> np.ndarray:
-    """Return coefficients as an array; raise ValueError unless they are (B, M, D + 1, 3)."""
+def check_coeffs(value: ArrayLike) -> np.ndarray:
+    """Return the coefficients as an array; raise ValueError unless they are (B, M, D + 1, 3)."""
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
@@ -126,30 +124,30 @@ def checked_coeffs(value: ArrayLike) -> np.ndarray:
 
 
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans that `judge_motion` needs but the head state.
+    """Read the arrays of cases and plans that `judge_motion` needs, except the head state.
 
-    The optional limits are those that are not None: acceleration, thrust, rotors. So is the
-    trajectory to rest behind the plan, `recovery`.
+    Acceleration, thrust and rotors are optional limits of a case, and the recovery trajectory is
+    an optional part of a plan: they are None if absent.
     """
-    coeffs = checked_coeffs(plans.trajectory.coeffs)
+    coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
     leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
     durations = plans.trajectory.durations
-    leaves["durations"] = checked_leaf("durations", durations, (num_lanes, num_pieces))
+    leaves["durations"] = check_leaf("durations", durations, (num_lanes, num_pieces))
     limits = ("speed", "acceleration", "body_rate", "min_thrust", "max_thrust", "min_height")
     shapes = {"gravity": ()} | {f"limits.{name}": () for name in limits}
     leaves |= read_leaves(cases, shapes, num_lanes)
     if cases.limits.rotors is not None:
         leaves |= read_leaves(cases.limits.rotors, _ROTOR_SHAPES, num_lanes, "limits.rotors.")
     if plans.recovery is not None:
-        coeffs = checked_coeffs(plans.recovery.coeffs)
+        coeffs = check_coeffs(plans.recovery.coeffs)
         shapes = {"coeffs": coeffs.shape[1:], "durations": coeffs.shape[1:2]}
         leaves |= read_leaves(plans.recovery, shapes, num_lanes, "recovery.")
     return leaves
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Return derivatives (3, B, M, S) of order 0 to 3 at fractions u (S,) of all pieces."""
+    """Evaluate the derivatives (3, B, M, S) of order 0 to 3 at fractions u (S,) of all pieces."""
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
@@ -163,22 +161,22 @@ def _motion(pieces: Pieces, u: np.ndarray) -> list:
     return out
 
 
-def _squared(vector: np.ndarray) -> np.ndarray:
-    """Return the squared length of vectors (3, ...)."""
+def _norm_squared(vector: np.ndarray) -> np.ndarray:
+    """Return the squared norm of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """Return |a + g e_3|^2 of accelerations (3, ...)."""
+    """Return |a + g e_3|^2 for accelerations a (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
 def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
     """Return |omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
 
-    z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2, and the yaw rate
-    (z_y z_x' - z_x z_y') / (1 + z_z) is -c_z / (|tau| (|tau| + tau_z)).
-    Infinite without thrust and upside down, where there is no attitude.
+    The thrust direction z has z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2. The yaw rate is
+    (z_y z_x' - z_x z_y') / (1 + z_z) = -c_z / (|tau| (|tau| + tau_z)). The result is infinite
+    without thrust and upside down, where the attitude is undefined.
     """
     tau_x, tau_y, tau_z = acc[0], acc[1], acc[2] + gravity
     c_x = tau_y * jerk[2] - tau_z * jerk[1]
@@ -190,10 +188,10 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
     return np.where(upright > 0.0, rate, np.inf)
 
 
-# Name -> orders of the derivatives it needs, and the measure whose maximum is sought.
+# Quantities whose maximum is searched: the derivatives that each one needs, and its function.
 _MEASURES = {
-    "speed": ((1,), lambda gravity, vel: _squared(vel)),
-    "acceleration": ((2,), lambda gravity, acc: _squared(acc)),
+    "speed": ((1,), lambda gravity, vel: _norm_squared(vel)),
+    "acceleration": ((2,), lambda gravity, acc: _norm_squared(acc)),
     "body rate": ((2, 3), _body_rate_squared),
     "depth": ((0,), lambda gravity, pos: -pos[2]),
     "thrust": ((2,), _thrust_squared),
@@ -202,10 +200,11 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the greatest of samples (N, M, S) of M pieces, and the likeliest peak.
+    """Find the greatest of samples (N, M, S) of M pieces, and the likeliest peak.
 
-    The samples are overwritten. Results are the index (N,) of the greatest sample among the M S,
-    its value, and the index next to the greatest parabola through three samples of a piece.
+    Returns the index (N,) of the greatest sample among the M S of a row, its value, and the index
+    of the sample under the highest vertex of a parabola through three samples of a piece. The
+    samples are overwritten.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
@@ -220,10 +219,10 @@ def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
-    """Return the greatest value (B,) of every measure along the trajectory, and its time [s].
+    """Find the greatest value (B,) of every quantity along the trajectory, and its time [s].
 
-    Every piece is sampled at both ends and inside; the likeliest peak by parabolas through
-    three samples is then searched on the polynomial itself, so that the value is reached.
+    Every piece is sampled at both ends and inside. Parabolas through three samples give the
+    likeliest peak, which is then refined on the polynomial itself.
     """
     u = np.linspace(0.0, 1.0, intervals + 1)
     parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in cut(len(gravity), _SEARCHED)]
@@ -236,7 +235,7 @@ def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tupl
 
 
 def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
-    """Return `peaks` of the lanes that are searched at once, sampled at fractions u (S,)."""
+    """Find the `peaks` of some lanes, from samples at fractions u (S,)."""
     num_lanes, num_pieces = pieces.durations.shape
     products = num_pieces * pieces.coeffs.shape[-1] * len(u)
     tiles = cut(num_lanes, max(_PRODUCT // products, 1))
@@ -256,7 +255,7 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """Return `_tops` of every measure, (6, B), and `_fastest_turn`, (B,)."""
+    """Return `_tops` of every quantity, (6, B), and `_fastest_turn`, (B,)."""
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
@@ -268,14 +267,14 @@ def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the time (B,) [s] of one sample a lane, counted through all of its pieces."""
+    """Return the time (B,) [s] of one sample a lane; indices count the samples of all pieces."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Search the greatest value (B,) of a measure around one sample a lane; return its time too."""
+    """Refine the greatest value (B,) of a quantity near one sample a lane; return its time too."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
@@ -291,21 +290,21 @@ def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tup
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greater of two values, lane by lane, with its time."""
+    """Return the greater of two values lane by lane, with its time."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the sample (B,) before the fastest turn of the thrust, and the squared body rate.
+    """Find the fastest rotation of the thrust between two samples: first sample, squared rate.
 
-    The rate is the mean over a step, so never above the true maximum. It reveals a thrust that
-    passes through zero between two samples and turns the quadrotor over at once.
+    The mean rate over a step is never above the true maximum. It detects a thrust that passes
+    through zero between two samples, which flips the quadrotor.
     """
     tau = acc.copy()
     tau[2] += gravity
     tau = tau.reshape(3, -1)
-    size = np.sqrt(_squared(tau))
+    size = np.sqrt(_norm_squared(tau))
     along = tau[:, 1:] * tau[:, :-1]
     cosine = np.ones(acc.shape[1:])
     cosine.ravel()[:-1] = (along[0] + along[1] + along[2]) / (size[1:] * size[:-1])
@@ -321,9 +320,9 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
     """Return errors of head state and joints [m], time of the worst joint, and scale [m].
 
-    An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
-    that it makes over one mean piece h, at least `SHORTEST_PIECE`. The scale is the largest
-    coordinate at the pieces' ends, at least 1 m. The head state is (B, 4, 3), position to jerk.
+    An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n! over
+    the mean duration h of a piece, at least `SHORTEST_PIECE`. The scale is the largest coordinate
+    at the ends of the pieces, at least 1 m. The head state is (B, 4, 3), position to jerk.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)
@@ -348,10 +347,10 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
 def judge_motion(
     pieces: Pieces, case: dict, extras: tuple, intervals: int, relative: float, continuity: float
 ) -> tuple[dict, dict]:
-    """Return the measurements of `FlightVerdict`, and tests: name -> failed, excess, time.
+    """Return the measurements of `FlightVerdict`, and tests (failed, excess, time) by name.
 
-    A case has "head_state" and the leaves of `read_flight`. `continuity` is the tolerance of head
-    state and joints, times the scale of the coordinates.
+    A case has "head_state" and the arrays of `read_flight`. The tolerance of head state and joints
+    is `continuity` times the scale of the coordinates.
     """
     found = peaks(pieces, case["gravity"], intervals)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
@@ -378,7 +377,7 @@ def judge_motion(
         "continuity": (jump > allowed, jump, jump_time),
         "extra": (beyond > relative, beyond, at),
     }
-    # Test -> peak, what is measured there, the limit's field, sign of an upper or lower limit.
+    # By test: peak, measurement, field of the limit, sign (1 for an upper limit, -1 for a lower).
     bounds = {
         "speed": ("speed", "max_speed", "speed", 1.0),
         "acceleration": ("acceleration", "max_acceleration", "acceleration", 1.0),
@@ -398,15 +397,14 @@ def judge_motion(
         of_rotors, rotor_tests = judge_rotors(pieces, case, u, relative)
         measured, tests = measured | of_rotors, tests | rotor_tests
     else:
-        unknown = np.full(len(head), np.nan)
-        measured |= {"min_rotor_thrust": unknown, "max_rotor_thrust": unknown}
+        measured |= dict.fromkeys(("min_rotor_thrust", "max_rotor_thrust"), np.full(num, np.nan))
     return measured, tests | _judge_rest(case, pieces, continuity)
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """Test that trajectories behind plans end at rest; no test without such trajectories.
+    """Test that recovery trajectories end at standstill; return no test if plans have none.
 
-    Velocity, acceleration and jerk at the end count as displacement, as jumps between pieces do.
+    Velocity, acceleration and jerk at the end count as displacement, as in `joint_errors`.
     """
     if "recovery.coeffs" not in case:
         return {}

@@ -1,21 +1,24 @@
-"""What a quadrotor's rotors have to do along a trajectory, in float64, for the referee.
+"""The thrusts of a quadrotor's rotors along a trajectory, in float64 NumPy.
 
-The attitude comes from the thrust (the Hopf fibration at zero heading), its rate from the cross
-product of thrust and jerk, and the angular acceleration from rates a moment apart: nothing is
-shared with the planners, who take it from the snap.
+The attitude follows from the thrust (Hopf fibration at zero heading), and the body rate from the
+cross product of thrust and jerk. The angular acceleration is a central difference of body rates,
+whereas the planners compute it from the snap.
 """
 
 import numpy as np
 
-from planner_jax.referee.judging import cut
+from planner_jax.referee.judging import cut, derivative
 from planner_jax.referee.quadrotor import Pieces
 
-_MOMENT = 1e-5  # [s]
-_NUMBERS = 250_000  # samples of the rotors that are computed at once, so that they fit a cache
+_MOMENT = 1e-5  # [s], half the step of the central difference
+_NUMBERS = 250_000  # samples that are computed at once: they fit a cache
 
 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Return least and greatest thrust (B,) [N] of a rotor at samples u (S,), and the tests."""
+    """Measure the least and greatest thrust (B,) [N] of a rotor, and test both.
+
+    Every piece is sampled at fractions u (S,) of its duration.
+    """
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))
@@ -24,7 +27,7 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
         np.concatenate(found) for found in zip(*parts, strict=True)
     )
     low, high = case["limits.rotors.min_thrust"], case["limits.rotors.max_thrust"]
-    # Both are relative to the greatest thrust: the least is zero for most rotors.
+    # Both are relative to the upper limit, since the lower one is zero for most rotors.
     below, beyond = (low - least) / high, most / high - 1.0
     tests = {
         "rotor low": (~(below <= relative), below, least_time),
@@ -55,16 +58,21 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Return the thrust of each rotor [N] (B, M, S, 4); not finite where there is no attitude.
+    """Return the thrusts (B, M, S, 4) [N] of the rotors; not finite where there is no attitude.
 
-    Coefficients (3, B, M, D + 1) are of rising powers of the times (B, M, S) [s] since each piece's
-    start; gravity, mass, inertia and mixer are those of the case, with leading axis B.
+    Args:
+        coeffs: (3, B, M, D + 1), of rising powers of the time since each piece's start.
+        times: (B, M, S) [s], since each piece's start.
+        gravity: (B,) [m/s^2], magnitude.
+        mass: (B,) [kg].
+        inertia: (B, 3) [kg m^2], about the body's axes.
+        mixer: (B, 4, 4), from thrust and torques to the thrusts of the rotors.
     """
     pull, rate = _pull_and_rate(coeffs, times, gravity)
     before, after = (
         _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
     )
-    # A rate that the body sees and one that the world sees change alike.
+    # The derivative of the body rate is the same in both frames, as omega x omega = 0.
     change = (after - before) / (2.0 * _MOMENT)
     axes = _body_axes(pull)
     own = np.einsum("...ij,...i->...j", axes, rate)
@@ -80,29 +88,18 @@ def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return thrust per unit mass [m/s^2] and world angular velocity [rad/s], (B, M, S, 3)."""
-    powers = np.arange(coeffs.shape[-1])
-    twice, thrice = powers * (powers - 1.0), powers * (powers - 1.0) * (powers - 2.0)
-    acc = _at(coeffs * twice, times, 2)
-    jerk = _at(coeffs * thrice, times, 3)
-    pull = acc.copy()
+    powers = np.moveaxis(coeffs, -1, 0)[..., None]
+    pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
-    # Across the thrust it turns by tau x jerk / |tau|^2; about it as zero heading asks.
+    # omega = tau x jerk / |tau|^2 + the rate about the thrust that keeps the heading zero.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
     return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
 
 
-def _at(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate polynomials (3, B, M, D + 1) without their first `order` powers: (B, M, S, 3)."""
-    value = np.zeros((3, *times.shape))
-    for k in range(coeffs.shape[-1] - 1, order - 1, -1):
-        value = value * times + coeffs[..., k, None]
-    return np.moveaxis(value, 0, -1)
-
-
 def _body_axes(pull: np.ndarray) -> np.ndarray:
-    """Return the shortest rotation (..., 3, 3), body to world, from upright to a thrust."""
+    """Return the shortest rotations (..., 3, 3) from the vertical to thrusts (..., 3)."""
     up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
     x, y, z = np.moveaxis(up, -1, 0)
     k = 1.0 / (1.0 + z)

@@ -1,15 +1,14 @@
 """Distances in space between points, segments and boxes, in float64 NumPy.
 
-It shares no code with the planners. Vectors (3, ...) [m] have their components first; whatever
-is compared broadcasts. All are closed forms, exact to rounding.
+Vectors (3, ...) [m] have their components first, and arguments broadcast. All distances are closed
+forms, exact to rounding.
 """
 
 import itertools
 
 import numpy as np
 
-# Two edges whose directions have a product shorter than this are taken for parallel.
-_PARALLEL = 1e-9
+_PARALLEL = 1e-9  # edges are parallel if the cross product of their directions is shorter
 
 
 def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
@@ -18,22 +17,22 @@ def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
 
 
 def length(vector: np.ndarray | list) -> np.ndarray:
-    """Return lengths (...) of vectors (3, ...)."""
+    """Return the lengths (...) of vectors (3, ...)."""
     return np.sqrt(dot(vector, vector))
 
 
-def turned(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return products (3, ...) of matrices (3, 3, ...) and vectors (3, ...)."""
+def rotate(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Multiply vectors (3, ...) by matrices (3, 3, ...)."""
     return np.stack([dot(rotation[k], vector) for k in range(3)])
 
 
-def turned_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return vectors (3, ...) in the frames that rotations (3, 3, ...) lead out of."""
+def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """Multiply vectors (3, ...) by the transposes of matrices (3, 3, ...)."""
     return np.stack([dot(rotation[:, k], vector) for k in range(3)])
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return distances (...) [m] of points from segments; their two ends may be one point."""
+    """Return distances (...) [m] of points from segments, whose length may be zero."""
     way, away = second - first, point - first
     square = dot(way, way)
     share = np.clip(_ratio(dot(away, way), square), 0.0, 1.0)
@@ -43,10 +42,10 @@ def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np
 def between_segments(
     first: np.ndarray, second: np.ndarray, third: np.ndarray, fourth: np.ndarray
 ) -> np.ndarray:
-    """Return distances (...) [m] of segments from `first` to `second` from those to `fourth`.
+    """Return distances (...) [m] between segments `first` to `second` and `third` to `fourth`.
 
-    The shares of either way at the nearest points: those of the two lines, held in [0, 1] one
-    after the other (Ericson, Real-Time Collision Detection, Section 5.1.9).
+    The parameters of the nearest points of both lines are clipped to [0, 1] one after the other
+    (Ericson, Real-Time Collision Detection, Section 5.1.9).
     """
     way, other, away = second - first, fourth - third, first - third
     a, b, c = dot(way, way), dot(way, other), dot(other, other)
@@ -60,14 +59,15 @@ def between_segments(
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return distances (...) [m] of segments from boxes around the origin; zero where they meet.
 
-    The squared distance is convex along the segment, and its slope is a line between the places
-    where the segment crosses the planes of the box's sides: the root lies between the last of
-    them with a slope below zero and the first with one above. Ends and half edges are (3, ...).
+    Along the segment the squared distance is convex. Its slope is piecewise linear, with breaks
+    where the segment crosses the planes of the box's sides. The root of the slope lies between the
+    last break with a negative slope and the first with a positive one. Ends and half edges are
+    (3, ...).
     """
     way = second - first
 
     def beyond(share: np.ndarray) -> list:
-        """Return how far out of the box a place on the segment is, component by component."""
+        """Return the vector from the box to the point of the segment at `share`."""
         places = (first[k] + share * way[k] for k in range(3))
         return [place - np.clip(place, -half[k], half[k]) for k, place in enumerate(places)]
 
@@ -86,17 +86,17 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
 def between_boxes(
     middle: np.ndarray, rotation: np.ndarray, half: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """Return distances (P,) [m] between boxes; of overlapping ones minus the depth.
+    """Return distances (P,) [m] between boxes; minus the penetration depth where they overlap.
 
-    By separating axes: if the greatest gap along the normals of sides and the products of edges
-    is negative the two overlap, and it is the shortest way out. If not, the nearest points lie
-    on an edge of one of them and on the other.
+    Separating axes are the normals of the sides and the cross products of the edges. If the
+    greatest gap along them is negative, the boxes overlap, and the gap is minus the depth.
+    Otherwise a nearest point lies on an edge of one of the boxes.
 
     Args:
         middle: (3, P), of the first box in the frame of the second.
-        rotation: (3, 3, P), of the first one's frame to that of the second.
-        half: (3, P), half edges of the first.
-        other: (3, P), half edges of the second, around the origin.
+        rotation: (3, 3, P), from the frame of the first box to the frame of the second.
+        half: (3, P), half edges of the first box.
+        other: (3, P), half edges of the second box, around the origin.
     """
     axes = [np.broadcast_to(axis[:, None], middle.shape) for axis in np.eye(3)]
     own = [rotation[:, k] for k in range(3)]
@@ -110,7 +110,7 @@ def between_boxes(
         gap = np.where(size > _PARALLEL, np.maximum(gap, apart), gap)
     free = np.flatnonzero(gap > 0.0)
     middle, rotation, half, other = (part[..., free] for part in (middle, rotation, half, other))
-    out, back = -turned_back(rotation, middle), np.swapaxes(rotation, 0, 1)
+    out, back = -rotate_back(rotation, middle), np.swapaxes(rotation, 0, 1)
     gap[free] = np.minimum(
         _edges_to_box(middle, rotation, half, other), _edges_to_box(out, back, other, half)
     )
@@ -118,7 +118,7 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return distances (P,) [m] of boxes' nearest edges from others; as in `between_boxes`."""
+    """Return the least distances (P,) [m] of edges of the first boxes; see `between_boxes`."""
     edges = rotation * half  # (3, 3, P), half of each
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
@@ -129,6 +129,6 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
 
 
 def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Return the quotient, and zero where `by` is."""
+    """Return the quotient, or zero where the divisor is zero."""
     none = by == 0.0
     return np.where(none, 0.0, value / np.where(none, 1.0, by))

@@ -1,7 +1,7 @@
 """Processes that judge, for batches so large that threads would wait for the interpreter.
 
-A worker is this module run by itself: it imports the referee and NumPy and nothing of the
-program that asks, so that a caller needs no `if __name__ == "__main__"`.
+A worker runs this module with `python -m`: it imports the referee and NumPy, and nothing of the
+calling program, which therefore needs no `if __name__ == "__main__"`.
 """
 
 import atexit
@@ -10,92 +10,72 @@ import os
 import pickle
 import subprocess
 import sys
-import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from queue import SimpleQueue
 from typing import TypeVar
 
 from planner_jax.referee.judging import cores
 
-Given = TypeVar("Given")
-Found = TypeVar("Found")
-_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # a core is one worker's
+ArgumentT = TypeVar("ArgumentT")
+ResultT = TypeVar("ResultT")
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each worker has one core
 
 
-class _Worker:
-    """One process, and the pipes to it."""
+def map_in_processes(
+    function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
+) -> list[ResultT]:
+    """Return `function` of each argument; `pickle` must be able to write both."""
+    threads, idle = _start_workers()
 
-    def __init__(self) -> None:
-        self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env={
-                **os.environ,
-                "PYTHONPATH": os.pathsep.join(sys.path),
-                **_ENVIRONMENT,
-            },
-        )
-
-    def call(self, function: Callable[[Given], Found], argument: Given) -> Found:
-        """Return the function's result, computed there; its exception, raised here."""
-        process = self._process
-        assert process.stdin is not None and process.stdout is not None
+    def call(argument: ArgumentT) -> ResultT:
+        worker = idle.get()
         try:
-            pickle.dump((function, argument), process.stdin, pickle.HIGHEST_PROTOCOL)
-            process.stdin.flush()
-            failed, result = pickle.load(process.stdout)
-        except (BrokenPipeError, EOFError) as error:
-            code = process.wait()
-            raise RuntimeError(f"a process of the referee ended with code {code}") from error
-        if failed:
-            raise result
-        return result
+            return _call(worker, function, argument)
+        finally:
+            idle.put(worker)
 
-    def stop(self) -> None:
-        """Let the process end: it does when there is no more to read."""
-        assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.close()
-        self._process.wait()
-        self._process.stdout.close()
+    return list(threads.map(call, arguments))
 
 
-class Workers:
-    """As many processes as the referee has cores."""
-
-    def __init__(self, num: int) -> None:
-        self._threads = ThreadPoolExecutor(num, initializer=self._start_worker)
-        self._own = threading.local()
-        self._all: list[_Worker] = []
-
-    def map(self, function: Callable[[Given], Found], arguments: list[Given]) -> list[Found]:
-        """Return `function` of each argument; both must be known to `pickle`."""
-        return list(
-            self._threads.map(lambda each: self._own.worker.call(function, each), arguments)
-        )
-
-    def _start_worker(self) -> None:
-        """Start the process of the thread that calls this."""
-        self._own.worker = _Worker()
-        self._all.append(self._own.worker)
-
-    def stop(self) -> None:
-        """End all processes."""
-        self._threads.shutdown()
-        for worker in self._all:
-            worker.stop()
+def _call(
+    worker: subprocess.Popen, function: Callable[[ArgumentT], ResultT], argument: ArgumentT
+) -> ResultT:
+    """Compute the function's result in a worker; raise the exception that it raises there."""
+    assert worker.stdin is not None and worker.stdout is not None
+    try:
+        pickle.dump((function, argument), worker.stdin, pickle.HIGHEST_PROTOCOL)
+        worker.stdin.flush()
+        failed, result = pickle.load(worker.stdout)
+    except (BrokenPipeError, EOFError) as error:
+        code = worker.wait()
+        raise RuntimeError(f"a process of the referee ended with code {code}") from error
+    if failed:
+        raise result
+    return result
 
 
 @functools.cache
-def workers() -> Workers:
-    """Return the processes of this program, begun when they are first asked for."""
-    pool = Workers(cores())
-    atexit.register(pool.stop)
-    return pool
+def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
+    """Start one process a core, and the threads that wait for them; they end with the program."""
+    num, idle = cores(), SimpleQueue()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **_ONE_THREAD}
+    pipe, command = subprocess.PIPE, [sys.executable, "-m", __name__]
+    for _ in range(num):
+        idle.put(subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment))
+    threads = ThreadPoolExecutor(num)
+    atexit.register(_stop_workers, threads, idle)
+    return threads, idle
+
+
+def _stop_workers(threads: ThreadPoolExecutor, idle: SimpleQueue) -> None:
+    threads.shutdown()
+    while not idle.empty():
+        idle.get().communicate()  # closes the pipe that the process reads, which ends it
 
 
 def _serve() -> None:
-    """Answer until there is nothing more to read."""
+    """Answer calls until the pipe is closed."""
     calls, answers = sys.stdin.buffer, sys.stdout.buffer
     while True:
         try:
@@ -104,7 +84,7 @@ def _serve() -> None:
             return
         try:
             answer = False, function(argument)
-        except Exception as error:  # whatever it is, it belongs to the caller
+        except Exception as error:  # the caller raises it
             answer = True, error
         pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
         answers.flush()

@@ -20,7 +20,7 @@ from planner_jax.core.plan_files import leaves_by_name
 from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
-from planner_jax.referee.solids import from_segment, turned, turned_back
+from planner_jax.referee.solids import from_segment, rotate, rotate_back
 from planner_jax.runs.timing import timed_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
@@ -261,7 +261,7 @@ def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) 
     turns, places = links_of(case, angles)
     middle, turn = shield_middle(case, turns, places), turns[5]
     ball = ball_places(case, times)
-    height, *beside = turned_back(turn, ball - middle)
+    height, *beside = rotate_back(turn, ball - middle)
     gap, beside = height - BALL_RADIUS, np.stack(beside)
     entry = entry_times(cases)
 
@@ -319,7 +319,7 @@ def _strikes(
             continue
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
         if link >= 0:
-            first, second = (places[link] + turned(turns[link], end) for end in (first, second))
+            first, second = (places[link] + rotate(turns[link], end) for end in (first, second))
         apart = from_segment(ball, first, second) - case["arm.capsule_radius"][:, k, None]
         found |= apart < BALL_RADIUS
     return found
