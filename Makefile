@@ -56,10 +56,8 @@ format: $(VENV)/.installed-dev  ## rewrite the code as `make lint` wants it
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
 
-# Not --quiet, which lets --strict pass warnings.
 docs: $(VENV)/.installed-docs  ## the documentation site, into build/site
-	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/mkdocs build --strict
-	@echo "Look at build/site/index.html"
+	$(VENV)/bin/python docs/build_site.py
 
 bench: $(VENV)/.installed-test $(VENV)/.installed-oracle  ## every module of benchmarks/ but policy_peer
 	@set -e; for file in $$(grep -l __main__ benchmarks/*.py | grep -v policy_peer); do \
