@@ -39,40 +39,29 @@ READ += ("motion_coeffs", "motion_durations")
 
 
 def batch(robot):
-    """Three plans that differ, the last of them not solved."""
-    plans = jax.tree.map(
-        lambda leaf: np.stack([leaf, leaf * 0.75, leaf * 0.5]).astype(leaf.dtype), PLANS[robot]
-    )
-    if robot == "quadrotor":  # all under the gravity of their run
+    """Return three plans that differ, the last of them not solved."""
+    scale = lambda leaf: np.stack([leaf, leaf * 0.75, leaf * 0.5]).astype(leaf.dtype)  # noqa: E731
+    plans = jax.tree.map(scale, PLANS[robot])
+    if robot == "quadrotor":  # gravity is the same for all plans of a run
         plans = plans.replace(gravity=np.full(NUM, 9.81, np.float32))
     return plans.replace(status=np.array([0, 1, 2], np.int32))
 
 
 def written_run(folder, task="hit", *, finished=True):
-    """A run with the columns from which a plan is made, of plans that nobody has to make."""
+    """Write a run with the columns that determine a plan, for plans without a planner."""
     robot, columns = TASKS[task]
     plans = batch(robot)
-    rows = known.rows_of(
-        [column for column in columns if column.name in READ and column.name != "start"]
-        + [column for column in columns if column.name == "start" and robot == "car"],
-        known.RefereedBatch(
-            Chunk(np.arange(NUM), SimpleNamespace(start=getattr(plans, "start", None))),
-            plans,
-            SimpleNamespace(
-                success=np.array([True, False, False]), sentence=lambda k: f"plan {k} is too fast"
-            ),
-        ),
-        "world",
+    read = [column for column in columns if column.name in READ]
+    verdict = SimpleNamespace(
+        success=np.array([True, False, False]), sentence=lambda k: f"plan {k} is too fast"
     )
-    manifest = {
-        "kind": f"sweep {task}",
-        "state": "running",
-        "parameters": {},
-        **{name: "" for name in ("run", "settings")},
-        **{name: {} for name in ("versions", "device")},
-        "sessions": [],
-        "setting": {"gravity": 9.81},
-    }
+    cases = SimpleNamespace(start=getattr(plans, "start", None))
+    refereed = known.RefereedBatch(Chunk(np.arange(NUM), cases), plans, verdict)
+    read = [column for column in read if column.name != "start" or robot == "car"]
+    rows = known.rows_of(read, refereed, "world")
+    manifest = {"kind": f"sweep {task}", "state": "running", "parameters": {}, "sessions": []}
+    manifest |= {"run": "", "settings": "", "versions": {}, "device": {}}
+    manifest["setting"] = {"gravity": 9.81}
     run = RunFolder(folder, name="RUN")
     with run.created(manifest):
         if finished:
@@ -80,9 +69,8 @@ def written_run(folder, task="hit", *, finished=True):
             summary |= {"plans_per_second_warm": 0.0, "status_counts": {}, "failed_limits": {}}
             seconds = {f"{name}_seconds": 0.0 for name in ("compile", "referee", "wall")}
             run.plans.write_rows(rows)
-            run.write_manifest(
-                {**manifest, "state": "complete", "summary": summary, "times": seconds}
-            )
+            manifest |= {"state": "complete", "summary": summary, "times": seconds}
+            run.write_manifest(manifest)
     return run
 
 
@@ -90,9 +78,6 @@ def assert_same(one, other):
     for ours, theirs in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
         assert ours.dtype == theirs.dtype
         np.testing.assert_array_equal(ours, theirs)
-
-
-# Rows of runs.
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -104,14 +89,12 @@ def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, tas
         assert sentence == ("" if row == 0 else f"plan {row} is too fast")
 
 
-@pytest.mark.parametrize("row", [-1, 3, None])
-def test_a_row_that_is_not_there(tmp_path, row):
-    shown = "nothing" if row is None else row
-    with pytest.raises(ArgumentError, match=f"^row must be from 0 to 2, got {shown}$"):
-        planned_row(written_run(tmp_path / "run"), row)
-
-
-def test_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
+def test_a_row_that_is_not_there_and_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
+    run = written_run(tmp_path / "run")
+    for row in (-1, 3, None):
+        shown = "nothing" if row is None else row
+        with pytest.raises(ArgumentError, match=f"^row must be from 0 to 2, got {shown}$"):
+            planned_row(run, row)
     with pytest.raises(ArgumentError, match="^RUN must be finished, got .*; resume it first$"):
         planned_row(written_run(tmp_path / "half", finished=False), 0)
     run = written_run(tmp_path / "damaged")
@@ -129,9 +112,6 @@ def test_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
         planned_row(flown, 0)
 
 
-# Saved files.
-
-
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_saved_batch_is_read_as_what_its_robot_knows(tmp_path, robot):
     plans = batch(robot)
@@ -142,7 +122,7 @@ def test_a_saved_batch_is_read_as_what_its_robot_knows(tmp_path, robot):
         assert_same(plan, pj.take(plans, row))
 
 
-def test_what_a_task_adds_to_a_saved_plan_is_left_out(tmp_path):
+def test_fields_of_a_task_are_left_out_and_files_of_something_else_are_refused(tmp_path):
     vector, number = np.zeros(3, np.float32), np.float32(0.0)
     stroke = pj.hit.Stroke(number, vector, vector, vector, vector, number)
     plan = quadrotor()
@@ -150,23 +130,13 @@ def test_what_a_task_adds_to_a_saved_plan_is_left_out(tmp_path):
     read = load_plan(tmp_path / "a.npz")
     assert type(read) is QuadrotorPlan
     assert_same(read, plan)
-
-
-def test_a_saved_file_of_something_else_is_named(tmp_path):
-    plan = quadrotor()
     pj.Plan(plan.cost, plan.violation, plan.iterations, plan.status).save(tmp_path / "a.npz")
     says = "^path must be a file of QuadrotorPlan or CarPlan of version 1, got Plan of version 1 in"
     with pytest.raises(PlanFileError, match=says):
         load_fitting(tmp_path / "a.npz", [QuadrotorPlan, CarPlan])
-
-
-def test_a_saved_batch_of_unequal_leaves_is_refused(tmp_path):
     batch("quadrotor").replace(gravity=np.ones(2, np.float32)).save(tmp_path / "a.npz")
     with pytest.raises(PlanFileError, match="^path must hold as much of every plan, got"):
         load_plan(tmp_path / "a.npz", 1)
-
-
-# The command.
 
 
 @pytest.fixture
@@ -180,8 +150,8 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
-def said(capsys, words, recovery="none"):
-    """Exit code and what went to the two streams; by default of plans as they are."""
+def run_export(capsys, words, recovery="none"):
+    """Run the command; return the exit code and the text of the two streams."""
     try:
         code = main(["export", *words.split(), *(["--recovery", recovery] if recovery else [])])
     except SystemExit as stop:
@@ -200,22 +170,19 @@ def said(capsys, words, recovery="none"):
         ("one.npz --to csv --out a.csv", "a.csv"),
     ],
 )
-def test_a_plan_is_written_and_its_file_is_told(capsys, here, words, name):
+def test_a_plan_is_written_and_its_file_is_named(capsys, here, words, name):
     before = set(here.iterdir())
-    assert said(capsys, words) == (0, f"{name}\n", "")
+    assert run_export(capsys, words) == (0, f"{name}\n", "")
     assert {path.name for path in set(here.iterdir()) - before} == {name}
     assert (here / name).stat().st_size > 0
 
 
-def test_a_row_is_written_as_pj_export_writes_its_plan(capsys, here):
-    assert said(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
+def test_a_row_is_written_as_pj_export_writes_it_and_a_plan_that_fails_with_a_warning(capsys, here):
+    assert run_export(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
     as_it_is(pj.take(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
     assert (here / "a.csv").read_bytes() == (here / "b.csv").read_bytes()
-
-
-def test_a_plan_that_the_referee_fails_is_written_with_a_warning(capsys, here):
     warning = "planner-jax: warning: row 1 fails the referee: plan 1 is too fast\n"
-    assert said(capsys, "run --row 1 --to csv") == (0, "run-1-csv.csv\n", warning)
+    assert run_export(capsys, "run --row 1 --to csv") == (0, "run-1-csv.csv\n", warning)
 
 
 def test_setpoints_are_sent_to_a_port(capsys, here):
@@ -225,9 +192,9 @@ def test_setpoints_are_sent_to_a_port(capsys, here):
         packets = []
         hear = threading.Thread(target=lambda: packets.extend(ear.recv(300) for _ in range(21)))
         hear.start()
-        told = said(capsys, f"run --row 0 --to px4 --udp {ear.getsockname()[1]} --rate 50")
+        result = run_export(capsys, f"run --row 0 --to px4 --udp {ear.getsockname()[1]} --rate 50")
         hear.join()
-    assert told == (0, "21 setpoints sent\n", "") and len(packets) == 21
+    assert result == (0, "21 setpoints sent\n", "") and len(packets) == 21
 
 
 @pytest.mark.parametrize(
@@ -258,7 +225,7 @@ def test_what_cannot_be_exported_is_refused_in_one_line_and_leaves_nothing(
     capsys, here, words, says
 ):
     before = sorted(here.rglob("*"))
-    code, out, err = said(capsys, words)
+    code, out, err = run_export(capsys, words)
     assert (code, out) == (2, "")
     assert err.startswith(f"planner-jax: error: {says}") and err.count("\n") == 1
     assert sorted(here.rglob("*")) == before
@@ -266,6 +233,6 @@ def test_what_cannot_be_exported_is_refused_in_one_line_and_leaves_nothing(
 
 def test_a_file_that_is_there_stays_as_it_is(capsys, here):
     (here / "a.csv").write_text("mine")
-    code, _, err = said(capsys, "run --row 0 --to csv --out a.csv")
+    code, _, err = run_export(capsys, "run --row 0 --to csv --out a.csv")
     assert code == 2 and "--out must be a new file, got 'a.csv'" in err
     assert (here / "a.csv").read_text() == "mine"

@@ -1,4 +1,4 @@
-"""Plans in north-east-down: frames, signs, and what PX4 is told, read back by pymavlink."""
+"""Plans in north-east-down: frames, signs, and messages for PX4, read back by pymavlink."""
 
 import socket
 import struct
@@ -20,25 +20,10 @@ from planner_jax.export.setpoints import setpoints_of
 RATE = 50.0
 
 
-# Frames.
-
-
-@pytest.mark.parametrize(
-    ("enu", "ned"),
-    [
-        ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]),  # east is y
-        ([0.0, 1.0, 0.0], [1.0, 0.0, 0.0]),  # north is x
-        ([0.0, 0.0, 1.0], [0.0, 0.0, -1.0]),  # up is negative z
-        ([1.0, 2.0, 3.0], [2.0, 1.0, -3.0]),
-    ],
-)
-def test_a_direction_of_ours_in_north_east_down(enu, ned):
-    np.testing.assert_array_equal(frames.to_ned(np.array(enu)), ned)
-    np.testing.assert_array_equal(frames.to_ned(np.array(ned)), enu)
-
-
-def test_there_and_back_again_no_bit_has_changed_and_the_frame_is_right_handed():
+def test_east_is_y_north_is_x_up_is_negative_z_and_the_conversion_is_exact():
+    np.testing.assert_array_equal(frames.to_ned(np.eye(3)), [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
     a, b = np.random.default_rng(0).normal(size=(2, 50, 3)).astype(np.float32)
+    np.testing.assert_array_equal(frames.to_ned(a), a[:, [1, 0, 2]] * np.float32([1, 1, -1]))
     back = frames.to_ned(frames.to_ned(a))
     assert back.dtype == np.float32 and (back == a).all()
     crossed = np.cross(frames.to_ned(a), frames.to_ned(b))
@@ -72,15 +57,12 @@ def test_a_nose_that_points_straight_up_has_no_yaw():
     assert (yaw, rate) == (0.0, -0.7)
 
 
-# PX4.
-
-
 def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():
     plan = quadrotor()
     fields, found = trajectory_setpoints(plan, RATE), setpoints_of(plan, RATE)
-    np.testing.assert_array_equal(fields["position"], found.pos[:, [1, 0, 2]] * [1, 1, -1])
-    for name, wanted in [("velocity", "vel"), ("acceleration", "acc"), ("jerk", "jerk")]:
-        np.testing.assert_array_equal(fields[name], frames.to_ned(getattr(found, wanted)))
+    vectors = {"position": found.pos, "velocity": found.vel, "acceleration": found.acc}
+    for name, ours in {**vectors, "jerk": found.jerk}.items():
+        np.testing.assert_array_equal(fields[name], frames.to_ned(ours))
     np.testing.assert_array_equal(fields["timestamp"], np.round(1e6 * found.time))
     nose = matrices(found.quat_wxyz)[:, :, 0]
     np.testing.assert_allclose(fields["yaw"], np.arctan2(nose[:, 0], nose[:, 1]), atol=1e-5)
@@ -105,25 +87,18 @@ def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
     for name, values in fields.items():
         read = np.array([getattr(message, name) for *_, message in found])
         np.testing.assert_array_equal(read.astype(values.dtype), values, err_msg=name)
-    np.testing.assert_array_equal(
-        [record.log_time for _, _, record, _ in found], 1000 * fields["timestamp"]
-    )
+    times = [record.log_time for _, _, record, _ in found]
+    np.testing.assert_array_equal(times, 1000 * fields["timestamp"])
 
 
 def assert_are_setpoints(read, fields):
-    """Whether MAVLink messages are the setpoints of a plan, all that is in them to be heeded."""
+    """Check that MAVLink messages are the setpoints of a plan, and that no field is ignored."""
     assert len(read) == len(fields["timestamp"])
-    for names, field in [
-        (("x", "y", "z"), "position"),
-        (("vx", "vy", "vz"), "velocity"),
-        (("afx", "afy", "afz"), "acceleration"),
-        (("yaw",), "yaw"),
-        (("yaw_rate",), "yawspeed"),
-    ]:
-        found = np.array([[getattr(message, name) for name in names] for message in read])
-        np.testing.assert_array_equal(
-            found.astype(np.float32).reshape(fields[field].shape), fields[field]
-        )
+    names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
+    found = [[getattr(message, name) for name in names] for message in read]
+    columns = ("position", "velocity", "acceleration", "yaw", "yawspeed")
+    expected = np.hstack([fields[name].reshape(len(read), -1) for name in columns])
+    np.testing.assert_array_equal(np.array(found, np.float32), expected)
     assert {message.get_type() for message in read} == {"SET_POSITION_TARGET_LOCAL_NED"}
     assert {(m.coordinate_frame, m.type_mask) for m in read} == {(common.MAV_FRAME_LOCAL_NED, 0)}
     stamps = [message.time_boot_ms for message in read]
@@ -152,11 +127,8 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
         ear.settimeout(5.0)
         port = ear.getsockname()[1]
         sent = []
-        sender = threading.Thread(
-            target=lambda: sent.append(
-                stream(quadrotor(), recovery=None, to="px4", udp=port, rate=RATE)
-            )
-        )
+        send = lambda: stream(quadrotor(), recovery=None, to="px4", udp=port, rate=RATE)  # noqa: E731
+        sender = threading.Thread(target=lambda: sent.append(send()))
         fields = trajectory_setpoints(quadrotor(), RATE)
         packets, came, began = [], [], time.monotonic()
         sender.start()
@@ -171,20 +143,14 @@ def test_a_stream_arrives_in_real_time_and_is_decoded():
     assert (late >= 0.0).all() and late.min() < 1.0, "none is early, however busy the machine is"
 
 
-@pytest.mark.parametrize("port", [0, -1, 65536, "14540", True, None])
-def test_a_port_is_one_that_there_is(port):
-    with pytest.raises(ArgumentError, match="^udp must be a port from 1 to 65535, got"):
-        stream(quadrotor(), recovery=None, to="px4", udp=port)
-
-
-def test_a_port_on_which_nobody_listens_is_refused():
+def test_only_px4_is_streamed_to_a_port_on_which_a_program_listens():
+    for port in (0, -1, 65536, "14540", True, None):
+        with pytest.raises(ArgumentError, match="^udp must be a port from 1 to 65535, got"):
+            stream(quadrotor(), recovery=None, to="px4", udp=port)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
     with pytest.raises(ArgumentError, match=f"^udp must be .* listens, got {port}$"):
         stream(quadrotor(), recovery=None, to="px4", udp=port)
-
-
-def test_only_px4_is_streamed():
     with pytest.raises(ArgumentError, match="^udp must not be given for csv, only for px4, got 9$"):
         stream(quadrotor(), recovery=None, to="csv", udp=9)

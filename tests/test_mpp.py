@@ -1,4 +1,4 @@
-"""The `mpp` baseline: every catch is made, at the fixed height, by the cheapest that was tried."""
+"""The baseline `mpp`: the cheapest of the tried trajectories, to a catch at a fixed height."""
 
 import dataclasses
 
@@ -9,7 +9,7 @@ import pytest
 
 from planner_jax.ball.flight import BallState
 from planner_jax.baselines.catch.mpp import MppCatch, falling_time
-from planner_jax.core.protocol import Status, is_solved
+from planner_jax.core.protocol import Status, is_solved, take
 from planner_jax.planning.plan import plan
 from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.context import order_targets, targets_at
@@ -21,14 +21,14 @@ MPP = MppCatch()
 
 @pytest.fixture(scope="module")
 def throws():
-    """As many of the paper's throws as of the hard ones, two more targets being absent."""
+    """Throws of two suites, half of them hard; two further targets of each case are absent."""
     suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
 
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Two throws and one absent target; of the first two lanes the order is the wrong way round."""
+    """Two throws and one absent target; the order of the first two cases is reversed."""
     cases = draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
@@ -46,12 +46,8 @@ def pair_plans(pairs):
     return plan(MPP, pairs)
 
 
-def lane_of(tree, lane):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
-
-
 def heights(cases, plans):
-    """Heights [m] of the targets at the catches, in their order."""
+    """Return the heights [m] of the targets at the catches, in their order."""
     ordered = jax.vmap(order_targets)(cases).targets
     return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
 
@@ -85,22 +81,19 @@ def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
         return MPP.candidates(case.head_state, ball, times[0], case)
 
     for lane in (0, 7):
-        candidates = tried(lane_of(throws, lane))
+        candidates = tried(take(throws, lane))
         assert candidates.cost.shape == (81,)
-        costs, kept = np.asarray(candidates.cost), throw_plans.trajectory.coeffs[lane, :2]
+        costs, coeffs = np.asarray(candidates.cost), throw_plans.trajectory.coeffs[lane, :2]
         np.testing.assert_allclose(throw_plans.cost[lane], costs.min(), rtol=1e-4)
-        np.testing.assert_allclose(
-            kept, candidates.trajectory.coeffs[costs.argmin()], rtol=1e-3, atol=1e-2
-        )
-        every = np.asarray(mean_squared_jerk(candidates.trajectory))
-        np.testing.assert_allclose(costs, every, rtol=1e-3)
+        cheapest = candidates.trajectory.coeffs[costs.argmin()]
+        np.testing.assert_allclose(coeffs, cheapest, rtol=1e-3, atol=1e-2)
+        np.testing.assert_allclose(costs, mean_squared_jerk(candidates.trajectory), rtol=1e-3)
 
 
 def mean_squared_jerk(trajectory):
-    """(K,), by Gauss-Legendre quadrature of order 5, exact for squares of quadratic jerks."""
+    """Return (K,) by Gauss-Legendre quadrature, exact for squares of quadratic jerks."""
     nodes, weights = np.polynomial.legendre.leggauss(5)
-    coeffs = np.asarray(trajectory.coeffs, np.float64)
-    durations = np.asarray(trajectory.durations, np.float64)
+    coeffs, durations = (np.asarray(x, float) for x in (trajectory.coeffs, trajectory.durations))
     t = 0.5 * durations[..., None] * (1.0 + nodes)  # (K, 2, 5)
     powers = np.stack([6.0 * t**0, 24.0 * t, 60.0 * t**2], axis=-1)
     jerk = np.einsum("kpni,kpix->kpnx", powers, coeffs[:, :, 3:])
@@ -111,11 +104,10 @@ def mean_squared_jerk(trajectory):
 def test_one_equals_its_lane_in_the_batch(pairs, pair_plans):
     solve = jax.jit(lambda case: MPP.solve(case, MPP.attempts[0]))
     for lane in (3, 5, 9):
-        alone = solve(lane_of(pairs, lane))
-        for one, among in zip(
-            jax.tree.leaves(alone), jax.tree.leaves(lane_of(pair_plans, lane)), strict=True
-        ):
-            np.testing.assert_allclose(one, among, rtol=2e-3, atol=2e-3)
+        alone = solve(take(pairs, lane))
+        among = jax.tree.leaves(take(pair_plans, lane))
+        for one, other in zip(jax.tree.leaves(alone), among, strict=True):
+            np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-3)
 
 
 def test_targets_are_caught_one_after_the_other_and_an_absent_one_is_not(pairs, pair_plans):
@@ -139,16 +131,15 @@ def test_times_that_do_not_rise_leave_the_lane_unsolved(pair_plans):
 
 
 def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
-    """One too low, one that rises, one at rest, one that is not a number; one good one last."""
+    """Try targets too low, rising, at rest and NaN; the others are solved."""
     pos, vel = np.array(throws.targets.ball.pos), np.array(throws.targets.ball.vel)
     pos[0, 0, 2], vel[0, 0, 2] = 0.8, -1.0
     vel[1, 0, 2] = 30.0
     pos[3] = np.nan
     gravity, drag = np.array(throws.targets.gravity), np.array(throws.targets.drag)
     vel[2], gravity[2], drag[2] = 0.0, 0.0, 0.0
-    targets = dataclasses.replace(
-        throws.targets, ball=BallState(pos, vel), gravity=gravity, drag=drag
-    )
+    changes = {"ball": BallState(pos, vel), "gravity": gravity, "drag": drag}
+    targets = dataclasses.replace(throws.targets, **changes)
     broken = dataclasses.replace(throws, targets=targets)
     found = jax.device_get(plan(MPP, jax.tree.map(jnp.asarray, broken)))
     assert set(found.status[:3]) == {Status.INFEASIBLE}
@@ -159,7 +150,7 @@ def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
 
 
 def test_the_first_fall_of_a_swing_is_found():
-    targets = lane_of(draw(8, "harmonic2", 1).targets, slice(None))
+    targets = draw(8, "harmonic2", 1).targets
     middle = targets.pos[..., 2]
 
     @jax.jit
@@ -175,10 +166,8 @@ def test_the_first_fall_of_a_swing_is_found():
 
 
 def test_bad_settings_are_named_in_one_line():
-    for options, says in (
-        ({"height": 2.0}, "height must be > 0 and < 2, got 2"),
-        ({"thrusts": ()}, "speeds and thrusts must have an entry, got none"),
-    ):
-        with pytest.raises(ValueError, match=says):
-            MppCatch(**options)
+    with pytest.raises(ValueError, match="height must be > 0 and < 2, got 2"):
+        MppCatch(height=2.0)
+    with pytest.raises(ValueError, match="speeds and thrusts must have an entry, got none"):
+        MppCatch(thrusts=())
     assert [attempt.starts for attempt in MPP.attempts] == [1]

@@ -40,9 +40,8 @@ TIMES = np.arange(NUM, dtype=np.float32) / 60.0
 STD = 0.02  # [m]
 AHEAD = 0.8  # [s], at which flights are compared
 BALL = BallState(pos=np.float32([6.8, -1.5, 0.4]), vel=np.float32([-7.7, 1.6, 4.6]))
-CAMERA = looking_at(
-    (-0.5, 0.1, 1.7), (5.0, 0.4, 1.0), size=(320, 192), field_of_view=np.deg2rad(110.0)
-)
+VIEW = {"size": (320, 192), "field_of_view": np.deg2rad(110.0)}
+CAMERA = looking_at((-0.5, 0.1, 1.7), (5.0, 0.4, 1.0), **VIEW)
 
 paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
 fit_one = jax.jit(fit_flight)
@@ -53,23 +52,16 @@ sighting_one = jax.jit(sighting)
 
 @jax.jit
 def errors(fits, truth):
-    """What many fits say of the ball `AHEAD` [s] after the first look, and how far they are off."""
+    """Return the beliefs of many fits at the time `AHEAD`, their deviations, and their errors."""
     beliefs = jax.vmap(belief_at, (0, None, None))(fits, AHEAD, GRAVITY)
     stds = jax.vmap(across_std)(beliefs)
     return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
 
 
 def seen(num, rng, std=STD):
-    """Noisy places (num, NUM, 3) of one flight."""
+    """Return noisy positions (num, NUM, 3) of one flight."""
     places = np.asarray(paths(BALL, TIMES, GRAVITY).pos)
     return (places + std * rng.normal(size=(num, *places.shape))).astype(np.float32)
-
-
-def repeated(value, num):
-    return np.broadcast_to(value, (num, *np.shape(value)))
-
-
-# Fits of flights.
 
 
 def test_a_flight_without_noise_is_found_exactly(float64):
@@ -82,10 +74,10 @@ def test_a_flight_without_noise_is_found_exactly(float64):
 
 
 def test_float32_finds_a_flight_whose_depths_are_much_less_certain():
-    """Where a direction counts 10,000 times less than the others, and it lies aslant."""
+    """Weight one oblique direction 10,000 times less than the others."""
     turn = Rotation.from_rotvec([0.4, -0.8, 0.3]).as_matrix()
     weights = turn @ np.diag([1e6, 1e6, 1e2]) @ turn.T
-    weights = repeated(weights.astype(np.float32), NUM)
+    weights = np.tile(weights.astype(np.float32), (NUM, 1, 1))
     fit = fit_one(TIMES, paths(BALL, TIMES, GRAVITY).pos, weights, GRAVITY)
     ahead = believed(fit, AHEAD, GRAVITY)
     truth = drag_free_flight(BALL, AHEAD, GRAVITY)
@@ -96,19 +88,15 @@ def test_float32_finds_a_flight_whose_depths_are_much_less_certain():
 def test_the_covariance_is_that_of_many_fits():
     rng = np.random.default_rng(0)
     num = 4000
-    fits = fit_many(
-        repeated(TIMES, num), seen(num, rng), repeated(np.float32(STD**-2), num), GRAVITY
-    )
+    weights = np.full(num, np.float32(STD**-2))
+    fits = fit_many(np.tile(TIMES, (num, 1)), seen(num, rng), weights, GRAVITY)
     truth = drag_free_flight(BALL, AHEAD, GRAVITY)
     beliefs, stds, off = errors(fits, truth)
     off_mean = np.asarray(beliefs.mean) - np.concatenate([truth.pos, truth.vel])
     believed_covariance = np.asarray(beliefs.covariance[0])
     deviations = np.sqrt(np.diag(believed_covariance))
-    np.testing.assert_allclose(
-        np.cov(off_mean.T) / np.outer(deviations, deviations),
-        believed_covariance / np.outer(deviations, deviations),
-        atol=0.06,
-    )
+    scale = np.outer(deviations, deviations)
+    np.testing.assert_allclose(np.cov(off_mean.T) / scale, believed_covariance / scale, atol=0.06)
     assert np.sqrt(np.mean(off**2)) == pytest.approx(float(stds[0]), rel=0.04)
     assert np.sqrt(np.mean(fits.misfit**2)) == pytest.approx(1.0, abs=0.02)
 
@@ -139,7 +127,7 @@ def test_what_is_not_seen_leaves_no_trace():
 
 
 def test_a_batch_is_its_lanes_one_by_one():
-    """Lanes of very different observations, one of them never seen."""
+    """Check very different observations, and a ball that is never seen."""
     rng = np.random.default_rng(3)
     places = seen(4, rng)
     places[1, 5:] = np.nan
@@ -148,10 +136,9 @@ def test_a_batch_is_its_lanes_one_by_one():
     times = (TIMES + rng.uniform(0.0, 1.0, (4, 1))).astype(np.float32)
     many = fit_many(times, places, weights, GRAVITY)
     for k in range(4):
-        one = fit_one(times[k], places[k], weights[k], GRAVITY)
-        jax.tree.map(
-            lambda a, b, k=k: np.testing.assert_allclose(a, b[k], rtol=2e-4, atol=2e-5), one, many
-        )
+        one = jax.tree.leaves(fit_one(times[k], places[k], weights[k], GRAVITY))
+        for a, b in zip(one, jax.tree.leaves(many), strict=True):
+            np.testing.assert_allclose(a, b[k], rtol=2e-4, atol=2e-5)
     assert many.status.tolist() == [Sight.SEEN, Sight.SEEN, Sight.NEVER_SEEN, Sight.SEEN]
 
 
@@ -200,9 +187,6 @@ def test_gradients_of_a_fit_are_finite_with_and_without_a_ball():
     np.testing.assert_allclose(found[3], 0.0)
 
 
-# Cameras.
-
-
 def test_points_come_back_from_their_pixels():
     rng = np.random.default_rng(0)
     points = rng.uniform([0.5, -4.0, -1.0], [12.0, 4.0, 4.0], (50, 3)).astype(np.float32)
@@ -231,21 +215,21 @@ def test_the_field_of_view_ends_where_it_should():
 
 
 @pytest.mark.parametrize(
-    ("options", "message"),
+    ("make", "options", "message"),
     [
-        ({"target": (1.0, 2.0, 9.0)}, "target must be beside the camera"),
-        ({"field_of_view": 3.5}, "field_of_view must be between 0 and pi, got 3.5"),
-        ({"size": (0, 4)}, "size must be >= 1"),
+        (looking_at, {"target": (1.0, 2.0, 9.0)}, "target must be beside the camera"),
+        (looking_at, {"field_of_view": 3.5}, "field_of_view must be between 0 and pi, got 3.5"),
+        (looking_at, {"size": (0, 4)}, "size must be >= 1"),
+        (stereo_noise, {"baseline": 0.0}, "baseline must be > 0, got 0"),
+        (stereo_noise, {"dropout": 1.0}, "dropout must be < 1, got 1"),
+        (stereo_noise, {"pixel_std": -0.1}, "pixel_std must be >= 0, got -0.1"),
     ],
 )
-def test_a_camera_that_cannot_be_is_refused_in_a_line(options, message):
-    given = {"target": (5.0, 0.0, 1.0), "size": (64, 64), "field_of_view": 1.0} | options
+def test_a_camera_or_noise_that_cannot_be_is_refused_in_a_line(make, options, message):
+    usual = {"position": (1.0, 2.0, 3.0), "target": (5.0, 0.0, 1.0), **VIEW}
     with pytest.raises(ValueError, match=message) as caught:
-        looking_at((1.0, 2.0, 3.0), **given)
+        make(**(usual if make is looking_at else {}) | options)
     assert "\n" not in str(caught.value)
-
-
-# Stereo noise.
 
 
 def test_the_noise_of_depth_grows_with_the_square_of_the_distance():
@@ -280,22 +264,6 @@ def test_what_is_lost_or_out_of_view_is_not_seen():
     assert np.isnan(look(jax.random.key(1), CAMERA, stereo_noise(), behind)).all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"baseline": 0.0}, "baseline must be > 0, got 0"),
-        ({"dropout": 1.0}, "dropout must be < 1, got 1"),
-        ({"pixel_std": -0.1}, "pixel_std must be >= 0, got -0.1"),
-    ],
-)
-def test_noise_that_cannot_be_is_refused_in_a_line(options, message):
-    with pytest.raises(ValueError, match=message):
-        stereo_noise(**options)
-
-
-# Colours and frames.
-
-
 def test_hue_saturation_and_value_are_those_of_the_standard_library():
     rng = np.random.default_rng(0)
     colours = np.concatenate(
@@ -325,7 +293,7 @@ def test_the_mask_compares_hue_saturation_and_value(hues):
 
 
 def ball_frame(place, radius=0.05):
-    """Image and depth of an orange ball at (3,) [m] before a grey wall, ray by ray."""
+    """Render image and depth of an orange ball at (3,) [m] before a grey wall, ray by ray."""
     column, row = np.meshgrid(*(np.arange(size) for size in CAMERA.size))
     across = (np.stack([column, row], axis=-1) - CAMERA.centre) / CAMERA.focal
     ray = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=-1)
@@ -392,11 +360,8 @@ def test_noisy_depth_images_have_the_noise_that_is_asked_for():
     assert found.std() < 1e-5 and abs(found[0, 0] - 3.0) > 1e-3
 
 
-# Hand-eye calibration.
-
-
 def views(rng, std, num=12):
-    """A camera's and a board's poses, those of the flange, the board's points and as seen."""
+    """Return poses of camera, board and flange, the board's points, and their observations."""
     facing = Rotation.from_matrix(np.asarray(CAMERA.rotation, float)).as_matrix()
     camera = pose(facing, np.asarray(CAMERA.position, float))
     board = pose(Rotation.from_rotvec([0.2, -0.4, 1.0]).as_matrix(), np.array([0.02, 0.05, 0.1]))

@@ -1,21 +1,28 @@
-"""Quadrotor flatness: thrust, attitude and body rate by the Hopf fibration."""
+"""Quadrotors: flatness by the Hopf fibration, and setpoints of plans."""
+
+import dataclasses
 
 import jax
 import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
+from flown_plans import matrices
 
+import planner_jax as pj
 from planner_jax.robot.quadrotor import (
     QuadrotorLimits,
+    QuadrotorPlan,
     body_rate_squared,
     body_z,
     net_thrust,
     tangent_basis,
 )
 
-GRAVITY = 9.8
+GRAVITY = 9.81
+UP = np.array([0.0, 0.0, 1.0])
 # An acceleration polynomial (3 axes) that tilts the quadrotor far and turns it about its thrust.
 MOTION = np.array([[2.0, -3.0, 1.5, 4.0], [-4.0, 6.0, 2.0, -1.0], [1.0, 2.0, -6.0, 3.0]])
+FIELDS = ("pos", "vel", "acc", "jerk", "quat_wxyz", "body_rate", "thrust")
 
 float64 = pytest.mark.usefixtures("float64")
 
@@ -29,67 +36,44 @@ def acceleration(time, order=0):
     return np.array([np.polynomial.Polynomial(row).deriv(order)(time) for row in MOTION])
 
 
-def hopf_rotation(z):
-    """Attitude of the Hopf fibration at zero heading, of the quaternion (1 + z_z, -z_y, z_x, 0)."""
-    w, x, y = np.array([1.0 + z[2], -z[1], z[0]]) / np.sqrt(2.0 * (1.0 + z[2]))
-    return np.array(
-        [
-            [1.0 - 2.0 * y * y, 2.0 * x * y, 2.0 * w * y],
-            [2.0 * x * y, 1.0 - 2.0 * x * x, -2.0 * w * x],
-            [-2.0 * w * y, 2.0 * w * x, 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
+def hopf_rotations(z):
+    """Return attitudes (K, 3, 3) of the Hopf fibration at zero heading for body z axes (K, 3)."""
+    quat = np.stack([1.0 + z[:, 2], -z[:, 1], z[:, 0], np.zeros(len(z))], axis=1)
+    return matrices(quat / np.sqrt(2.0 * (1.0 + z[:, 2:])))
 
 
 def attitude(time):
-    thrust = acceleration(time) + [0.0, 0.0, GRAVITY]
-    return hopf_rotation(thrust / np.linalg.norm(thrust))
+    thrust = acceleration(time) + GRAVITY * UP
+    return hopf_rotations(thrust[None] / np.linalg.norm(thrust))[0]
 
 
-def unit_vectors(num=50):
-    vectors = np.random.default_rng(0).normal(size=(num, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-# Thrust
+# Thrust and attitude
 
 
 @float64
 def test_the_thrust_carries_the_weight_and_the_body_axis_follows_it():
     acc = np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 4.0 - GRAVITY], [0.0, 0.0, -2.0 * GRAVITY]])
-    np.testing.assert_allclose(net_thrust(acc, GRAVITY), acc + [0.0, 0.0, GRAVITY], rtol=1e-15)
+    np.testing.assert_allclose(net_thrust(acc, GRAVITY), acc + GRAVITY * UP, rtol=1e-15)
     expected = [[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, 0.0, -1.0]]
     np.testing.assert_allclose(axis(acc, GRAVITY), expected, atol=1e-15)
 
 
 def test_in_free_fall_the_body_axis_is_zero_with_a_finite_gradient():
     fall = np.array([0.0, 0.0, -GRAVITY], np.float32)
-    assert not np.any(axis(fall[None], GRAVITY))
+    assert not np.any(axis(fall[None], np.float32(GRAVITY)))
     jacobian = jax.jit(jax.jacfwd(body_z))(fall, np.float32(GRAVITY))
     assert np.all(np.isfinite(jacobian))
 
 
-# Attitude
-
-
 @float64
-def test_the_basis_and_the_normal_are_a_right_handed_frame():
-    normals = unit_vectors()
-    x, y = basis(normals)
-    frames = np.stack([x, y, normals], axis=-1)
-    np.testing.assert_allclose(
-        np.swapaxes(frames, 1, 2) @ frames, np.tile(np.eye(3), (50, 1, 1)), atol=1e-13
-    )
+def test_the_basis_and_the_normal_are_the_right_handed_hopf_frame_of_zero_heading():
+    normals = np.random.default_rng(0).normal(size=(50, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    frames = np.stack([*basis(normals), normals], axis=-1)
+    np.testing.assert_allclose(frames, hopf_rotations(normals), atol=1e-13)
+    identities = np.tile(np.eye(3), (50, 1, 1))
+    np.testing.assert_allclose(np.swapaxes(frames, 1, 2) @ frames, identities, atol=1e-13)
     np.testing.assert_allclose(np.linalg.det(frames), 1.0, rtol=1e-13)
-
-
-@float64
-def test_the_basis_is_the_hopf_attitude_of_zero_heading():
-    normals = unit_vectors()
-    x, y = basis(normals)
-    for k, normal in enumerate(normals):
-        frame = np.stack([x[k], y[k], normal], axis=1)
-        np.testing.assert_allclose(frame, hopf_rotation(normal), atol=1e-13)
 
 
 def test_the_basis_is_level_in_hover_and_finite_straight_down():
@@ -104,7 +88,7 @@ def test_the_basis_is_level_in_hover_and_finite_straight_down():
 @float64
 @pytest.mark.parametrize("time", [0.0, 0.3, 0.7, 1.1])
 def test_the_body_rate_is_that_of_the_turning_attitude(time):
-    """omega^ = R^T dR/dt, with central differences of R."""
+    """Compare with  omega^ = R^T dR/dt  by central differences of R."""
     step = 1e-5
     turning = attitude(time).T @ (attitude(time + step) - attitude(time - step)) / (2.0 * step)
     np.testing.assert_allclose(turning, -turning.T, atol=1e-8)
@@ -114,20 +98,11 @@ def test_the_body_rate_is_that_of_the_turning_attitude(time):
 
 
 @float64
-def test_in_hover_the_body_rate_is_the_jerk_across_the_thrust_over_gravity():
-    jerk = np.array([3.0, -4.0, 7.0])
-    squared = rate_squared(np.zeros(3), jerk, GRAVITY)
-    np.testing.assert_allclose(squared, (5.0 / GRAVITY) ** 2, rtol=1e-14)
-
-
-@float64
-def test_jerk_along_the_thrust_does_not_turn_the_body():
+def test_the_body_rate_is_the_jerk_across_the_thrust_in_proportion():
+    hover = rate_squared(np.zeros(3), np.array([3.0, -4.0, 7.0]), GRAVITY)
+    np.testing.assert_allclose(hover, (5.0 / GRAVITY) ** 2, rtol=1e-14)
     acc = np.array([3.0, -2.0, 1.0])
-    assert rate_squared(acc, 5.0 * (acc + [0.0, 0.0, GRAVITY]), GRAVITY) < 1e-13
-
-
-@float64
-def test_the_body_rate_grows_with_the_jerk_alone_in_proportion():
+    assert rate_squared(acc, 5.0 * (acc + GRAVITY * UP), GRAVITY) < 1e-13
     acc, jerk = acceleration(0.5), acceleration(0.5, 1)
     doubled = rate_squared(acc, 2.0 * jerk, GRAVITY)
     np.testing.assert_allclose(doubled, 4.0 * rate_squared(acc, jerk, GRAVITY), rtol=1e-14)
@@ -135,9 +110,8 @@ def test_the_body_rate_grows_with_the_jerk_alone_in_proportion():
 
 @float64
 def test_the_body_rate_is_never_below_the_rate_at_which_the_thrust_tilts():
-    rng = np.random.default_rng(1)
-    acc, jerk = rng.normal(scale=6.0, size=(2, 5, 4, 3))
-    thrust = acc + [0.0, 0.0, GRAVITY]
+    acc, jerk = np.random.default_rng(1).normal(scale=6.0, size=(2, 5, 4, 3))
+    thrust = acc + GRAVITY * UP
     across = np.cross(thrust, jerk)
     tilt_squared = np.sum(across**2, axis=-1) / np.sum(thrust**2, axis=-1) ** 2
     squared = rate_squared(acc, jerk, GRAVITY)
@@ -145,16 +119,12 @@ def test_the_body_rate_is_never_below_the_rate_at_which_the_thrust_tilts():
     assert np.all(squared >= tilt_squared * (1.0 - 1e-12))
 
 
-def rate_of(point):
-    return body_rate_squared(*point)
-
-
 @float64
 @pytest.mark.parametrize("acc", [(0.0, 0.0, 0.0), (3.0, -5.0, 2.0), (4.0, 1.0, -12.0)])
 def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
-    """In hover, tilted, and with the thrust pointing down."""
+    """Check in hover, tilted, and with the thrust pointing down."""
     point = (np.array(acc), np.array([20.0, -7.0, 11.0]), GRAVITY)
-    assert_gradient_matches_differences(rate_of, point, rtol=1e-6)
+    assert_gradient_matches_differences(lambda point: body_rate_squared(*point), point, rtol=1e-6)
 
 
 # In hover; near and in free fall; near and at straight down.
@@ -163,7 +133,7 @@ def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
 )
 @pytest.mark.parametrize("jerk", [(0.0, 0.0, 0.0), (30.0, -20.0, 10.0)])
 def test_value_and_gradient_are_finite_wherever_the_thrust_points(thrust, jerk):
-    acc = np.array(thrust, np.float32) - np.array([0.0, 0.0, GRAVITY], np.float32)
+    acc = (np.array(thrust) - GRAVITY * UP).astype(np.float32)
     value, gradient = rate_and_gradient(acc, np.array(jerk, np.float32), np.float32(GRAVITY))
     assert np.isfinite(value) and value >= 0.0
     assert all(np.all(np.isfinite(leaf)) for leaf in gradient)
@@ -184,3 +154,107 @@ def test_scaled_limits_keep_the_ground():
     assert (half.speed, half.acceleration, half.body_rate) == (2.5, 7.5, 2.0)
     assert half.min_height == limits.min_height
     assert limits.speed == 5.0
+
+
+# Setpoints of plans
+
+
+def plan_of(coeffs, durations):
+    """Return a plan, or a batch, in float64 where that is enabled."""
+    coeffs, durations = np.asarray(coeffs, float), np.asarray(durations, float)
+    blank = np.zeros(coeffs.shape[:-3])
+    return QuadrotorPlan(
+        *(blank, blank, blank.astype(np.int32), blank.astype(np.int32)),
+        trajectory=pj.PiecewisePolynomial(coeffs=coeffs, durations=durations),
+        gravity=np.full(coeffs.shape[:-3], GRAVITY),
+    )
+
+
+def hover(duration=0.5):
+    coeffs = np.zeros((2, 8, 3))
+    coeffs[:, 0] = [1.0, -2.0, 1.5]
+    return plan_of(coeffs, [0.4 * duration, 0.6 * duration])
+
+
+def curve(seed=0, duration=0.8):
+    """Return one piece of degree 7 that turns and tilts without losing its thrust."""
+    coeffs = np.random.default_rng(seed).normal(size=(1, 8, 3))
+    return plan_of(coeffs / np.array([1, 1, 1, 2, 6, 24, 60, 120])[:, None], [duration])
+
+
+def batch(*plans):
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
+
+
+def test_a_hover_is_upright_at_rest_and_carries_its_weight():
+    found = hover().sample(100.0)
+    np.testing.assert_allclose(found.time, np.arange(51) / 100.0)
+    np.testing.assert_allclose(found.pos, np.tile([1.0, -2.0, 1.5], (51, 1)))
+    np.testing.assert_allclose(found.quat_wxyz, np.tile([1.0, 0.0, 0.0, 0.0], (51, 1)), atol=1e-7)
+    np.testing.assert_allclose(found.thrust, GRAVITY, rtol=1e-6)
+    for name in ("vel", "acc", "jerk", "body_rate"):
+        np.testing.assert_array_equal(getattr(found, name), np.zeros((51, 3)))
+
+
+def test_derivatives_and_attitude_are_those_of_the_flown_path(float64):
+    rate = 2000.0
+    found = curve().sample(rate)
+    differences = lambda x: (x[2:] - x[:-2]) * (0.5 * rate)  # noqa: E731
+    for low, high in (("pos", "vel"), ("vel", "acc"), ("acc", "jerk")):
+        derivative = differences(getattr(found, low))
+        np.testing.assert_allclose(derivative, getattr(found, high)[1:-1], atol=1e-4)
+    np.testing.assert_allclose(np.linalg.norm(found.quat_wxyz, axis=1), 1.0, rtol=1e-12)
+    np.testing.assert_array_equal(found.quat_wxyz[:, 3], 0.0, "the heading is zero")
+    turned = matrices(found.quat_wxyz)
+    pull = found.acc + GRAVITY * UP
+    np.testing.assert_allclose(turned[:, :, 2] * found.thrust[:, None], pull, atol=1e-9)
+    # R^T dR/dt is the cross-product matrix of the rate in the body frame.
+    spin = np.einsum("kji,kjl->kil", turned[1:-1], differences(turned))
+    rates = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+    assert np.abs(found.body_rate).min(axis=0).max() > 0.0 and np.abs(rates).max() > 0.5
+    np.testing.assert_allclose(found.body_rate[1:-1], rates, atol=1e-4)
+
+
+def test_each_plan_of_a_batch_is_sampled_up_to_its_own_end():
+    plans = batch(curve(0, 0.8), curve(1, 0.35))
+    together = plans.sample(20.0)
+    assert together.time.shape == (17,)
+    for k, num in enumerate((17, 8)):  # the second plan ends at 0.35 s, its eighth sample
+        alone = pj.take(plans, k).sample(20.0)
+        np.testing.assert_array_equal(alone.time, together.time[:num])
+        for name in FIELDS:
+            leaf = getattr(together, name)
+            assert leaf.shape[:2] == (2, 17)
+            assert np.isfinite(leaf[k, :num]).all() and np.isnan(leaf[k, num:]).all()
+            np.testing.assert_allclose(getattr(alone, name), leaf[k, :num], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("rate", [10.0, 60.0, 100.0, 1000.0])
+def test_the_last_sample_is_the_end_where_the_end_is_one(rate):
+    """Check also that a sum of durations in float32 that is a little short does not matter."""
+    short = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == float else x, hover(0.7))
+    assert short.sample(rate).time[-1] == pytest.approx(0.7)
+    assert np.isfinite(short.sample(rate).thrust).all()
+
+
+def test_a_plan_that_is_not_finite_is_nan_beside_its_neighbours():
+    plans = batch(curve(0), curve(1))
+    plans.trajectory.durations[1] = np.nan
+    found = plans.sample(20.0)
+    assert np.isfinite(found.pos[0]).all() and np.isnan(found.pos[1]).all()
+
+
+@pytest.mark.parametrize("rate", [0.0, -3.0, np.nan])
+def test_a_rate_must_be_positive(rate):
+    with pytest.raises(ValueError, match=f"^rate must be finite and > 0, got {rate:g}$"):
+        hover().sample(rate)
+
+
+def test_setpoints_of_a_planned_hit_begin_at_the_head_and_end_at_the_impact():
+    case = pj.take(pj.hit.draw(1), 0)
+    plan = pj.plan(pj.hit.planner("juggle", nodes=6), case)
+    found = plan.sample(1000.0)
+    assert {f.name for f in dataclasses.fields(found)} == {"time", *FIELDS}
+    np.testing.assert_allclose(found.pos[0], case.head_state[0], atol=1e-5)
+    assert plan.stroke.time - 2e-3 < found.time[-1] <= plan.stroke.time + 1e-6
+    np.testing.assert_allclose(found.thrust[0], case.gravity, rtol=1e-5)

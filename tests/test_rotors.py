@@ -1,6 +1,6 @@
-"""What rotors have to do along a motion: closed forms, and two derivations of which each is alone.
+"""Thrusts of rotors along a motion: closed forms, and two independent derivations.
 
-The planners' comes from the snap, the referee's from angular velocities a moment apart.
+The planners derive the thrusts from the snap, the referee from differences of angular velocities.
 """
 
 import dataclasses
@@ -13,17 +13,10 @@ import pytest
 import planner_jax as pj
 from planner_jax.referee.rotors import rotor_thrusts as judged_thrusts
 from planner_jax.robot.quadrotor import RotorLimits, body_rate, flat_attitude, rotor_thrusts
-from planner_jax.robot.quadrotor_model import (
-    NET,
-    RACKET,
-    FlightLimits,
-    QuadrotorModel,
-    Rotors,
-    Tool,
-)
+from planner_jax.robot.quadrotor_model import NET, RACKET, FlightLimits, Rotors, Tool
 
 GRAVITY = 9.81
-MODEL = QuadrotorModel(
+MODEL = pj.QuadrotorModel(
     name="small",
     mass=0.8,
     inertia=(0.003, 0.004, 0.006),
@@ -32,11 +25,7 @@ MODEL = QuadrotorModel(
     limits=FlightLimits(speed=6.0, body_rate=6.0, thrust=(0.2 * GRAVITY, 1.9 * GRAVITY)),
 )
 ROTORS = RotorLimits(
-    mass=np.array(MODEL.mass),
-    inertia=np.array(MODEL.inertia),
-    mixer=MODEL.rotors.mixer,
-    min_thrust=np.array(0.0),
-    max_thrust=np.array(4.5),
+    *map(np.array, (MODEL.mass, MODEL.inertia, MODEL.rotors.mixer)), np.array(0.0), np.array(4.5)
 )
 
 float64 = pytest.mark.usefixtures("float64")
@@ -63,28 +52,19 @@ def test_in_a_plane_the_torque_is_the_inertia_times_the_angle_s_second_derivativ
     np.testing.assert_allclose(wrench, [thrust, *torque], atol=1e-6)
 
 
-def pieces(seed):
-    """Coefficients (3, B, M, 8) that tilt and turn, and times (B, M, S) [s]."""
-    random = np.random.default_rng(seed)
-    coeffs = random.normal(size=(3, 4, 2, 8)) * np.array([1, 1, 2, 2, 1, 1, 0.5, 0.5])
-    return coeffs, np.broadcast_to(np.linspace(0.0, 0.8, 9), (4, 2, 9))
-
-
 @float64
 def test_planner_and_referee_find_the_same_thrusts():
-    coeffs, times = pieces(0)
+    coeffs = np.random.default_rng(0).normal(size=(3, 4, 2, 8))  # tilt and turn
+    coeffs *= np.array([1, 1, 2, 2, 1, 1, 0.5, 0.5])
+    times = np.broadcast_to(np.linspace(0.0, 0.8, 9), (4, 2, 9))
     batch = np.ones(4)
     mixer = np.broadcast_to(ROTORS.mixer, (4, 4, 4))
     body = batch * MODEL.mass, batch[:, None] * ROTORS.inertia, mixer
     found = judged_thrusts(coeffs, times, batch * GRAVITY, *body)
     for lane, piece, sample in np.ndindex(4, 2, 9):
-        one = np.moveaxis(coeffs[:, lane, piece], 0, 1)
-        motion = [
-            np.polynomial.polynomial.polyval(
-                times[lane, piece, sample], np.polynomial.polynomial.polyder(one, order)
-            )
-            for order in (2, 3, 4)
-        ]
+        axes = [np.polynomial.Polynomial(axis) for axis in coeffs[:, lane, piece]]
+        time = times[lane, piece, sample]
+        motion = [np.array([axis.deriv(k)(time) for axis in axes]) for k in (2, 3, 4)]
         planned = np.array(rotor_thrusts(*motion, GRAVITY, ROTORS))
         np.testing.assert_allclose(found[lane, piece, sample], planned, rtol=1e-6, atol=1e-6)
 
@@ -100,7 +80,7 @@ def test_the_body_rate_is_that_of_the_attitude():
 
 @pytest.fixture(scope="module")
 def hits():
-    """Hits of a robot whose rotors are just strong enough, and their plans."""
+    """Hits by a robot whose rotors are just strong enough, and their plans."""
     weak = dataclasses.replace(MODEL.rotors, max_thrust=3.4)
     robot = dataclasses.replace(MODEL, rotors=weak)
     drawn = pj.hit.draw(64, seed=2)
@@ -121,26 +101,19 @@ def test_plans_keep_to_what_the_rotors_can_do(hits):
 
 
 @pytest.mark.parametrize(
-    ("name", "bound"), [("rotor high", "max_thrust"), ("rotor low", "min_thrust")]
+    ("name", "bound", "off"), [("rotor high", "max", -0.1), ("rotor low", "min", 0.1)]
 )
-def test_a_rotor_beyond_its_bound_fails_by_name(hits, name, bound):
+def test_a_rotor_beyond_its_bound_fails_by_name(hits, name, bound, off):
     cases, plans = hits
     verdict = pj.hit.judge(cases, plans)
-    at = {
-        "max_thrust": verdict.max_rotor_thrust - 0.1,
-        "min_thrust": verdict.min_rotor_thrust + 0.1,
-    }
-    rotors = dataclasses.replace(cases.limits.rotors, **{bound: at[bound].astype(np.float32)})
+    done = verdict.success
+    thrust = (getattr(verdict, f"{bound}_rotor_thrust") + off).astype(np.float32)
+    rotors = dataclasses.replace(cases.limits.rotors, **{f"{bound}_thrust": thrust})
     tight = dataclasses.replace(cases, limits=dataclasses.replace(cases.limits, rotors=rotors))
     found = pj.hit.judge(tight, plans)
-    assert (found.failed_limit[verdict.success] == name).all(), found.failed_limit
-    of_most = 0.1 / np.asarray(rotors.max_thrust)
-    np.testing.assert_allclose(
-        found.failed_excess[verdict.success], of_most[verdict.success], rtol=1e-2
-    )
-
-
-# Robots
+    assert (found.failed_limit[done] == name).all(), found.failed_limit
+    excess = 0.1 / np.asarray(rotors.max_thrust)
+    np.testing.assert_allclose(found.failed_excess[done], excess[done], rtol=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -157,12 +130,9 @@ def test_a_robot_that_cannot_be_is_refused_in_one_line(changed, message):
         dataclasses.replace(MODEL, **changed)
 
 
-def test_rotors_in_one_line_cannot_turn_the_body():
+def test_rotors_in_one_line_a_net_and_a_name_do_not_hit():
     with pytest.raises(ValueError, match="^rotors.places must let them turn the body"):
         Rotors(((0.1, 0.0), (0.05, 0.0), (-0.05, 0.0), (-0.1, 0.0)), max_thrust=4.0)
-
-
-def test_a_net_does_not_hit_and_a_name_is_no_robot():
     where = np.zeros((3,)), np.ones((3,)), np.zeros((3,))
     net = dataclasses.replace(MODEL, tool=Tool(NET, 0.2, 0.1))
     with pytest.raises(ValueError, match="^robot must carry a racket, got 'small' with a net$"):
