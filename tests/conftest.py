@@ -1,7 +1,7 @@
-"""Settings that every test shares; they must stand before the first import of JAX.
+"""Settings that every test shares, made before the first import of JAX.
 
-They are environment variables, so that the processes which tests start (the command line, the
-notebooks' kernels) and the workers of a parallel run have them too.
+They are environment variables, so that worker processes and the processes that tests start (the
+command line, the notebooks' kernels) have them too.
 """
 
 import os
@@ -14,9 +14,8 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(CACHE))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("MPLBACKEND", "agg")
-# Most of the time of the tests is compilation, a third of which goes into the fusion of loops that
-# then run quicker: not worth it for a few lanes. XLA ends a process that names a flag it lacks, as
-# later versions do.
+# The tests mostly compile, and a third of that time fuses loops, which does not pay for few lanes.
+# XLA ends a process that names an unknown flag, and later versions do not know this one.
 if version("jaxlib") < "0.11":
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false")
 
@@ -29,13 +28,13 @@ pytest.register_assert_rewrite("sweeps", "tests.sweeps")
 accept_leaves()
 install_import_hook([f"planner_jax.{name}" for name in PACKAGES], "typecheck.check")
 
-# Every compiled program takes some of the mappings that Linux lets a process have, 65,530 by
-# default; without any left a compilation aborts the process.
+# Every compiled program takes some of the 65,530 memory mappings that Linux allows a process by
+# default; without a free one a compilation aborts the process.
 MOST_MAPPINGS = 40_000
 
 
 def pytest_runtest_teardown(item, nextitem):
-    """Forget compiled programs where there are many, after a module or a slow test."""
+    """Forget compiled programs if there are many, after a module or a slow test."""
     ends_module = nextitem is None or nextitem.path != item.path
     mappings = Path("/proc/self/maps")
     if (ends_module or item.get_closest_marker("slow")) and mappings.exists():
@@ -45,14 +44,14 @@ def pytest_runtest_teardown(item, nextitem):
 
 @pytest.fixture
 def float64():
-    """Double precision for the length of one test: the reference arithmetic of the suite."""
+    """Use double precision during one test: the reference arithmetic of the suite."""
     with jax.enable_x64(True):
         yield
 
 
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
-    """The folder and manifest of an undisturbed sweep of the module's TASK and SETTINGS."""
+    """Return folder and manifest of a complete sweep of the module's TASK and SETTINGS."""
     from planner_jax.sweep.run import start_sweep
 
     out = tmp_path_factory.mktemp("runs") / "finished"
@@ -70,9 +69,9 @@ SLOW = (
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
-# Modules that take longest, or whose compiled programs others find in the cache: the hit planner's
-# of test_exact, the catch planner's of test_decide. Workers get whole modules in this order: none
-# is left with a long one in the end, and none compiles what another one is compiling.
+# Modules that take longest, or compile programs that others find in the cache: test_exact the hit
+# planner's, test_decide the catch planner's. Workers get whole modules in this order, so that none
+# ends with a long module, and no two compile the same program.
 FIRST = (
     *("along_curvature", "sims_flights", "exact", "notebooks", "intercept", "decide"),
     *("contract", "block", "own_task", "along", "estimation"),
@@ -81,7 +80,7 @@ FIRST = (
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """Mark the modules of SLOW, and put those of FIRST before the others."""
+    """Mark the modules of SLOW, and put the modules of FIRST before the others."""
     places = {f"test_{name}": place for place, name in enumerate(FIRST)}
     items.sort(key=lambda item: places.get(item.path.stem, len(FIRST)))
     for item in items:

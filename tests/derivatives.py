@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 
@@ -12,10 +13,10 @@ def value_and_gradient(function):
 
 
 def assert_gradient_matches_differences(function, point, *, step=1e-5, rtol=1e-7, directions=3):
-    """The gradient of a scalar function agrees with central differences along random directions.
+    """Assert that a scalar function's gradient agrees with central differences.
 
-    For float64. Steps are relative to the size of each leaf of `point`, tolerances to the sum of
-    what the single numbers of the point contribute to the slope. Compiles once a function.
+    For float64. Directions are random, steps relative to the size of each leaf of `point`, and
+    tolerances relative to the sum of the terms of the slope. Compiles once for each function.
     """
     point = jax.tree.map(lambda x: np.asarray(x, np.float64), point)
     gradient = jax.tree.map(np.asarray, value_and_gradient(function)(point)[1])
@@ -37,6 +38,17 @@ def assert_gradient_matches_differences(function, point, *, step=1e-5, rtol=1e-7
             rtol=0.0,
             atol=rtol * np.sum(np.abs(terms)),
         )
+
+
+def double(tree):
+    """Convert the floating-point leaves of a pytree to float64."""
+
+    def convert(leaf):
+        leaf = jnp.asarray(leaf)
+        is_floating = jnp.issubdtype(leaf.dtype, jnp.floating)
+        return leaf.astype(jnp.float64) if is_floating else leaf
+
+    return jax.tree.map(convert, tree)
 
 
 def along(point, direction, distance):

@@ -1,4 +1,4 @@
-"""What a function asks of the machine when it is traced, whatever it is nested in."""
+"""Properties of the equations of a traced function, nested ones included."""
 
 import jax
 from jax import lax
@@ -8,11 +8,11 @@ HIGHEST = (lax.Precision.HIGHEST, lax.Precision.HIGHEST)
 
 
 def assert_full_precision(function, *args):
-    """Every matrix product of `function(*args)` asks for `Precision.HIGHEST`.
+    """Assert that every matrix product of `function(*args)` requests `Precision.HIGHEST`.
 
     With less, a GPU rounds the factors of a float32 product to TF32. Derivatives are functions
-    of their own: hand in `jax.grad(function)` as well. Returns the number of products, so that
-    a test can tell that it looked at any.
+    of their own: check `jax.grad(function)` as well. Returns the number of products, so that a
+    test can assert that there are any.
     """
     products = [
         equation
@@ -28,7 +28,7 @@ def assert_full_precision(function, *args):
 
 
 def equations(jaxpr):
-    """All equations of a jaxpr and of those inside it: loops, branches, solves, calls."""
+    """Yield all equations of a jaxpr and of those inside it: loops, branches, solves, calls."""
     for equation in jaxpr.eqns:
         yield equation
         for inner in inner_jaxprs(tuple(equation.params.values())):

@@ -1,4 +1,4 @@
-"""The packages in the order of their layers, what each one imports, and the table of them.
+"""The packages in the order of their layers, the imports of each, and the table of them.
 
     python -m tests.layers [--write]
 
@@ -53,7 +53,7 @@ class Import:
 
     @property
     def package(self) -> str | None:
-        """The package of `planner_jax` that is imported, or None outside of `planner_jax`."""
+        """The imported package of `planner_jax`, or None for a module outside `planner_jax`."""
         top, *parts = self.name.split(".")
         if top != "planner_jax":
             return top if top in OUTSIDE else None
@@ -75,7 +75,7 @@ def package_of(path: Path) -> str:
 
 
 def _names_of(statement: ast.AST, package: tuple[str, ...]) -> list[str]:
-    """Return the full names that an import statement in `package` asks for."""
+    """Return the full names in an import statement of a module in `package`."""
     if isinstance(statement, ast.Import):
         return [alias.name for alias in statement.names]
     if isinstance(statement, ast.ImportFrom):
@@ -105,7 +105,7 @@ def read_imports(path: Path, source: str | None = None) -> Iterator[Import]:
 
 
 def is_allowed(found: Import) -> bool:
-    """Return whether a module may import or name what it does."""
+    """Return whether the layers allow this import, or name in a string."""
     own, other = package_of(found.path), found.package
     if own not in LAYERS:
         return False
@@ -145,7 +145,7 @@ def make_table() -> str:
 
 
 def split_page() -> tuple[str, str, str]:
-    """Split CONTRIBUTING.md into the text before the table, the table, and the text behind it."""
+    """Split CONTRIBUTING.md into the text before the table, the table, and the text after it."""
     before, rest = PAGE.read_text().split(BEGIN)
     table, after = rest.split(END)
     return before + BEGIN, table, END + after

@@ -1,4 +1,4 @@
-"""Penalties along a trajectory: what they integrate, their slopes, and the kernel for both."""
+"""Penalties along a trajectory: their integral, its derivatives, and the kernels for both."""
 
 import dataclasses
 import functools
@@ -34,23 +34,19 @@ ALONG = Along(
 
 
 def cases(num=LANES, dtype=np.float32):
-    """Trajectories that break every limit somewhere: columns, durations, gravity and limits."""
+    """Return trajectories that break every limit: columns, durations, gravity and limits."""
     random = np.random.default_rng(0)
     columns = random.standard_normal((num, SEGMENTS, 5, 3)) * 0.7
     durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
     limit = lambda low, high: random.uniform(low, high, num).astype(dtype)  # noqa: E731
-    limits = QuadrotorLimits(
-        speed=limit(2, 9),
-        acceleration=limit(5, 15),
-        body_rate=limit(3, 8),
-        min_height=limit(-1, 1),
-    )
+    bounds = {"speed": (2, 9), "acceleration": (5, 15), "body_rate": (3, 8), "min_height": (-1, 1)}
+    limits = QuadrotorLimits(**{name: limit(*bound) for name, bound in bounds.items()})
     return columns.astype(dtype), durations.astype(dtype), (limit(9, 10), limits)
 
 
 @jax.jit
-def sampled(columns, durations, given):
-    """The excess over every limit at every sample of a trajectory's segments, and the hinges."""
+def sample(columns, durations, given):
+    """Return the excess over every limit at every sample of the segments, and the hinges."""
     motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
     excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
     return excess, smooth_hinge(excess + np.array(ALONG.margins)[:, None], ALONG.hinge_width)
@@ -58,7 +54,7 @@ def sampled(columns, durations, given):
 
 @jax.jit
 def along_a_line(t, x, direction):
-    """The penalties' sum beside x, with its slope and its curvature in the direction."""
+    """Return the penalties' sum at x + t direction, its slope and its curvature."""
 
     def value(t):
         columns, durations, given = jax.tree.map(lambda a, b: a + t * b, x, direction)
@@ -70,7 +66,7 @@ def along_a_line(t, x, direction):
 def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     penalties, worst = jax.jit(functools.partial(integrate_along, ALONG))(columns, durations, given)
-    for n, (excess, hinges) in enumerate(zip(*sampled(columns, durations, given), strict=True)):
+    for n, (excess, hinges) in enumerate(zip(*sample(columns, durations, given), strict=True)):
         excess, hinges = np.asarray(excess), np.asarray(hinges).sum(axis=0)
         times = np.concatenate([[0.0], np.cumsum(np.repeat(ALONG.maps.proportions, 5) / 5)])
         expected = durations[n] * np.trapezoid(hinges, times)
@@ -97,7 +93,7 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
 
 
 def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
-    """Of speed and height; body rates of these wild ways peak too sharply for any sampling."""
+    """For speed and height; body rates of these trajectories peak too sharply for sampling."""
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
@@ -118,8 +114,8 @@ def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
     assert slope[0] < 0.0 and slope[1] == 0.0  # slower is less
 
 
-def test_three_samples_show_the_peak_of_a_parabola_and_no_other(float64):
-    """With unequal steps, also where it is nearer to an outer sample; else nothing is added."""
+def test_the_crest_is_the_peak_of_a_parabola_between_three_samples(float64):
+    """For unequal steps, also near an outer sample; a peak outside adds nothing."""
     before, after = 0.3, 0.5
     for peak, height in ((0.02, 1.0), (-0.29, 2.0), (0.49, 0.5), (-0.31, 3.0), (0.51, 1.0)):
         left, middle, right = (height - 7.0 * (t - peak) ** 2 for t in (-before, 0.0, after))
@@ -131,7 +127,7 @@ def test_three_samples_show_the_peak_of_a_parabola_and_no_other(float64):
         assert np.isfinite(slopes).all() or np.isinf(values).any()
 
 
-def test_tangents_show_the_tip_of_a_tent_and_are_above_what_is_concave(float64):
+def test_tangents_find_the_tip_of_a_tent_and_bound_a_concave_function(float64):
     times = np.linspace(0.0, 1.0, 11)
     tent, slopes = 1.0 - 2.0 * np.abs(times - 0.537), -2.0 * np.sign(times - 0.537)
     np.testing.assert_allclose(greatest_by_tangents(tent, slopes, 0.1), 1.0, rtol=1e-12)
@@ -147,15 +143,15 @@ def test_worst_has_no_derivative():
     np.testing.assert_array_equal(slope, 0.0)
 
 
-def asked(mode):
-    """What a kernel computes, of one lane, by `integrate_along` alone."""
+def reference(mode):
+    """Return the function of one lane that a kernel computes, by `integrate_along` alone."""
 
     def value(*x):
         penalties, worst = integrate_along(ALONG, *x)
         return jnp.sum(penalties), (penalties, worst)
 
     def slopes(*x):
-        """Every segment has its own parameters, to have its own slopes."""
+        """Return slopes for each segment, also by the parameters."""
         num = range(3 if mode != "slopes" else 2)
 
         def segment(c, h, given):
@@ -190,10 +186,10 @@ def test_the_kernel_gives_the_same_numbers(mode):
     if mode == "curvature":
         random = np.random.default_rng(1)
         args = (args, jax.tree.map(lambda x: random.standard_normal(x.shape).astype(x.dtype), args))
-    expected = jax.tree.leaves(jax.jit(jax.vmap(asked(mode), out_axes=-1))(*args))
+    expected = jax.tree.leaves(jax.jit(jax.vmap(reference(mode), out_axes=-1))(*args))
     lanes = jax.tree.map(lambda x: jnp.asarray(np.moveaxis(x, 0, -1)), args)
-    made = peaks_kernel if mode == "greatest" else functools.partial(along_kernel, mode=mode)
-    kernel = made(ALONG, interpret=True)
+    make = peaks_kernel if mode == "greatest" else functools.partial(along_kernel, mode=mode)
+    kernel = make(ALONG, interpret=True)
     found = kernel(jax.tree.structure(args), jax.tree.leaves(lanes))
     assert len(found) == len(expected)
     for ours, theirs in zip(found, expected, strict=True):
@@ -203,22 +199,22 @@ def test_the_kernel_gives_the_same_numbers(mode):
 
 @pytest.mark.slow
 def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
-    """Slopes and curvature by kernels, `vmap` of them, and what reverse mode makes of them."""
+    """Slopes and curvature by kernels, `vmap` of them, and reverse mode through them."""
     used = []
 
     def in_lanes(along, mode):
         kernel = along_kernel(along, mode, interpret=True)
 
-        def counted(*args):
+        def count(*args):
             used.append(mode)
             return kernel(*args)
 
-        return counted
+        return count
 
     monkeypatch.setattr("planner_jax.cost.along_kernel.along_kernel", in_lanes)
     monkeypatch.setattr("planner_jax.lanes.kernels.has_gpu", lambda: True)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
-    along = dataclasses.replace(ALONG, hinge_width=0.25)  # another, to be built with these
+    along = dataclasses.replace(ALONG, hinge_width=0.25)  # new constants, for new kernels
     args = cases()
     lanes = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), args)
 
@@ -228,22 +224,22 @@ def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
     def by_all(c, h, given):
         return jax.grad(value, argnums=(0, 1, 2))(c, h, given)
 
-    def curved(c, h, given):
+    def along_columns(c, h, given):
         return jax.jvp(lambda c: by_all(c, h, given), (c,), (jnp.cos(c),))[1]
 
-    def curvature(c, h, given):
+    def by_durations(c, h, given):
         return jax.jacfwd(lambda h: by_all(c, h, given))(h)
 
-    def reversed(c, h, given):
+    def backward(c, h, given):
         total = lambda *x: sum(jnp.sum(leaf**2) for leaf in jax.tree.leaves(by_all(*x)))  # noqa: E731
         return jax.grad(total, argnums=(0, 1, 2))(c, h, given)
 
     by_kernels = {"slopes by all", "curvature"}
     for function, kernels in (
         (by_all, {"slopes by all"}),
-        (curved, by_kernels),
-        (curvature, by_kernels),
-        (reversed, {"slopes by all"}),
+        (along_columns, by_kernels),
+        (by_durations, by_kernels),
+        (backward, {"slopes by all"}),
     ):
         used.clear()
         expected = jax.vmap(function, out_axes=-1)(*args)
@@ -254,7 +250,7 @@ def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
             np.testing.assert_allclose(ours, theirs, rtol=2e-4, atol=5e-5 * scale)
 
 
-def test_the_kernel_leaves_alone_what_it_is_not_made_for():
+def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():
     kernel = along_kernel(ALONG, "values")
     for num, dtype in ((LANES, np.float16), (7, np.float32)):
         args = cases(num, dtype)
@@ -262,8 +258,8 @@ def test_the_kernel_leaves_alone_what_it_is_not_made_for():
         assert kernel(jax.tree.structure(args), lanes) is None
 
 
-def test_a_kernel_has_the_same_name_whatever_was_compiled_before(monkeypatch):
-    """Or kept programs would not be found again in another process."""
+def test_the_name_of_a_kernel_does_not_depend_on_earlier_kernels(monkeypatch):
+    """Otherwise another process would not find the programs in the compile cache."""
     lane = jax.tree.map(lambda leaf: leaf[0], cases())
     others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
 

@@ -1,4 +1,4 @@
-"""Second derivatives of the penalties along a way, beside those of automatic differentiation."""
+"""Second derivatives of the penalties along a trajectory, against automatic differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -7,17 +7,14 @@ import pytest
 
 import planner_jax as pj
 from planner_jax.cost.along import integrate_along
-from planner_jax.cost.along_curvature import (
-    block_and_diagonal,
-    columns_columns,
-    curvature_along,
-)
+from planner_jax.cost.along_curvature import block_and_diagonal, columns_columns, curvature_along
 from planner_jax.cost.quadrotor import flight_along
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.catch.decide import Greedy
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.proportional_minco import proportional_minco
+from tests.derivatives import double
 
 MAPS = proportional_minco(4, (0.3, 1.0, 1.0))
 CASES = {
@@ -30,11 +27,6 @@ CASES = {
         extras=(pj.KeepOut(centre=np.array([0.0, 0.2, 1.0]), radius=np.array(0.7)),),
     ),
 }
-
-
-def double(tree):
-    floating = lambda leaf: jnp.issubdtype(jnp.asarray(leaf).dtype, jnp.floating)  # noqa: E731
-    return jax.tree.map(lambda x: jnp.asarray(x, jnp.float64) if floating(x) else x, tree)
 
 
 @pytest.mark.parametrize("given", [0, 4])
@@ -52,8 +44,8 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
             every = jnp.concatenate([head, moving])
             return integrate_along(along, every[None], jnp.exp(at)[None], parameters)[0][0]
 
-        @jax.jit  # all at once: compiled one by one, the operations take many times as long
-        def both_ways(moving, at):
+        @jax.jit  # one program: compiled one by one, the operations take much longer
+        def compare(moving, at):
             found = curvature_along(along, columns, jnp.exp(at), parameters, given)
             block, diagonal = block_and_diagonal(along, found.at_samples, 4, given)
             mine = (
@@ -71,36 +63,31 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
             )
             return mine, exact
 
-        pairs = zip(*both_ways(columns[given:], theta), strict=True)
+        pairs = zip(*compare(columns[given:], theta), strict=True)
         for mine, exact in pairs:
             assert np.abs(exact).max() > 0.0
             np.testing.assert_allclose(mine, exact, rtol=1e-9, atol=1e-11 * np.abs(exact).max())
 
 
-def a_hit():
-    case = pj.take(pj.hit.draw(1, seed=1), 0)
-    return ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0)), case, 8
-
-
-def a_throw():
-    return ExactCatch(), decided("throws", 1), 12
-
-
-def a_pair():
-    return ExactCatch(), decided("parabola2", 2), 12
-
-
-def a_throw_and_a_place_for_another():
-    return ExactCatch(), decided("throws", 2), 12
-
-
-def decided(suite, num_targets):
-    """One case in the greedy order, with places for so many targets."""
+def greedy_catch(suite, num_targets):
+    """Return one case in the greedy order, with space for a number of targets."""
     cases = pj.catch.draw(1, suite, 3, num_targets=num_targets)
     return pj.take(first_choice(Greedy(), cases), 0)
 
 
-@pytest.mark.parametrize("make", [a_hit, a_throw, a_pair, a_throw_and_a_place_for_another])
+PLANS = {  # planner, case, end variables of a segment
+    "hit": lambda: (
+        ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0)),
+        pj.take(pj.hit.draw(1, seed=1), 0),
+        8,
+    ),
+    "throw": lambda: (ExactCatch(), greedy_catch("throws", 1), 12),
+    "pair": lambda: (ExactCatch(), greedy_catch("parabola2", 2), 12),
+    "throw and an absent target": lambda: (ExactCatch(), greedy_catch("throws", 2), 12),
+}
+
+
+@pytest.mark.parametrize("make", PLANS.values(), ids=PLANS)
 def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
     planner, case, num_own = make()
     with jax.enable_x64(True):
@@ -115,7 +102,7 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
             return planner.objective(x, context).cost
 
         @jax.jit
-        def both_ways(point):
+        def compare(point):
             evaluation, gradient, products, preconditioner = planner.curvature_at(point, context)
             hessian = jax.hessian(cost)(point)
             damping = 2.0 * jnp.abs(hessian).max()
@@ -125,18 +112,18 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
             exact = (cost(point), planner.objective(point, context).violation, *exact)
             return found, exact, hessian, damping, solved
 
-        found, exact, hessian, damping, solved = both_ways(point)
+        found, exact, hessian, damping, solved = compare(point)
         for mine, expected in zip(found[:2], exact[:2], strict=True):
             np.testing.assert_allclose(mine, expected, rtol=1e-12)
         for mine, expected in zip(found[2:], exact[2:], strict=True):
             greatest = np.abs(expected).max()
             np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-11 * greatest)
-        # What is preconditioned: the Hessian with nothing but its block of ends and its diagonal.
+        # The preconditioner is the inverse of the block of end variables and of the diagonal.
         hessian = np.asarray(hessian)
         kept = np.diag(np.abs(np.diag(hessian)))
         ends = np.arange(size).reshape(num, -1)[:, -num_own:].ravel()
         kept[np.ix_(ends, ends)] = hessian[np.ix_(ends, ends)]
         kept += damping * np.eye(size)
         assert np.linalg.eigvalsh(kept)[0] > 0.0
-        # What has no curvature of its own, of a target that is absent, is given a millionth.
+        # Variables without curvature, of the absent target, have a millionth of the greatest.
         np.testing.assert_allclose(kept @ solved, direction, rtol=2e-6)

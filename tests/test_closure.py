@@ -1,4 +1,4 @@
-"""How much of the library a reader has to know who follows one hit."""
+"""The number of files of the library that a reader of one hit must know."""
 
 import subprocess
 import sys

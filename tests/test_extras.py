@@ -1,4 +1,4 @@
-"""Limits and costs of a user's own along the way, planned by `exact` and judged by the referee."""
+"""A user's limits and costs along the trajectory, planned by `exact` and judged by the referee."""
 
 import dataclasses
 import functools
@@ -16,7 +16,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-# Smooth ways, around whose middle obstacles are put.
+# Smooth trajectories; obstacles are placed around their middles.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
@@ -26,7 +26,7 @@ TRACES = []
 
 @struct.dataclass
 class Gentle:
-    """A limit of this test's own, which notes on what it is called."""
+    """A limit of this test, which records whether its arguments are NumPy arrays."""
 
     acceleration: Any  # () [m/s^2], horizontal
 
@@ -47,7 +47,7 @@ def having(
     point=-FAR,
     normal=(0.0, 0.0, 1.0),
 ):
-    """Cases with five extras, which change nothing unless told: all of one compiled program."""
+    """Return cases with five extras without effect by default: all use one compiled program."""
     batch = cases.batch_shape
     full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
 
@@ -65,14 +65,14 @@ def having(
 
 
 def way(plans, k, num=200):
-    """Positions (num, 3) of plan k at equal steps, the ends included."""
+    """Return positions (num, 3) of plan k at equal steps, the ends included."""
     path = pj.take(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
 
 
 def straight(path, vel):
-    """A way (1, M) from the origin on at one velocity (3,), of as long pieces as a path has."""
+    """Return a path (1, M) from the origin at one velocity (3,), with the durations of a path."""
     coeffs = np.zeros_like(path.coeffs[:1])
     starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
     coeffs[:, :, 0], coeffs[:, :, 1] = starts[..., None] * vel, vel
@@ -80,7 +80,7 @@ def straight(path, vel):
 
 
 def places(plans):
-    """Of each way the place (3,) half as far from its start as its end is."""
+    """Return for each plan the position (3,) half as far from its start as its end is."""
     found = []
     for k in range(NUM):
         flown = way(plans, k)
@@ -106,7 +106,7 @@ def middle(free):
 
 @pytest.fixture(scope="module")
 def blocked(hits, middle):
-    """The same hits, a sphere beside the middle of each free way; radii of their own."""
+    """Return the same hits with a sphere near the middle of each free trajectory."""
     return having(hits, middle + np.array([0.0, 0.03, 0.0]), np.array([0.2, 0.25, 0.15, 0.2]))
 
 
@@ -120,7 +120,7 @@ def test_excess_and_cost_have_their_closed_forms():
     vel = np.array([[3.0, 0.0, 4.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]])
     found = pj.KeepOut(AT, 2.0).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.75, -1.5, -0.125], atol=1e-9)
-    # Half a metre outside, half way in, and on a face; the shortest side is of 4 m.
+    # Half a metre outside, half way inside, and on a face; the shortest side is 4 m long.
     box = pj.KeepOutBox(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 3.0, 4.0]))
     where = np.array([[0.0, 3.5, 2.0], [1.0, 0.5, 2.0], [0.0, 0.5, 0.0]])
     np.testing.assert_allclose(box.excess(where, vel, vel), [-0.25, 0.5, 0.0], atol=1e-12)
@@ -128,7 +128,7 @@ def test_excess_and_cost_have_their_closed_forms():
     np.testing.assert_allclose(wall.excess(pos, vel, vel), [-2.0, 1.0, -2.0], atol=1e-12)
     found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
-    # Inside, beyond 1.25 radii, and half way between, where u = 1/2 and the limit is twice as high.
+    # Inside, beyond 1.25 radii, and half way between, where u = 1/2 and the limit is doubled.
     found = pj.SpeedZone(AT, 2.0, 2.5).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(pj.Dislike(AT, 1.0, 2.0).cost(pos, vel, vel), [1.125, 0.0, 0.0])
@@ -146,7 +146,7 @@ def test_excess_and_cost_have_their_closed_forms():
     ],
     ids=lambda extra: type(extra).__name__,
 )
-def test_gradients_are_those_of_differences(extra, float64):
+def test_gradients_match_differences(extra, float64):
     pos = np.array([[0.5, 0.1, 0.0], [0.3, 0.7, 0.4]])
     method = getattr(extra, "excess", None) or extra.cost
     name = method.__name__
@@ -162,7 +162,7 @@ def test_gradients_are_those_of_differences(extra, float64):
 
 def test_a_case_gives_its_extras_the_shape_of_the_batch():
     pos, vel, target = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-    one = pj.Geofence((-1, -1, 0), (1, 1, 2))  # three numbers, and a batch of three
+    one = pj.Geofence((-1, -1, 0), (1, 1, 2))  # for one case, in a batch of three
     many = pj.KeepOut(np.ones((3, 3)), np.ones(3))
     cases = pj.hit.case(pos, vel, target, extras=(one, many))
     assert [leaf.shape for leaf in jax.tree.leaves(cases.extras)] == [(3, 3), (3, 3), (3, 3), (3,)]
@@ -174,7 +174,7 @@ def test_a_case_gives_its_extras_the_shape_of_the_batch():
 
 
 @pytest.mark.slow
-def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
+def test_plans_avoid_obstacles_and_the_referee_rejects_plans_through_them(
     hits, free, blocked, around
 ):
     assert pj.solved(free).all() and pj.hit.judge(hits, free).success.all()
@@ -187,13 +187,19 @@ def test_a_blocked_way_is_planned_around_and_the_referee_says_which_was_not(
     assert verdict.success.all(), [verdict.sentence(k) for k in range(4)]
 
 
-def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
-    """A straight way at 2 m/s through two spheres, the second of them deeper."""
-    head = np.zeros((1, 4, 3), np.float32)
-    head[0, 1, 0] = 2.0
-    plan = pj.take(free, slice(0, 1)).replace(trajectory=straight(free.trajectory, head[0, 1]))
+def fly_straight(hits, free, vel):
+    """Return one case without a floor, and its plan that flies straight at one velocity (3,)."""
+    one = slice(0, 1)
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
-    case = pj.take(hits.replace(limits=limits), slice(0, 1)).replace(head_state=head)
+    head = np.zeros((1, 4, 3), np.float32)
+    head[0, 1] = vel
+    case = pj.take(hits.replace(limits=limits), one).replace(head_state=head)
+    return case, pj.take(free, one).replace(trajectory=straight(free.trajectory, head[0, 1]))
+
+
+def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
+    """A straight path at 2 m/s through two spheres, the second of them deeper."""
+    case, plan = fly_straight(hits, free, (2.0, 0.0, 0.0))
     zones = (
         pj.KeepOut(np.array([[0.3, 0.4, 0.0]]), np.array([0.5])),
         pj.Dislike(np.zeros((1, 3)), np.ones(1), np.ones(1)),
@@ -207,16 +213,10 @@ def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
     assert pj.hit.judge(case.replace(extras=broken), plan).failed_limit[0] == "not finite"
 
 
-def test_the_tip_of_a_way_past_an_edge_is_found_between_samples(hits, free):
-    """A straight way at 2.8 m/s that cuts 2 mm off a box's edge, where no sample lies."""
-    one = slice(0, 1)
-    span = free.trajectory.durations[one].sum(axis=1)
-    limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
-    head = np.zeros((1, 4, 3), np.float32)
-    head[0, 1] = (2.0, 2.0, 0.0)
-    case = pj.take(hits.replace(limits=limits), one).replace(head_state=head)
-    path = straight(free.trajectory, head[0, 1])
-    plan = pj.take(free, one).replace(trajectory=path)
+def test_the_peak_of_a_path_past_an_edge_is_found_between_samples(hits, free):
+    """A straight path at 2.8 m/s cuts 2 mm off a box's edge, where no sample lies."""
+    case, plan = fly_straight(hits, free, (2.0, 2.0, 0.0))
+    head, span = case.head_state, plan.trajectory.durations.sum(axis=1)
     maps, still = FREE.maps, np.zeros((FREE.num_pieces - 1, 3))
     tail = np.stack([head[0, 1] * span, head[0, 1], *np.zeros((2, 3))])
     rows = boundary_rows(head[0], tail, span[0] / FREE.num_pieces)
@@ -225,8 +225,7 @@ def test_the_tip_of_a_way_past_an_edge_is_found_between_samples(hits, free):
     for place in (0.9, 0.9012, 0.9024, 0.9036):
         low = np.array([[place, -0.1, -0.5]])
         high = np.array([[1.9, place + 0.004, 0.5]])
-        zone = pj.KeepOutBox(low, high)
-        verdict = pj.hit.judge(case.replace(extras=(zone,)), plan)
+        verdict = pj.hit.judge(case.replace(extras=(pj.KeepOutBox(low, high),)), plan)
         depth = 0.002 / (0.5 * (high - low).min())
         assert verdict.failed_limit[0] == "extra"
         np.testing.assert_allclose(verdict.failed_excess, depth, rtol=1e-2)
@@ -251,14 +250,14 @@ def test_another_value_compiles_nothing_anew(hits, around):
 
 
 def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
-    """Boxes that reach 3 cm over the middle of two ways; planes across the two others."""
+    """Boxes 3 cm over the middles of two trajectories; planes across the two others."""
     sides = np.array([0.5, 0.4, 0.6])
     reach = sides * [0.5, 1.0, 0.5] - [0.0, 0.03, 0.0]
     low = np.where(np.arange(NUM)[:, None] < 2, middle - reach, FAR)
     first, last = (np.array([way(free, k)[place] for k in range(NUM)]) for place in (0, -1))
     across = np.cross(last - first, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    # Of a straight line from start to end, the side on which the middle of the way is not.
+    # The side of the straight line from start to end without the middle of the trajectory.
     side = np.sign(((middle - first) * across).sum(1, keepdims=True))
     depth = np.abs(((middle - first) * across).sum(1, keepdims=True))
     point = np.where(np.arange(NUM)[:, None] < 2, -FAR, first + 0.5 * depth * side * across)
@@ -266,29 +265,29 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     cases = having(hits, low=low, size=sides, point=point, normal=normal)
     verdict = pj.hit.judge(cases, free)
     assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
-    # One attempt ends at an edge of a box now and then, from which it finds no way round.
+    # A single attempt sometimes ends at an edge of a box.
     verdict = pj.hit.judge(cases, pj.plan(FREE, cases))
     assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
 
 
-def test_no_claim_is_refused_of_ways_past_boxes(hits, middle):
-    """Boxes of 20 to 60 cm about the middle of each way, whose edges the plans pass closely."""
-    random, claims = np.random.default_rng(2), 0
+def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
+    """Boxes of 20 to 60 cm near the middle of each trajectory; plans pass close to their edges."""
+    random, num_solved = np.random.default_rng(2), 0
     for _ in range(16):  # on some processors 8 of the first 32 cases are solved, on others more
         half = random.uniform(0.1, 0.3, (NUM, 3))
         low = middle + random.normal(0.0, 0.08, (NUM, 3)) - half
         cases = having(hits, low=low, size=2.0 * half)
         plans = pj.plan(HIT, cases)
         verdict, solved = pj.hit.judge(cases, plans), pj.solved(plans)
-        claims += solved.sum()
+        num_solved += solved.sum()
         assert verdict.success[solved].all(), [verdict.sentence(k) for k in range(NUM)]
         broken = verdict.failed_limit == "extra"
         excess = np.where(broken, verdict.failed_excess, plans.violation)
         np.testing.assert_allclose(plans.violation, excess, atol=1e-3)
-    assert claims > 8
+    assert num_solved > 8
 
 
-def test_a_box_inside_out_and_a_plane_without_a_direction_are_refused(hits):
+def test_a_negative_size_and_a_zero_normal_raise(hits):
     for changed, words in (
         (dict(size=np.array([1.0, -1.0, 1.0])), r"extras.3.low must be < extras.3.high|low must"),
         (dict(normal=(0.0, 0.0, 0.0)), "extras.4.normal must be other than zero, got 0 in lane 0"),
@@ -297,7 +296,7 @@ def test_a_box_inside_out_and_a_plane_without_a_direction_are_refused(hits):
             pj.require_sound(having(hits, **changed))
 
 
-def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
+def test_a_users_class_is_planned_and_judged(hits, free):
     samples = pj.take(free, 0).sample(200.0)
     taken = np.linalg.norm(samples.acc[:, :2], axis=1).max()
     gentle = having(hits, acceleration=np.r_[0.8 * taken, [99.0] * (NUM - 1)])
@@ -308,7 +307,7 @@ def test_a_class_of_ones_own_is_planned_with_and_judged(hits, free):
     assert TRACES.count(True)  # by the referee
 
 
-def test_a_cost_moves_the_way(hits, free, middle):
+def test_a_cost_moves_the_trajectory(hits, free, middle):
     moved = pj.plan(HIT, having(hits, disliked=middle, weight=0.05))
     assert pj.hit.judge(hits, moved).success.all()
     for k in range(NUM):
@@ -320,7 +319,7 @@ def test_a_cost_moves_the_way(hits, free, middle):
 
 @pytest.mark.slow
 def test_catches_stay_inside_a_fence():
-    """Each may go 85 % as far from its start, along one axis, as the catch that is free."""
+    """The fence is at 85 % of the distance of the free catch from its start, along one axis."""
     cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", seed=3))
     free = pj.plan(CATCH, cases)
     assert pj.catch.judge(cases, free).success.all()
@@ -339,7 +338,7 @@ def test_catches_stay_inside_a_fence():
 
 
 @pytest.mark.slow
-def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(hits, float64):
+def test_the_gradient_by_a_radius_matches_differences_of_plans(hits, float64):
     solver = pj.LbfgsConfig(max_steps=2000, tolerance=1e-13, patience=40)
     long = HIT.with_solver(solver)
     double = lambda cases: jax.tree.map(lambda leaf: np.asarray(leaf, float), cases)  # noqa: E731
@@ -356,6 +355,6 @@ def test_the_gradient_by_a_radius_is_that_of_plans_made_anew(hits, float64):
     np.testing.assert_allclose(found.by["extras.0.radius"], slopes, rtol=1e-3)
 
 
-def test_a_place_in_the_extras_that_is_not_there_is_named(blocked):
+def test_an_unknown_name_in_the_extras_is_named(blocked):
     with pytest.raises(ValueError, match=r"'extras.5.radius': tuple has 0, 1, 2, 3, 4"):
         pj.gradient(HIT, blocked, of="cost", by="extras.5.radius")

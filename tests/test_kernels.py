@@ -1,4 +1,4 @@
-"""Programs for CUDA hold their kernels, which is seen without a GPU; a switch takes them away."""
+"""Programs for CUDA contain their kernels, unless a switch is off; visible without a GPU."""
 
 import re
 import sys
@@ -20,45 +20,40 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 
 LANES = 128
-# Of one round: the table; penalties with slopes, without (of guesses, of trials), greatest of a
-# finished plan; and the direction.
-ROUND = {
-    "flight_table": 1,
-    "integrate_along": 3,
-    "lbfgs_turn": 1,
-    "greatest_along": 1,
-}
-# Of a gradient: the table and its slopes; penalties' slopes and, along the adjoint, curvature; the
-# inverse of the block of the ends. The products' curvature of penalties is no kernel yet.
+# Kernels of one round: the table; penalties with slopes, of guesses and of trials; the greatest
+# excesses of a finished plan; and the direction.
+ROUND = {"flight_table": 1, "integrate_along": 3, "lbfgs_turn": 1, "greatest_along": 1}
+# Kernels of a gradient: the table and its slopes; penalties' slopes, and their curvature along the
+# adjoint; the inverse of the block of end variables. Products with the Hessian have no kernel.
 GRADIENT = {"flight_table": 2, "integrate_along": 2, "positive_inverse": 1}
 
 
 @pytest.fixture
 def gpu(monkeypatch):
-    """As on a machine with a GPU, for which programs are lowered, but not compiled."""
+    """Simulate a machine with a GPU, for which programs are lowered, but not compiled."""
     monkeypatch.delenv(kernels.SWITCH, raising=False)
     monkeypatch.setattr(kernels, "has_gpu", lambda: True)
 
 
 @pytest.fixture
 def no_triton(monkeypatch):
-    """A JAX without Pallas' Triton backend."""
+    """Simulate a JAX without Pallas' Triton backend."""
     monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
     monkeypatch.delitem(sys.modules, "planner_jax.lanes.pallas", raising=False)
 
 
 def kernels_in(function, *args):
-    """How many kernels of each name the function's program for CUDA calls."""
+    """Return the number of kernels of each name in the function's program for CUDA."""
     device = jax.sharding.AbstractDevice("NVIDIA H100", None, "gpu")
     mesh = jax.sharding.AbstractMesh((), (), abstract_device=device)
-    with jax.sharding.use_abstract_mesh(mesh):  # later versions of JAX ask for the kind of GPU
+    with jax.sharding.use_abstract_mesh(mesh):  # later versions of JAX need the kind of GPU
         lowered = jax.jit(function).trace(*args).lower(lowering_platforms=("cuda",))
     names = re.findall(r'\bname = "(\w+)"', lowered.as_text())
     return {name: names.count(name) for name in set(names)}
 
 
 def round_of(planner):
-    """A function that nothing has traced before: plans of one round."""
+    """Return a new function, which nothing has traced, that makes plans of one round."""
     attempt = Round(1, LbfgsConfig(max_steps=2))
     return lambda cases: solve_batch(planner, attempt, cases)
 
@@ -68,28 +63,28 @@ def serves():
 
 
 def small():
-    """Return a function of one lane with one kernel, which nothing has traced before."""
+    """Return a new function, which nothing has traced, of one lane with one kernel."""
     return over_lanes(lambda x: positive_inverse(x))
 
 
 X = np.broadcast_to(np.eye(3, dtype=np.float32)[..., None], (3, 3, LANES))
 
 
-def test_a_round_of_hits_holds_its_kernels(gpu):
-    """Were something of JAX renamed, kernels would go and nothing but the speed would tell."""
+def test_a_round_of_hits_contains_its_kernels(gpu):
+    """If JAX renamed an operation, kernels would disappear, visible only in the speed."""
     assert kernels_in(round_of(ExactHit()), serves()) == ROUND
 
 
 @pytest.mark.slow
-def test_a_round_of_catches_holds_its_kernels(gpu):
-    """All but that of the table, which takes one ball a lane and not one a target."""
+def test_a_round_of_catches_contains_its_kernels(gpu):
+    """The table has none: its kernel takes one ball a lane, not one for each target."""
     throws = pj.catch.draw(LANES, "throws")
     held = kernels_in(round_of(ExactCatch()), throws)
     assert held == {name: num for name, num in ROUND.items() if name != "flight_table"}
 
 
 @pytest.mark.slow
-def test_gradients_hold_their_kernels(gpu):
+def test_gradients_contain_their_kernels(gpu):
     planner, lanes = ExactHit(), jax.tree.map(lambda leaf: np.moveaxis(leaf, 0, -1), serves())
     starts = jax.vmap(lambda case: planner.guesses(planner.prepare(case), 1)[0], out_axes=-1)
 
@@ -102,7 +97,7 @@ def test_gradients_hold_their_kernels(gpu):
     assert held == GRADIENT
 
 
-def test_the_switch_takes_all_kernels_away(gpu, monkeypatch):
+def test_the_switch_removes_all_kernels(gpu, monkeypatch):
     monkeypatch.setenv(kernels.SWITCH, "on")
     assert kernels_in(small(), X) == {"positive_inverse": 1}
     monkeypatch.setenv(kernels.SWITCH, "off")
@@ -110,23 +105,21 @@ def test_the_switch_takes_all_kernels_away(gpu, monkeypatch):
     assert kernels_in(round_of(ExactHit()), serves()) == {}
 
 
-def test_without_triton_programs_have_no_kernels_and_are_made_all_the_same(gpu, no_triton):
+def test_without_triton_programs_have_no_kernels(gpu, no_triton):
     assert kernels.kernels() is kernels.Kernels.MISSING
     assert kernels_in(small(), X) == {}
 
 
-def test_a_wrong_value_of_the_switch_is_one_line(monkeypatch):
+def test_a_wrong_value_of_the_switch_raises_one_line(monkeypatch):
     monkeypatch.setenv(kernels.SWITCH, "no")
     line = "^PLANNER_JAX_KERNELS must be one of on, off, got 'no'$"
-    with pytest.raises(ValueError, match=line):
-        small()(X)
-    with pytest.raises(ValueError, match=line):
-        kernels.kernels()
-    with pytest.raises(ArgumentError, match=line):  # before a command does anything
-        require_backend()
+    # The last one is called before a command does anything.
+    for call in (lambda: small()(X), kernels.kernels, require_backend):
+        with pytest.raises(ArgumentError, match=line):
+            call()
 
 
-def test_the_doctor_says_whether_there_are_kernels(gpu, monkeypatch):
+def test_the_doctor_reports_the_state_of_kernels(gpu, monkeypatch):
     assert doctor._kernels() == doctor.Finding("kernels", "on")
     monkeypatch.setenv(kernels.SWITCH, "off")
     assert doctor._kernels() == doctor.Finding("kernels", "off, by PLANNER_JAX_KERNELS")
@@ -134,6 +127,6 @@ def test_the_doctor_says_whether_there_are_kernels(gpu, monkeypatch):
     assert "no GPU" in doctor._kernels().text
 
 
-def test_the_doctor_calls_a_gpu_without_kernels_bad(gpu, no_triton):
+def test_the_doctor_reports_a_gpu_without_kernels_as_bad(gpu, no_triton):
     finding = doctor._kernels()
     assert finding.text.startswith("unavailable") and not finding.good

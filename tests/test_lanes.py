@@ -1,4 +1,4 @@
-"""`over_lanes` is `jax.vmap` with the lanes last, whatever the function does."""
+"""`over_lanes` equals `jax.vmap` with the lanes last, for any function."""
 
 import functools
 
@@ -11,7 +11,7 @@ from jax.sharding import Mesh, PartitionSpec
 from planner_jax.lanes import kernels, over_lanes, with_kernel
 
 MATRIX = np.random.default_rng(0).standard_normal((5, 4))
-LANES = 32  # what a kernel takes
+LANES = 32  # enough for a kernel
 
 
 @jax.custom_jvp
@@ -22,7 +22,7 @@ def cube(x):
 cube.defjvp(lambda primals, tangents: (cube(*primals), 7.0 * tangents[0]))  # not its slope
 
 
-def halved_until_small(x):
+def halve_until_small(x):
     return jax.lax.while_loop(lambda y: jnp.sum(y**2) > 0.1, lambda y: 0.5 * y, x)
 
 
@@ -42,7 +42,7 @@ FUNCTIONS = {
     "gather": lambda x, k: x[k],
     "bounds": lambda x, k: jnp.clip(x, -0.5, x[0, 0]),
     "choice": lambda x, k: jnp.where(k > 1, x, 0.0),
-    "loop": lambda x, k: halved_until_small(x),
+    "loop": lambda x, k: halve_until_small(x),
     "branches": lambda x, k: jax.lax.cond(k > 1, jnp.sin, jnp.cos, x),
     "own derivative": lambda x, k: (cube(x), jax.grad(lambda y: jnp.sum(cube(y)))(x)),
     "gradient": lambda x, k: jax.grad(lambda y: jnp.sum(jnp.sin(MATRIX @ y) ** 2) / y[0, 0])(x),
@@ -55,7 +55,7 @@ FUNCTIONS = {
 
 
 def lanes():
-    """What the functions are called with."""
+    """Return the arguments of the functions."""
     random = np.random.default_rng(1)
     x = jnp.asarray(random.standard_normal((4, 3, LANES)))
     return x, jnp.asarray(random.integers(-1, 5, LANES))
@@ -63,12 +63,12 @@ def lanes():
 
 @functools.cache
 def by_vmap(name):
-    """What a function gives, in float64."""
+    """Return the result of a function by `jax.vmap`, in float64."""
     return jax.jit(jax.vmap(FUNCTIONS[name], in_axes=-1, out_axes=-1))(*lanes())
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
-def test_is_vmap_with_the_lanes_last(name, float64):
+def test_it_equals_vmap_with_the_lanes_last(name, float64):
     expected, found = by_vmap(name), jax.jit(over_lanes(FUNCTIONS[name]))(*lanes())
     assert jax.tree.structure(found) == jax.tree.structure(expected)
     for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
@@ -77,26 +77,25 @@ def test_is_vmap_with_the_lanes_last(name, float64):
 
 
 def test_a_shared_matrix_makes_one_product_and_no_gather():
-    """What the layout is for: the lanes stay columns of one large product."""
-    jaxpr = jax.make_jaxpr(over_lanes(lambda x: jnp.sum((MATRIX @ x) ** 2)))(
-        jnp.ones((4, 3, LANES))
-    )
+    """This is the purpose of the layout: the lanes are columns of one large product."""
+    function = over_lanes(lambda x: jnp.sum((MATRIX @ x) ** 2))
+    jaxpr = jax.make_jaxpr(function)(jnp.ones((4, 3, LANES)))
     (product,) = [eqn for eqn in jaxpr.eqns if eqn.primitive.name == "dot_general"]
     assert product.outvars[0].aval.shape == (5, 3, LANES)
     assert not [eqn for eqn in jaxpr.eqns if eqn.primitive.name in ("transpose", "gather")]
 
 
 def test_lanes_do_not_mix():
-    x = np.random.default_rng(2).standard_normal((4, 3, LANES))
-    clean = over_lanes(lambda y: jnp.tanh(MATRIX @ y))(jnp.asarray(x))
+    x, function = np.array(lanes()[0]), over_lanes(lambda y: jnp.tanh(MATRIX @ y))
+    clean = function(jnp.asarray(x))
     x[:, :, 2] = np.nan
-    broken = np.asarray(over_lanes(lambda y: jnp.tanh(MATRIX @ y))(jnp.asarray(x)))
+    broken = np.asarray(function(jnp.asarray(x)))
     assert np.isnan(broken[..., 2]).all()
     np.testing.assert_array_equal(np.delete(broken, 2, -1), np.delete(np.asarray(clean), 2, -1))
 
 
 def test_a_program_for_several_devices_calls_the_kernel_and_gives_the_results_of_one(monkeypatch):
-    """There `jnp.where` also states that a device's arrays are its own."""
+    """There `jnp.where` also marks arrays as local to a device."""
     calls = []
 
     def chosen(x, y):

@@ -1,4 +1,4 @@
-"""The solver: textbook directions, known minima, and every way of ending by name."""
+"""L-BFGS: directions of the textbook, known minima, and the status of every end."""
 
 import functools
 
@@ -14,14 +14,14 @@ from planner_jax.optimise.lbfgs_kernel import turn_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig
 
-stepped = jax.jit(lbfgs.step, static_argnums=(0, 2))
+step = jax.jit(lbfgs.step, static_argnums=(0, 2))
 direction_of = jax.jit(lbfgs.search_direction, static_argnums=2)
-search = jax.jit(minimise, static_argnums=(0, 2))  # one program for an objective and its settings
+search = jax.jit(minimise, static_argnums=(0, 2))
 remember_all = jax.jit(jax.vmap(lbfgs.remember, in_axes=-1, out_axes=-1))
 
 
 @functools.cache
-def unlimited(cost):
+def without_limits(cost):
     return lambda x: Evaluation(cost=cost(x), violation=jnp.full((), -1.0, x.dtype))
 
 
@@ -29,23 +29,23 @@ def rosenbrock(x):
     return jnp.sum(100.0 * (x[1:] - x[:-1] ** 2) ** 2 + (1.0 - x[:-1]) ** 2)
 
 
-def stretched(x):
+def stretch(x):
     return 0.5 * jnp.sum(jnp.logspace(0, 3, x.shape[0]) * (x - 1.0) ** 2)
 
 
 LONG = LbfgsConfig(max_steps=300, tolerance=1e-12, patience=8)
 
 
-@pytest.mark.parametrize("cost", [rosenbrock, stretched])
+@pytest.mark.parametrize("cost", [rosenbrock, stretch])
 def test_known_minimum_is_found(float64, cost):
-    found = search(unlimited(cost), np.full(6, -0.5), LONG)
+    found = search(without_limits(cost), np.full(6, -0.5), LONG)
     np.testing.assert_allclose(found.point, 1.0, atol=1e-4)
     assert found.stationary
 
 
 def test_final_cost_is_as_low_as_scipys(float64):
     start = np.full(6, -0.5)
-    ours = search(unlimited(rosenbrock), start, LONG)
+    ours = search(without_limits(rosenbrock), start, LONG)
     slopes = jax.jit(jax.value_and_grad(rosenbrock))
     theirs = scipy.optimize.minimize(
         slopes, start, jac=True, method="L-BFGS-B", options={"maxcor": 6}
@@ -54,7 +54,7 @@ def test_final_cost_is_as_low_as_scipys(float64):
 
 
 def two_loop_by_the_book(steps, changes, grad):
-    """[Nocedal2006, algorithm 7.4] written out for lists of pairs, oldest first."""
+    """Return the direction of [Nocedal2006, algorithm 7.4]; pairs are listed oldest first."""
     q, alphas = grad.copy(), []
     for s, y in zip(reversed(steps), reversed(changes), strict=True):
         alphas.append(s @ q / (y @ s))
@@ -65,16 +65,16 @@ def two_loop_by_the_book(steps, changes, grad):
     return -r
 
 
-def test_direction_is_that_of_the_two_loop_recursion(float64):
+def test_direction_equals_the_two_loop_recursion(float64):
     config = LbfgsConfig(memory=4, step_cap=1e9)
-    objective = unlimited(stretched)
+    objective = without_limits(stretch)
     state = lbfgs.init(np.linspace(-1.0, 2.0, 5), config)
     points = [state.point]
     for _ in range(8):
-        state = stepped(objective, state, config)
+        state = step(objective, state, config)
         points.append(state.point)
     points = np.asarray(points)
-    grads = np.asarray(jax.jit(jax.vmap(jax.grad(stretched)))(points))
+    grads = np.asarray(jax.jit(jax.vmap(jax.grad(stretch)))(points))
     steps, changes = np.diff(points[:-1], axis=0)[-4:], np.diff(grads[:-1], axis=0)[-4:]
     expected = two_loop_by_the_book(list(steps), list(changes), grads[-2])
     np.testing.assert_allclose(
@@ -97,11 +97,9 @@ def test_no_step_is_longer_than_the_cap():
     config = LbfgsConfig(step_cap=0.1)
     state = lbfgs.init(jnp.full(5, 50.0), config)
     for _ in range(5):
-        after = stepped(unlimited(stretched), state, config)
-        assert (
-            np.linalg.norm(np.asarray(after.point) - np.asarray(state.point))
-            <= 0.1 * max(config.trial_steps) * 1.001
-        )
+        after = step(without_limits(stretch), state, config)
+        length = np.linalg.norm(np.asarray(after.point) - np.asarray(state.point))
+        assert length <= 0.1 * max(config.trial_steps) * 1.001
         state = after
 
 
@@ -109,15 +107,15 @@ def test_cost_never_rises():
     height = jax.jit(rosenbrock)
     state = lbfgs.init(jnp.full(4, -1.0), LbfgsConfig())
     for _ in range(20):
-        after = stepped(unlimited(rosenbrock), state, LbfgsConfig())
+        after = step(without_limits(rosenbrock), state, LbfgsConfig())
         assert height(after.point) <= height(state.point)
         state = after
 
 
-def test_an_iteration_without_descent_forgets_and_looks_nearer():
+def test_an_iteration_without_descent_empties_the_memory_and_shortens_steps():
     config = LbfgsConfig(trial_steps=(1.0,))
     state = lbfgs.init(jnp.full(3, 1e-3), config)  # a unit step overshoots
-    state = stepped(unlimited(lambda x: jnp.sum(x**2)), state, config)
+    state = step(without_limits(lambda x: jnp.sum(x**2)), state, config)
     np.testing.assert_array_equal(state.step, 0.0)
     assert state.numbers.reach < 1.0
     memory = lbfgs.remember(
@@ -126,8 +124,13 @@ def test_an_iteration_without_descent_forgets_and_looks_nearer():
     np.testing.assert_array_equal(memory.inverse_curvature, 0.0)
 
 
-def test_the_kernel_turns_as_the_plain_path_does():
-    """With room for more pairs than there are, bad pairs, and lanes that did not move."""
+def turn_in_kernel(*args):
+    kernel = turn_kernel(3, 2.0, interpret=True)
+    return kernel(jax.tree.structure(args), [jnp.asarray(x) for x in jax.tree.leaves(args)])
+
+
+def test_the_kernel_computes_the_same_memory_and_direction():
+    """Includes empty slots, pairs of negative curvature, and lanes that did not move."""
     pairs, n, lanes = 3, 5, 32
     random = np.random.default_rng(3)
     curvature = np.logspace(0, 2, n)[:, None]
@@ -143,33 +146,27 @@ def test_the_kernel_turns_as_the_plain_path_does():
     memory = lbfgs.Memory(steps, changes, inverse.astype(np.float32))
     args = memory, step, change, grad
 
-    def plain(memory, step, change, grad):
-        memory = lbfgs.remember(memory, step, change)
-        return memory, lbfgs.search_direction(memory, grad, 2.0)
-
-    expected = jax.jit(jax.vmap(plain, in_axes=-1, out_axes=-1))(*args)
-    kernel = turn_kernel(pairs, 2.0, interpret=True)
-    found = kernel(jax.tree.structure(args), [jnp.asarray(x) for x in jax.tree.leaves(args)])
+    expected = jax.jit(jax.vmap(lbfgs._turn(pairs, 2.0), in_axes=-1, out_axes=-1))(*args)
+    found = turn_in_kernel(*args)
     for ours, theirs in zip(found, jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=1e-6)
 
 
 @pytest.mark.parametrize(("size", "kept"), [(0.0, 0), (1e-30, 0), (np.nan, 0), (1e-15, 3)])
 def test_the_memory_is_kept_while_the_squared_length_of_a_step_is_above_zero(size, kept):
-    """In the kernel too. The change has no positive curvature, so that no pair is added."""
+    """Also in the kernel. The curvature is negative, so that no pair is added."""
     full = lambda value, *shape: jnp.asarray(np.full((*shape, 32), value, np.float32))  # noqa: E731
     memory = lbfgs.Memory(full(1.0, 3, 5), full(1.0, 3, 5), full(0.2, 3))
     args = memory, full(size, 5), full(-1.0, 5), full(1.0, 5)
     plain = remember_all(*args[:3])
-    kernel = turn_kernel(3, 2.0, interpret=True)
-    *steps_and_changes, inverse, _ = kernel(jax.tree.structure(args), jax.tree.leaves(args))
+    *memory, _ = turn_in_kernel(*args)
     np.testing.assert_array_equal((np.asarray(plain.inverse_curvature) != 0.0).sum(axis=0), kept)
-    for ours, theirs in zip((*steps_and_changes, inverse), jax.tree.leaves(plain), strict=True):
+    for ours, theirs in zip(memory, jax.tree.leaves(plain), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
 def test_best_feasible_iterate_is_kept_when_the_minimum_is_infeasible():
-    """Minimum at 0, feasible only beyond 1: the answer lies at or beyond 1."""
+    """The minimum is at 0, and only x >= 1 is feasible."""
 
     def objective(x):
         return Evaluation(cost=jnp.sum(x**2), violation=1.0 - jnp.min(x))
@@ -190,29 +187,25 @@ def end_of(objective, start, **options):
 
 def test_each_recovery_has_its_status():
     start = np.full(4, -0.5, np.float32)
-    infeasible = lambda x: Evaluation(stretched(x), jnp.full((), 0.2, x.dtype))  # noqa: E731
-    assert end_of(unlimited(stretched), start, max_steps=200) is Status.CONVERGED
-    assert end_of(unlimited(rosenbrock), start, max_steps=2) is Status.FEASIBLE
+    infeasible = lambda x: Evaluation(stretch(x), jnp.full((), 0.2, x.dtype))  # noqa: E731
+    assert end_of(without_limits(stretch), start, max_steps=200) is Status.CONVERGED
+    assert end_of(without_limits(rosenbrock), start, max_steps=2) is Status.FEASIBLE
     assert end_of(infeasible, start, max_steps=200) is Status.INFEASIBLE
     assert end_of(infeasible, start, max_steps=1) is Status.MAX_STEPS
     nan = lambda x: jnp.sum(x) * jnp.nan  # noqa: E731
-    assert end_of(unlimited(nan), start, max_steps=5) is Status.NON_FINITE
+    assert end_of(without_limits(nan), start, max_steps=5) is Status.NON_FINITE
 
 
-def test_flat_objective_ends_stationary_and_finite():
-    found = search(unlimited(lambda x: 0.0 * jnp.sum(x) + 1.0), jnp.ones(3), LbfgsConfig())
-    assert found.stationary
-    assert jnp.all(jnp.isfinite(found.point))
-
-
-def test_steps_into_the_undefined_are_not_taken():
-    found = search(unlimited(lambda x: jnp.sum(x - jnp.log(x))), jnp.full(3, 0.2), LONG)
+def test_a_flat_objective_is_stationary_and_steps_to_undefined_costs_are_rejected():
+    found = search(without_limits(lambda x: 0.0 * jnp.sum(x) + 1.0), jnp.ones(3), LbfgsConfig())
+    assert found.stationary and jnp.all(jnp.isfinite(found.point))
+    found = search(without_limits(lambda x: jnp.sum(x - jnp.log(x))), jnp.full(3, 0.2), LONG)
     np.testing.assert_allclose(found.point, 1.0, atol=1e-2)
 
 
 def test_batch_equals_loop_with_unequal_lanes_and_a_broken_one(float64):
     def solve(start, scale):
-        return minimise(unlimited(lambda x: scale * rosenbrock(x)), start, LbfgsConfig(30))
+        return minimise(without_limits(lambda x: scale * rosenbrock(x)), start, LbfgsConfig(30))
 
     starts = np.array([[-0.5, 0.3], [2.0, -1.0], [1.0, 1.0], [0.1, 0.0]], np.float64)
     scales = np.array([1.0, 1e-4, 30.0, np.nan], np.float64)
@@ -227,7 +220,7 @@ def test_batch_equals_loop_with_unequal_lanes_and_a_broken_one(float64):
 
 
 @pytest.mark.parametrize("options", [{"max_steps": -1}, {"memory": 0}])
-def test_impossible_sizes_are_refused(options):
+def test_invalid_sizes_raise(options):
     name = next(iter(options))
     with pytest.raises(ValueError, match=f"{name} must be >= "):
         LbfgsConfig(**options)

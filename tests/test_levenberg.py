@@ -10,7 +10,7 @@ from planner_jax.optimise.levenberg import LevenbergConfig, Model, least_squares
 
 
 def of_residuals(residuals, violation=lambda x: jnp.array(-1.0)):
-    """The model of a function of residuals, its Jacobian by tangents."""
+    """Return the model of residuals, with the Jacobian by tangents."""
 
     def evaluate(x):
         r, slopes = residuals(x), jax.jacfwd(residuals)(x)

@@ -1,4 +1,4 @@
-"""Newton's method in a subspace: closed forms, limit cases, and a batch beside its lanes."""
+"""Newton's method in a subspace: closed forms, limit cases, and a batch against its lanes."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def rosenbrock(x, steepness=100.0):
 
 
 def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
-    """Steps and promise in a subspace, preconditioned by what is kept of the Hessian."""
+    """Return steps and predicted decrease, preconditioned by the part `kept` of the Hessian."""
     matrix = jnp.asarray(matrix, jnp.float32)
 
     def preconditioner(damping):
@@ -46,42 +46,45 @@ def steps_of(matrix, slope, damping, config=WHOLE, kept=None):
     return solve_damped(here, jnp.asarray(damping, jnp.float32), config)
 
 
-@pytest.mark.parametrize("kept", [None, np.diag(np.diag(CURVED))], ids=["nothing", "diagonal"])
+DIAGONAL = np.diag(np.diag(CURVED))
+
+
+@pytest.mark.parametrize("kept", [None, DIAGONAL], ids=["nothing", "diagonal"])
 def test_a_step_in_the_whole_space_is_newtons(kept):
     """Damped by the lane's own damping, and by multiples of the preconditioner's curvature."""
     damping, trials = 0.4, (0.0, 0.7)
     config = NewtonConfig(subspace=3, step_cap=100.0, trial_dampings=trials)
-    steps, promised = steps_of(CURVED, SLOPE, damping, config, kept)
+    steps, predicted = steps_of(CURVED, SLOPE, damping, config, kept)
     beside = damping * np.eye(3) + (0.0 if kept is None else kept)
     own = CURVED + damping * np.eye(3)
     for step, trial in zip(steps, trials, strict=True):
         exact = -np.linalg.solve(own + trial * beside, SLOPE)
         np.testing.assert_allclose(step, exact, rtol=5e-5, atol=5e-6)
-    np.testing.assert_allclose(promised, 0.5 * SLOPE @ np.linalg.solve(own, SLOPE), rtol=1e-5)
+    np.testing.assert_allclose(predicted, 0.5 * SLOPE @ np.linalg.solve(own, SLOPE), rtol=1e-5)
 
 
 def test_without_a_subspace_the_step_is_the_preconditioners():
-    damping, trials, kept = 0.4, (0.0, 0.7), np.diag(np.diag(CURVED))
+    damping, trials, kept = 0.4, (0.0, 0.7), DIAGONAL
     config = NewtonConfig(subspace=0, step_cap=100.0, trial_dampings=trials)
-    steps, promised = steps_of(CURVED, SLOPE, damping, config, kept)
+    steps, predicted = steps_of(CURVED, SLOPE, damping, config, kept)
     exact = -np.linalg.solve(kept + damping * np.eye(3), SLOPE)
     for step, trial in zip(steps, trials, strict=True):
         np.testing.assert_allclose(step, exact / (1.0 + trial), rtol=1e-5)
-    np.testing.assert_allclose(promised, -0.5 * SLOPE @ exact, rtol=1e-5)
+    np.testing.assert_allclose(predicted, -0.5 * SLOPE @ exact, rtol=1e-5)
 
 
-def test_where_the_cost_bends_downward_the_hessian_is_shifted_by_that_much():
+def test_an_indefinite_hessian_is_shifted_by_its_least_eigenvalue():
     bent, damping = CURVED - 4.0 * np.eye(3), 1e-3
     config = NewtonConfig(subspace=3, step_cap=100.0, trial_dampings=(500.0,))
-    steps, promised = steps_of(bent, SLOPE, damping, config)
+    steps, predicted = steps_of(bent, SLOPE, damping, config)
     shift = -np.linalg.eigvalsh(bent)[0]
     exact = -np.linalg.solve(bent + (shift + 500.0 * damping) * np.eye(3), SLOPE)
-    # The least eigenvalue is halved to some thousandths of the interval that must hold it.
+    # Bisection finds the least eigenvalue to some thousandths of its interval.
     np.testing.assert_allclose(steps[0], exact, rtol=5e-3)
-    assert promised > 0.0
+    assert predicted > 0.0
 
 
-def test_a_hessian_that_bends_upward_by_a_millionth_of_its_greatest_is_not_shifted():
+def test_a_positive_eigenvalue_of_a_millionth_of_the_greatest_causes_no_shift():
     steep = np.diag([1.0, 0.3, 1e-6])
     config = NewtonConfig(subspace=3, step_cap=1e9, trial_dampings=(0.0,))
     steps, _ = steps_of(steep, [1.0, -1.0, 1e-4], 1e-9, config, kept=np.diag([0.9, 0.3, 2e-6]))
@@ -95,9 +98,9 @@ def test_a_step_is_no_longer_than_the_cap():
 
 @pytest.mark.parametrize("slope", [np.zeros(3), np.array([0.0, 0.0, 2.0])], ids=["none", "own"])
 def test_a_subspace_that_ends_early_gives_finite_steps(slope):
-    steps, promised = steps_of(np.diag([1.0, 2.0, 4.0]), slope, 1e-6)
+    steps, predicted = steps_of(np.diag([1.0, 2.0, 4.0]), slope, 1e-6)
     np.testing.assert_allclose(steps[0], -slope / [1.0, 2.0, 4.0], atol=1e-5)
-    assert np.isfinite(promised)
+    assert np.isfinite(predicted)
 
 
 def test_a_bowl_takes_one_iteration():
@@ -123,33 +126,35 @@ def test_a_curved_valley_is_followed_to_its_end():
     assert found.stationary
 
 
-def test_a_batch_ends_where_its_lanes_do_and_stragglers_go_on():
+def test_a_batch_equals_its_lanes_and_stragglers_continue():
     starts = jnp.array([[-1.2, 1.0], [0.9, 0.8], [1.5, -0.5], [1.0, 1.0]])
-    config = NewtonConfig(max_steps=3, subspace=2)
     steepness = jnp.array([100.0, 10.0, 50.0, 1.0])
-    lanes = jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, config))(starts.T, steepness)
+
+    def solve(stragglers=None):
+        config = NewtonConfig(max_steps=3, subspace=2, stragglers=stragglers)
+        return jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, config))(starts.T, steepness)
+
+    lanes, config = solve(), NewtonConfig(max_steps=3, subspace=2)
     for k in range(len(starts)):
         alone = minimise(lambda x, k=k: rosenbrock(x, steepness[k]), starts[k], config)
         np.testing.assert_allclose(lanes.point[:, k], alone.point, rtol=1e-4, atol=1e-5)
-    longer = NewtonConfig(max_steps=3, subspace=2, stragglers=(0.5, 40, 1))
-    late = jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, longer))(starts.T, steepness)
-    went_on = np.asarray(late.iterations) > np.asarray(lanes.iterations)
-    assert 1 <= went_on.sum() <= 2
-    assert went_on[np.argmax(lanes.evaluation.cost)]
+    late = solve((0.5, 40, 1))
+    continued = np.asarray(late.iterations) > np.asarray(lanes.iterations)
+    assert 1 <= continued.sum() <= 2
+    assert continued[np.argmax(lanes.evaluation.cost)]
     assert np.all(late.evaluation.cost <= lanes.evaluation.cost)
-    np.testing.assert_allclose(late.evaluation.cost[went_on], 1.0, atol=1e-3)
-    every = NewtonConfig(max_steps=3, subspace=2, stragglers=(0.25, 20, 50))
-    last = jax.jit(lambda s, c: minimise_lanes(rosenbrock, s, c, every))(starts.T, steepness)
+    np.testing.assert_allclose(late.evaluation.cost[continued], 1.0, atol=1e-3)
+    last = solve((0.25, 20, 50))
     np.testing.assert_allclose(last.evaluation.cost, 1.0, atol=1e-3)
     assert last.stationary.all() and (last.iterations <= 3 + 20 * 50).all()
-    # A lane that is there already takes no part.
+    # A lane that starts at its optimum does not continue.
     assert last.iterations[3] == lanes.iterations[3]
 
 
 def by_hessian(cost):
-    """Second derivatives preconditioned by themselves, so that no subspace is needed."""
+    """Return derivatives preconditioned by the Hessian itself, so that no subspace is needed."""
 
-    def curved(x):
+    def expand(x):
         by, hessian = jax.grad(cost)(x), jax.hessian(cost)(x)
 
         def preconditioner(damping):
@@ -158,17 +163,17 @@ def by_hessian(cost):
 
         return Curvature(of_cost(cost)(x), by, lambda: lambda d: hessian @ d, preconditioner)
 
-    return curved
+    return expand
 
 
 def of_cost(cost):
     return lambda x: Evaluation(cost(x), jnp.asarray(-1.0, x.dtype))
 
 
-def test_where_a_limit_begins_just_ahead_the_search_does_not_end_in_front_of_it():
-    """The step that the flat side asks for is a hundred times as long as that to the optimum."""
+def test_the_search_does_not_end_just_before_a_limit():
+    """The Newton step on the flat side is a hundred times the distance to the optimum."""
 
-    def cost(x):  # x = 0.02 is where a steep penalty begins, and the optimum is just behind
+    def cost(x):  # a steep penalty starts at x = 0.02, just before the optimum
         slope = 1e-6 * jnp.sum((x - 2.0) ** 2) + 1e-5
         return slope + 10.0 * jnp.sum(smooth_hinge(x - 0.02, 0.05))
 
@@ -180,22 +185,23 @@ def test_where_a_limit_begins_just_ahead_the_search_does_not_end_in_front_of_it(
     assert found.stationary
     assert found.point[0] > 0.02
     assert abs(float(jax.grad(cost)(found.point)[0])) < 0.1 * abs(float(jax.grad(cost)(start)[0]))
-    # By its short steps alone the search would seem to be at its end.
+    # The short steps alone would look like convergence.
     hasty = minimise(of_cost(cost), start, dataclasses.replace(config, trusted=1e4), curved)
     assert hasty.stationary and hasty.point[0] < 0.02
 
 
-def test_where_costs_say_nothing_steps_go_on_by_the_slope():
+def test_steps_continue_by_the_slope_where_costs_are_equal():
     """All costs are 1 in float32, their slopes are exact."""
 
     def cost(x):
         return 1.0 + 1e-9 * jnp.sum((x - 3.0) ** 2)
 
-    start, curved = jnp.zeros(2), by_hessian(cost)
+    def solve(config):
+        return minimise(of_cost(cost), jnp.zeros(2), config, by_hessian(cost))
+
     config = NewtonConfig(max_steps=8, subspace=0, damping=1e-13, tolerance=1e-12, step_cap=9.0)
-    np.testing.assert_array_equal(minimise(of_cost(cost), start, config, curved).point, 0.0)
-    by_slope = dataclasses.replace(config, slack=4.0)
-    found = minimise(of_cost(cost), start, by_slope, curved)
+    np.testing.assert_array_equal(solve(config).point, 0.0)
+    found = solve(dataclasses.replace(config, slack=4.0))
     np.testing.assert_allclose(found.point, 3.0, rtol=1e-3)
     assert found.stationary
 
@@ -216,6 +222,6 @@ def test_where_costs_say_nothing_steps_go_on_by_the_slope():
         ("stragglers", 0.5, TypeError),
     ],
 )
-def test_a_size_that_cannot_be_meant_is_refused(argument, value, error):
+def test_invalid_settings_raise(argument, value, error):
     with pytest.raises(error, match=argument):
         NewtonConfig(**{argument: value})

@@ -27,12 +27,12 @@ GRAVITY = 9.8
 
 float64 = pytest.mark.usefixtures("float64")
 
-SHAPES = {"smoothed": smooth_hinge, "steep": steep_hinge}
+SHAPES = {"smooth": smooth_hinge, "steep": steep_hinge}
 
 
 @jax.jit
 def penalties(x, width):
-    """Value, first and second derivative of every shape at one x."""
+    """Return value, first and second derivative of every shape at one x."""
     found = {}
     for name, shape in SHAPES.items():
         slope = jax.grad(shape)
@@ -44,43 +44,32 @@ def value_slope_bend(name, points, width=WIDTH):
     return np.array([penalties(x, width)[name] for x in points]).T
 
 
-# Penalty shapes
-
-
 @float64
-def test_the_smoothed_hinge_is_zero_then_a_quartic_then_a_line():
+def test_the_smooth_hinge_is_zero_then_a_quartic_then_a_line():
     x = np.array([-1.0, 0.0, 0.05, 0.1, 0.3])
-    value, slope, _ = value_slope_bend("smoothed", x)
+    value, slope, _ = value_slope_bend("smooth", x)
     blend = (WIDTH - 0.025) * 0.5**3
     np.testing.assert_allclose(value, [0.0, 0.0, blend, 0.05, 0.25], atol=1e-16)
     np.testing.assert_allclose(slope, [0.0, 0.0, 0.5, 1.0, 1.0], atol=1e-14)
 
 
 @float64
-@pytest.mark.parametrize("joint", [0.0, WIDTH])
-def test_the_smoothed_hinge_is_twice_continuously_differentiable_where_it_is_joined(joint):
-    before, after = np.transpose(value_slope_bend("smoothed", joint + np.array([-1e-9, 1e-9])))
-    np.testing.assert_allclose(before, after, atol=1e-6)
-
-
-@float64
-def test_the_smoothed_hinge_never_falls_and_is_never_concave():
-    """Its bend is at most 3 / (2 mu), in the middle of the blend."""
-    value, slope, bend = value_slope_bend("smoothed", np.linspace(-0.0495, 0.2505, 301))
+def test_the_smooth_hinge_is_twice_differentiable_never_falls_and_is_never_concave():
+    """Its second derivative is at most 3 / (2 mu), in the middle of the blend."""
+    for joint in (0.0, WIDTH):
+        before, after = np.transpose(value_slope_bend("smooth", joint + np.array([-1e-9, 1e-9])))
+        np.testing.assert_allclose(before, after, atol=1e-6)
+    value, slope, bend = value_slope_bend("smooth", np.linspace(-0.0495, 0.2505, 301))
     assert np.all(value >= 0.0) and np.all(slope >= 0.0) and np.all(bend >= -1e-12)
     np.testing.assert_allclose(np.max(bend), 1.5 / WIDTH, rtol=1e-3)
 
 
 @float64
-def test_the_steep_hinge_is_as_printed():
+def test_the_steep_hinge_is_as_printed_and_loses_its_slope_at_the_joint():
     """x^3 up to eps, then eps^3 + (x - eps)^2 x / eps^4."""
     x = np.array([-1.0, 0.0, 0.06, 0.1, 0.3])
     printed = [0.0, 0.0, 0.06**3, 1e-3, 1e-3 + 0.2**2 * 0.3 / 1e-4]
     np.testing.assert_allclose(value_slope_bend("steep", x)[0], printed, rtol=1e-12)
-
-
-@float64
-def test_the_printed_steep_hinge_is_continuous_and_loses_its_slope_at_the_joint():
     value, slope, _ = value_slope_bend("steep", WIDTH + np.array([-1e-12, 1e-12]))
     np.testing.assert_allclose(value, WIDTH**3, atol=1e-12)
     np.testing.assert_allclose(slope, [3.0 * WIDTH**2, 0.0], atol=1e-8)
@@ -95,19 +84,11 @@ def test_penalties_and_their_slopes_are_finite_and_not_negative_in_float32(name)
     assert np.all(value >= 0.0) and np.all(slope >= 0.0)
 
 
-def sum_of_penalties(point):
-    x, width = point
-    shapes = (smooth_hinge, steep_hinge)
-    return sum(jnp.sum(shape(x, width)) for shape in shapes)
-
-
 @float64
 def test_penalty_gradients_match_finite_differences():
     x = np.array([-0.3, 0.03, 0.08, 0.13, 0.5])
-    assert_gradient_matches_differences(sum_of_penalties, (x, WIDTH), step=1e-6, rtol=1e-6)
-
-
-# Quadrature
+    total = lambda point: sum(jnp.sum(shape(*point)) for shape in SHAPES.values())  # noqa: E731
+    assert_gradient_matches_differences(total, (x, WIDTH), step=1e-6, rtol=1e-6)
 
 
 @pytest.mark.parametrize("num", [1, 2, 7])
@@ -130,36 +111,34 @@ def test_joined_weights_are_those_of_the_pieces_with_shared_ends_added():
     np.testing.assert_allclose(join_trapezoid_weights(4, shares), separate, rtol=1e-15)
 
 
-# Limits
-
-
 def limits():
     values = {"speed": 5.0, "acceleration": 15.0, "body_rate": 4.0, "min_height": 0.25}
     return QuadrotorLimits(**{name: np.array(value) for name, value in values.items()})
 
 
-# Each limit with a motion (acceleration, jerk, or what it takes) that meets it exactly:
-# |(3, 0, 4)| = 5; |(10, -5, 10)| = 15; a jerk of 4 g across the thrust in hover is 4 rad/s.
-BOUND = {
-    "speed": (lambda k, limits: speed_excess(k * np.array([3.0, 0.0, 4.0]), limits)),
-    "acceleration": (
-        lambda k, limits: acceleration_excess(k * np.array([10.0, -5.0, 10.0]), limits)
-    ),
-    "body rate": (
-        lambda k, limits: body_rate_excess(
-            np.zeros(3), k * np.array([0.0, 4.0 * GRAVITY, 0.0]), GRAVITY, limits
-        )
+# Motions that meet each limit exactly for k = 1: |(3, 0, 4)| = 5; |(10, -5, 10)| = 15; a jerk of
+# 4 g across the thrust in hover is 4 rad/s.
+AT_LIMIT = {
+    "speed": lambda k: speed_excess(k * np.array([3.0, 0.0, 4.0]), limits()),
+    "acceleration": lambda k: acceleration_excess(k * np.array([10.0, -5.0, 10.0]), limits()),
+    "body rate": lambda k: body_rate_excess(
+        np.zeros(3), k * np.array([0.0, 4.0 * GRAVITY, 0.0]), GRAVITY, limits()
     ),
 }
 
 
 @float64
-@pytest.mark.parametrize("name", BOUND)
+@pytest.mark.parametrize("name", AT_LIMIT)
 def test_the_excess_is_zero_at_the_limit_and_the_square_of_the_share_less_one(name):
     shares = np.array([0.0, 0.5, 1.0, 2.0])
-    excess = jax.jit(jax.vmap(BOUND[name], in_axes=(0, None)))(shares, limits())
+    excess = jax.jit(jax.vmap(AT_LIMIT[name]))(shares)
     np.testing.assert_allclose(excess, shares**2 - 1.0, atol=1e-14)
     np.testing.assert_allclose(relative(excess), shares - 1.0, atol=1e-6)
+
+
+def squared_excesses(limits, vel, acc, jerk):
+    rate = body_rate_excess(acc, jerk, GRAVITY, limits)
+    return speed_excess(vel, limits), acceleration_excess(acc, limits), rate
 
 
 def test_the_ground_is_exceeded_in_metres_from_below():
@@ -172,23 +151,18 @@ def test_gradients_are_finite_at_zero_speed_in_hover_and_near_free_fall():
     still = np.zeros(3, np.float32)
     fall = np.array([0.0, 0.0, -GRAVITY], np.float32)
 
-    def everything(vel, acc, jerk):
-        rate = body_rate_excess(acc, jerk, GRAVITY, limits())
-        squares = speed_excess(vel, limits()), acceleration_excess(acc, limits()), rate
+    def total(vel, acc, jerk):
+        squares = squared_excesses(limits(), vel, acc, jerk)
         return sum(squares) + sum(map(relative, squares))
 
-    gradient = jax.jit(jax.grad(everything, argnums=(0, 1, 2)))
+    gradient = jax.jit(jax.grad(total, argnums=(0, 1, 2)))
     for acc in (still, fall, fall + np.float32(1e-4)):
         assert all(np.all(np.isfinite(leaf)) for leaf in gradient(still, acc, still))
 
 
 def all_excesses(point):
-    limits, vel, acc, jerk, height = point
-    squares = (
-        speed_excess(vel, limits),
-        acceleration_excess(acc, limits),
-        body_rate_excess(acc, jerk, GRAVITY, limits),
-    )
+    limits, *motion, height = point
+    squares = squared_excesses(limits, *motion)
     return sum(jnp.sum(relative(x) + x) for x in squares) + jnp.sum(ground_excess(height, limits))
 
 
@@ -197,9 +171,6 @@ def test_limit_gradients_match_finite_differences_in_motion_and_limits():
     vel, acc, jerk = np.random.default_rng(0).normal(scale=(3.0, 5.0, 20.0), size=(4, 3, 3)).T
     point = (limits(), vel.T, acc.T, jerk.T, np.array([0.1, 0.5, 2.0]))
     assert_gradient_matches_differences(all_excesses, point, rtol=1e-6)
-
-
-# Contact
 
 
 @float64

@@ -1,4 +1,4 @@
-"""Files of plans: written whole, read as they were, and refused in one line if they are not."""
+"""Files of plans: written whole, read bit for bit, and rejected in one line if damaged."""
 
 import json
 import zipfile
@@ -16,7 +16,6 @@ from planner_jax.task.hit.plan import HitPlan
 
 @pytest.fixture(scope="module")
 def plans():
-    """Three plans that nobody has to make."""
     lanes = np.arange(3.0, dtype=np.float32)
     vectors = np.stack([lanes, -lanes, lanes / 3.0], axis=1)
     return HitPlan(
@@ -39,25 +38,19 @@ def path(plans, tmp_path):
     return path
 
 
-def rewritten(path, change):
-    """The file with its arrays changed."""
+def rewrite(path, change):
+    """Change the arrays of a file."""
     with np.load(path) as file:
         arrays = dict(file)
     change(arrays)
     with path.open("wb") as file:
         np.savez(file, **arrays)
-    return path
 
 
-def header(**fields):
-    return np.array(json.dumps({"version": 1, "class": "HitPlan", **fields}))
-
-
-def assert_refused(kind, path, says):
-    with pytest.raises(PlanFileError, match=says) as caught:
+def assert_rejected(path, rule, kind=HitPlan):
+    with pytest.raises(PlanFileError, match=rule) as caught:
         kind.load(path)
-    assert "\n" not in str(caught.value)
-    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
 def test_what_is_read_is_what_was_written_bit_for_bit(plans, path):
@@ -96,74 +89,71 @@ def test_a_write_that_fails_leaves_the_old_file_as_it_was(plans, path):
     assert [file.name for file in path.parent.iterdir()] == ["three"]
 
 
-def test_a_file_that_is_not_there_or_is_a_folder(tmp_path):
-    assert_refused(HitPlan, tmp_path / "nothing", "path must be a file of plans, got")
-    assert_refused(HitPlan, tmp_path, "path must be a whole file of plans, got")
+DAMAGED = "path must be a whole file of plans, got"
+
+
+def test_a_missing_file_and_a_folder_are_rejected(tmp_path):
+    assert_rejected(tmp_path / "nothing", "path must be a file of plans, got")
+    assert_rejected(tmp_path, DAMAGED)
 
 
 @pytest.mark.parametrize(
     "content", [b"", b"serve,landing\n1,2\n", b"PK\x03\x04 and no more", b"\x93NUMPY\x01\x00"]
 )
-def test_a_file_of_something_else(tmp_path, content):
+def test_a_file_with_other_content_is_rejected(tmp_path, content):
     path = tmp_path / "other"
     path.write_bytes(content)
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got")
+    assert_rejected(path, DAMAGED)
+    np.save(path.with_suffix(".npy"), np.zeros(3))
+    assert_rejected(path.with_suffix(".npy"), DAMAGED)
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.95, 0.999])
-def test_a_file_that_is_cut_off(path, share):
+def test_a_truncated_file_is_rejected(path, share):
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got")
+    assert_rejected(path, DAMAGED)
 
 
-def test_a_file_with_a_byte_that_has_changed(path):
+def test_a_file_with_a_changed_byte_is_rejected(path):
     with zipfile.ZipFile(path) as file:
-        place = file.getinfo("trajectory.coeffs.npy").header_offset + 400
+        offset = file.getinfo("trajectory.coeffs.npy").header_offset + 400
     content = bytearray(path.read_bytes())
-    content[place] ^= 0xFF
+    content[offset] ^= 0xFF
     path.write_bytes(content)
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got .*BadZipFile")
+    assert_rejected(path, f"{DAMAGED} .*BadZipFile")
 
 
-def test_a_single_array(tmp_path):
-    path = tmp_path / "array.npy"
-    np.save(path, np.zeros(3))
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got")
-
-
-def test_arrays_without_a_header_or_with_a_strange_one(path):
-    for strange in ("no json", "[1, 2]", "3", '{"version": 1}'):
-        rewritten(path, lambda arrays, text=strange: arrays.update(header=np.array(text)))
-        assert_refused(HitPlan, path, "path must be a whole file of plans, got")
-    rewritten(path, lambda arrays: arrays.pop("header"))
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got")
+@pytest.mark.parametrize("header", [None, "no json", "[1, 2]", "3", '{"version": 1}'])
+def test_a_missing_or_malformed_header_is_rejected(path, header):
+    rewrite(path, lambda arrays: arrays.pop("header"))
+    if header is not None:
+        rewrite(path, lambda arrays: arrays.update(header=np.array(header)))
+    assert_rejected(path, DAMAGED)
 
 
 @pytest.mark.parametrize("kind", [CatchPlan, QuadrotorPlan, pj.Plan])
-def test_a_file_of_another_class(path, kind):
-    says = f"path must be a file of {kind.__name__} of version 1, got HitPlan of version 1 in"
-    assert_refused(kind, path, says)
+def test_a_file_of_another_class_is_rejected(path, kind):
+    rule = f"path must be a file of {kind.__name__} of version 1, got HitPlan of version 1 in"
+    assert_rejected(path, rule, kind)
 
 
-def test_a_file_of_another_version(path):
-    rewritten(path, lambda arrays: arrays.update(header=header(version=2)))
-    assert_refused(HitPlan, path, "of HitPlan of version 1, got HitPlan of version 2 in")
+def test_a_file_of_another_version_is_rejected(path):
+    header = np.array(json.dumps({"version": 2, "class": "HitPlan"}))
+    rewrite(path, lambda arrays: arrays.update(header=header))
+    assert_rejected(path, "of HitPlan of version 1, got HitPlan of version 2 in")
 
 
 @pytest.mark.parametrize("name", ["cost", "stroke.normal", "trajectory.durations"])
-def test_a_field_that_is_missing_is_named(path, name):
-    rewritten(path, lambda arrays: arrays.pop(name))
-    assert_refused(HitPlan, path, f"path must hold {name}, got")
-
-
-def test_an_array_too_many_is_named(path):
-    rewritten(path, lambda arrays: arrays.update(wind=np.zeros(3)))
-    assert_refused(HitPlan, path, "path must not hold wind, got")
+def test_a_missing_field_and_an_unknown_array_are_named(path, name):
+    rewrite(path, lambda arrays: arrays.update(wind=np.zeros(3)))
+    assert_rejected(path, "path must not hold wind, got")
+    rewrite(path, lambda arrays: arrays.pop(name))
+    assert_rejected(path, f"path must hold {name}, got")
 
 
 class Trap:
-    """Says when it is unpickled."""
+    """Records when it is unpickled."""
 
     sprung: list = []
 
@@ -173,6 +163,6 @@ class Trap:
 
 @pytest.mark.parametrize("name", ["cost", "header"])
 def test_a_file_is_never_unpickled(path, name):
-    rewritten(path, lambda arrays: arrays.update({name: np.array([Trap()], object)}))
-    assert_refused(HitPlan, path, "path must be a whole file of plans, got .*ValueError")
+    rewrite(path, lambda arrays: arrays.update({name: np.array([Trap()], object)}))
+    assert_rejected(path, f"{DAMAGED} .*ValueError")
     assert not Trap.sprung

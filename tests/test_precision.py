@@ -1,4 +1,4 @@
-"""Matrix products ask for full float32 precision, which a GPU does not give unasked."""
+"""Matrix products request full float32 precision, which a GPU does not use by default."""
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +28,7 @@ def custom_derivative(product):
 
 
 def proportional_values(rows, offsets, duration):
-    """One number of everything that the maps of fixed proportions give."""
+    """Return the sum of all numbers that the maps of fixed proportions compute."""
     args = proportional_minco(4, (1.0,) * 4), rows, offsets, duration
     parts = (
         proportional_trajectory(*args),
@@ -36,9 +36,6 @@ def proportional_values(rows, offsets, duration):
         trajectory_energy(*args),
     )
     return sum(jnp.sum(leaf) for leaf in jax.tree.leaves(parts))
-
-
-# The check itself
 
 
 NESTED = {
@@ -64,9 +61,6 @@ def test_a_product_of_less_precision_is_found_wherever_it_hides(nest):
         less = lambda a, b, p=precision: jnp.matmul(a, b, precision=p)  # noqa: E731
         with pytest.raises(AssertionError, match="dot_general of .* asks for precision"):
             assert_full_precision(nest(less), MATRIX, MATRIX)
-
-
-# The library
 
 
 def test_the_equal_duration_maps_and_their_gradients_ask_for_full_precision():

@@ -1,4 +1,4 @@
-"""Names of tasks, planners and suites, the library's own and those of other packages."""
+"""Names of tasks, planners and suites, of the library and of other packages."""
 
 import pickle
 import subprocess
@@ -48,7 +48,7 @@ def low(height=0.8):
 
 @pytest.fixture
 def others(tmp_path, monkeypatch):
-    """Writes a package with these entry points, {group: {name: object}}, onto the path."""
+    """Write a package with these entry points, {group: {name: object}}, onto the path."""
     (tmp_path / "planner_jax_others.py").write_text(MODULE)
     folder = tmp_path / "planner_jax_others-1.0.dist-info"
     folder.mkdir()
@@ -56,15 +56,11 @@ def others(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
     def install(**groups):
-        lines = [
-            line
-            for group, entries in groups.items()
-            for line in (
-                f"[planner_jax.{group}]",
-                *(f"{name} = {place}" for name, place in entries.items()),
-            )
-        ]
-        (folder / "entry_points.txt").write_text("\n".join(lines) + "\n")
+        text = ""
+        for group, entries in groups.items():
+            text += f"[planner_jax.{group}]\n"
+            text += "".join(f"{name} = {place}\n" for name, place in entries.items())
+        (folder / "entry_points.txt").write_text(text)
         all_tasks.cache_clear()
 
     yield install
@@ -72,65 +68,54 @@ def others(tmp_path, monkeypatch):
     sys.modules.pop("planner_jax_others", None)
 
 
-def assert_one_line(call, says, kind=UnknownName):
-    with pytest.raises(kind, match=says) as caught:
+def assert_one_line(call, rule, kind=UnknownName):
+    with pytest.raises(kind, match=rule) as caught:
         call()
     assert "\n" not in str(caught.value)
 
 
-# What the library has.
+TASKS = ["hit", "catch", "intercept", "group", "block"]
 
 
-def test_the_library_has_three_tasks_that_name_themselves():
-    assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block"]
+def test_tasks_of_the_library_have_their_names_and_summaries():
+    assert list(all_tasks()) == TASKS
     for name, task in all_tasks().items():
-        assert task_named(name) is task
-        assert task.name == name
+        assert task_named(name) is task and task.name == name
         assert task.summary[0].islower() and not task.summary.endswith(".")
 
 
-@pytest.mark.parametrize("name", ["hit", "catch", "intercept", "group", "block"])
+@pytest.mark.parametrize("name", TASKS)
 def test_every_planner_of_a_task_can_be_made_and_the_first_is_the_default(name):
     task = task_named(name)
     for planner in task.all_planners().keys() - task.from_file.keys():
         assert task.make_planner(planner, {}).attempts
     first = next(iter(task.planners))
     assert task.planner() == task.planner(first)
-    made = task.planner()
-    assert made.inner == task.make_planner(first, {})
+    assert task.planner().inner == task.make_planner(first, {})
 
 
-def test_unknown_names_are_told_in_one_line_which_there_are():
-    assert_one_line(
-        lambda: task_named("juggle"),
-        "^task must be one of hit, catch, intercept, group, block, got 'juggle'$",
-    )
-    assert_one_line(
-        lambda: pj.hit.planner("mpp"),
-        "^planner must be one of exact, bat, bat-lite, juggle, got 'mpp'$",
-    )
-    assert_one_line(
-        lambda: pj.catch.planner("bat"), "^planner must be one of exact, catch, mpp, got 'bat'$"
-    )
-    assert_one_line(
-        lambda: pj.catch.planner(decide="late"),
-        "^decide must be one of best, greedy, random, given, policy, got 'late'$",
-    )
-    assert_one_line(
-        lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"
-    )
-    assert_one_line(
-        lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, swarm12, got 'rain'$"
-    )
+@pytest.mark.parametrize(
+    ("call", "rule"),
+    [
+        (lambda: task_named("juggle"), "^task must be one of hit, .*, group, block, got 'juggle'$"),
+        (lambda: pj.hit.planner("mpp"), "^planner must be one of exact, bat, .*, got 'mpp'$"),
+        (lambda: pj.catch.planner("bat"), "^planner must be one of exact, catch, mpp, got 'bat'$"),
+        (
+            lambda: pj.catch.planner(decide="late"),
+            "^decide must be one of best, greedy, random, given, policy, got 'late'$",
+        ),
+        (lambda: pj.hit.draw(1, "S.7"), r"^suite must be one of court, S\.1, .*, got 'S\.7'$"),
+        (lambda: pj.catch.draw(1, "rain"), "^suite must be one of throws, .*, got 'rain'$"),
+    ],
+)
+def test_the_error_for_an_unknown_name_lists_the_known_names_in_one_line(call, rule):
+    assert_one_line(call, rule)
     assert issubclass(UnknownName, ValueError)
 
 
-# What other packages have.
-
-
-def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
+def test_a_task_of_another_package_comes_after_the_librarys_own(others):
     others(tasks={"meet": "planner_jax_others:TASK"})
-    assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block", "meet"]
+    assert list(all_tasks()) == [*TASKS, "meet"]
     task = pj.task_named("meet")
     assert task.summary == "two quadrotors meet"
     assert task.case.__doc__ == "A case."
@@ -138,7 +123,7 @@ def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
 
 
 @pytest.mark.parametrize(
-    ("place", "says"),
+    ("place", "problem"),
     [
         ("planner_jax_others:NOTHING", "left out: AttributeError: .*NOTHING"),
         ("planner_jax_nowhere:TASK", "left out: ModuleNotFoundError: .*planner_jax_nowhere"),
@@ -146,22 +131,26 @@ def test_a_task_of_another_package_stands_behind_the_librarys_own(others):
         ("planner_jax_others:MISNAMED", "left out: it is not a Task of that name, got Task"),
     ],
 )
-def test_a_task_that_does_not_work_is_warned_about_and_the_others_do(others, place, says):
+def test_a_broken_task_is_left_out_with_a_warning(others, place, problem):
     others(tasks={"broken": place, "meet": "planner_jax_others:TASK"})
-    with pytest.warns(UserWarning, match=f"^task 'broken' of {place} is {says}") as told:
-        assert list(all_tasks()) == ["hit", "catch", "intercept", "group", "block", "meet"]
-    assert len(told) == 1 and "\n" not in str(told[0].message)
+    with pytest.warns(UserWarning, match=f"^task 'broken' of {place} is {problem}") as warned:
+        assert list(all_tasks()) == [*TASKS, "meet"]
+    assert len(warned) == 1 and "\n" not in str(warned[0].message)
     assert pj.task_named("hit").draw(1).batch_shape == (1,)
 
 
-def test_a_task_of_a_name_that_is_taken_is_left_out(others):
-    others(tasks={"hit": "planner_jax_others:THEIRS"})
-    says = "^task 'hit' .* left out: the name is taken by planner_jax.task.hit$"
-    with pytest.warns(UserWarning, match=says):
+def test_a_task_and_a_planner_with_a_used_name_are_left_out(others):
+    others(
+        tasks={"hit": "planner_jax_others:THEIRS"}, planners={"hit.exact": "planner_jax_others:low"}
+    )
+    problem = "^task 'hit' .* left out: the name is taken by planner_jax.task.hit$"
+    with pytest.warns(UserWarning, match=problem):
         assert all_tasks()["hit"].home == "planner_jax.task.hit"
+    with pytest.warns(UserWarning, match="planners 'hit.exact' .* left out, as the name is taken"):
+        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
 
 
-def test_of_two_packages_with_a_task_of_one_name_the_first_stays(others, tmp_path, monkeypatch):
+def test_the_first_of_two_tasks_of_one_name_is_used(others, tmp_path, monkeypatch):
     others(tasks={"meet": "planner_jax_others:TASK"})
     second = tmp_path / "second"
     folder = second / "more_others-1.0.dist-info"
@@ -186,21 +175,13 @@ def test_a_planner_of_another_package_is_made_by_its_name(others):
     assert pj.hit.judge(pj.hit.draw(2), plans).success.shape == (2,)
 
 
-def test_a_planner_of_a_name_that_is_taken_is_left_out(others):
-    others(planners={"hit.exact": "planner_jax_others:low"})
-    with pytest.warns(
-        UserWarning, match="planners 'hit.exact' .* is left out, as the name is taken"
-    ):
-        assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
-
-
-def test_a_planner_that_cannot_be_loaded_says_so_when_it_is_asked_for(others):
+def test_a_planner_that_cannot_be_loaded_raises_only_when_it_is_requested(others):
     others(planners={"hit.mine": "planner_jax_nowhere:low"})
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert type(pj.hit.planner("exact")).__name__ == "ExactHit"
-    says = "^hit.mine of planner_jax_nowhere:low must be one that can be loaded, got Module"
-    assert_one_line(lambda: pj.hit.planner("mine"), says)
+    rule = "^hit.mine of planner_jax_nowhere:low must be one that can be loaded, got Module"
+    assert_one_line(lambda: pj.hit.planner("mine"), rule)
 
 
 def test_a_suite_of_another_package_is_drawn_by_its_name(others):
@@ -220,9 +201,7 @@ def test_names_are_listed_without_jax():
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
-def test_a_missing_extra_is_installed_from_the_checkout_or_else_from_the_index(
-    monkeypatch, tmp_path
-):
+def test_a_missing_extra_is_installed_from_the_checkout_or_the_index(monkeypatch, tmp_path):
     assert errors.install_line("view") == "pip install -c constraints.txt -e '.[view]'"
     monkeypatch.setattr(errors, "__file__", str(tmp_path / "planner_jax" / "core" / "errors.py"))
     assert errors.install_line("view") == "pip install 'planner-jax[view]'"

@@ -1,4 +1,4 @@
-"""Adjoint gradients of plans: closed form, finite differences, and lanes apart."""
+"""Adjoint gradients of plans: closed form, finite differences, and independence of lanes."""
 
 import dataclasses
 import functools
@@ -9,17 +9,14 @@ import numpy as np
 import pytest
 from flax import struct
 
+import planner_jax as pj
 from planner_jax.core.protocol import Plan
 from planner_jax.optimise.implicit import newton_refine, optimal_plan
 from planner_jax.optimise.inverse_kernel import inverse_kernel
 from planner_jax.optimise.multistart import minimise
 from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.preconditioner import positive_inverse
-from planner_jax.optimise.sensitivity import (
-    _with_part,
-    gradient_at,
-    part_of,
-)
+from planner_jax.optimise.sensitivity import _with_part, gradient_at, part_of
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
 from planner_jax.planning.decided import first_choice
 from planner_jax.planning.gradient import gradient
@@ -28,6 +25,7 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.suites import generate_serves, to_cases
+from tests.derivatives import double
 
 CURVED = np.array([[3.0, 1.0, 0.2], [1.0, 2.0, 0.0], [0.2, 0.0, 1.0]])
 
@@ -66,14 +64,14 @@ class BowlPlanner(OptimisedPlanner):
         return jnp.arange(num)[:, None] + 0.0 * context["force"]
 
     def objective(self, point, context):
-        curved = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))
-        return Evaluation(curved - jnp.sum(point * context["force"]), -jnp.ones(()))
+        energy = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))
+        return Evaluation(energy - jnp.sum(point * context["force"]), -jnp.ones(()))
 
     def decode(self, point, context):
         return BowlPlan(point=point, **pending(-jnp.ones(())))
 
 
-def squared(plan):
+def square(plan):
     return jnp.sum(plan.point**2)
 
 
@@ -85,7 +83,7 @@ def bowls(float64):
 
 @pytest.mark.parametrize("options", [{"steps": 3}, {"steps": 1, "curvature": "whole"}])
 def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
-    found = gradient(BowlPlanner(), bowls, of=squared, by=("b", "k"), **options)
+    found = gradient(BowlPlanner(), bowls, of=square, by=("b", "k"), **options)
     inverse = np.linalg.inv(CURVED)
     best = (bowls.b + bowls.k[:, None] * np.eye(3)[0]) @ inverse
     np.testing.assert_allclose(found.plans.point, best, atol=1e-6)
@@ -95,35 +93,26 @@ def test_gradient_of_a_quadratic_is_the_closed_form(bowls, options):
     assert np.all(found.residual < 1e-6)
 
 
-def test_where_the_cost_curves_downward_there_is_no_gradient(bowls):
-    """At a saddle the theorem has no minimum to follow; the direct part would be a false zero."""
-    upside_down = dataclasses.replace(BowlPlanner(), weight=-1.0)
-    first = (Round(1, LbfgsConfig(max_steps=0)),)
-    found = gradient(
-        dataclasses.replace(upside_down, rounds=first), bowls, of=lambda plan: plan.point[0], by="b"
-    )
-    assert np.isnan(found.by["b"]).all()
-    assert np.isnan(found.residual).all()
+def test_the_gradient_is_nan_where_the_hessian_is_not_positive(bowls):
+    """A maximum has no derivative as a minimum; the direct part alone would be zero."""
+    planner = BowlPlanner(weight=-1.0, rounds=(Round(1, LbfgsConfig(max_steps=0)),))
+    found = gradient(planner, bowls, of=lambda plan: plan.point[0], by="b")
+    assert np.isnan(found.by["b"]).all() and np.isnan(found.residual).all()
 
 
 def test_gradient_of_the_cost_needs_no_adjoint(bowls):
     found = gradient(BowlPlanner(), bowls, of="cost", by=("b",), steps=0)
     np.testing.assert_allclose(found.by["b"], -found.plans.point, atol=1e-12)
     np.testing.assert_allclose(found.value, found.plans.cost, atol=1e-12)
-
-
-def test_one_name_need_not_be_in_a_list(bowls):
-    one, listed = (gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0) for by in ("b", ["b"]))
-    np.testing.assert_array_equal(one.by["b"], listed.by["b"])
-
-
-def test_an_optimal_plan_is_of_one_case(bowls):
-    with pytest.raises(ValueError, match=r"must be one case, got batch shape \(5,\)"):
-        optimal_plan(BowlPlanner(), bowls)
+    for by in ("b", ["b"]):  # one name, or a list
+        again = gradient(BowlPlanner(), bowls, of="cost", by=by, steps=0)
+        np.testing.assert_array_equal(again.by["b"], found.by["b"])
 
 
 def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
-    """u = A^-1 (b + k e_0): the slopes of u by b are A^-1, those by k its first column."""
+    """u = A^-1 (b + k e_0): du/db is A^-1, and du/dk its first column."""
+    with pytest.raises(ValueError, match=r"must be one case, got batch shape \(5,\)"):
+        optimal_plan(BowlPlanner(), bowls)
     bowl = jax.tree.map(lambda leaf: jnp.asarray(leaf[0]), bowls)
     inverse = np.linalg.inv(CURVED)
     point_of = lambda bowl: optimal_plan(BowlPlanner(), bowl).point  # noqa: E731
@@ -134,14 +123,14 @@ def test_an_optimal_plan_has_the_same_gradient_forward_and_backward(bowls):
         np.testing.assert_allclose(by_k, inverse[:, 0], atol=1e-9)
 
 
-def test_a_batch_is_its_lanes_and_a_broken_lane_spoils_no_other(bowls):
+def test_a_batch_equals_its_lanes_and_a_broken_lane_affects_no_other(bowls):
     b = bowls.b.copy()
     b[2] = np.nan
-    found = gradient(BowlPlanner(), bowls.replace(b=b), of=squared, by="b", steps=2)
+    found = gradient(BowlPlanner(), bowls.replace(b=b), of=square, by="b", steps=2)
     assert np.isnan(found.by["b"][2]).all() and found.plans.point.shape == (5, 3)
     for lane in (0, 1, 3, 4):
         one = jax.tree.map(lambda leaf, k=lane: leaf[k], bowls)
-        alone = gradient(BowlPlanner(), one, of=squared, by="b", steps=2)
+        alone = gradient(BowlPlanner(), one, of=square, by="b", steps=2)
         np.testing.assert_allclose(found.by["b"][lane], alone.by["b"], rtol=1e-9)
 
 
@@ -176,103 +165,69 @@ def test_the_kernel_gives_the_same_inverses():
         ({"curvature": "none"}, "curvature must be one of products, whole, got 'none'"),
     ],
 )
-def test_what_is_wrong_is_named(bowls, options, line):
-    asked = {"of": "cost", "by": ("b",), **options}
+def test_invalid_arguments_are_named(bowls, options, line):
     with pytest.raises(ValueError, match=line):
-        gradient(BowlPlanner(), bowls, **asked)
+        gradient(BowlPlanner(), bowls, **{"of": "cost", "by": ("b",), **options})
 
 
-def first(lanes):
-    """The first lane, in float64."""
-
-    def leaf(x):
-        x = jnp.asarray(x)[0]
-        return x.astype(jnp.float64) if jnp.issubdtype(x.dtype, jnp.floating) else x
-
-    return jax.tree.map(leaf, lanes)
+def late_serve():
+    """Return a late serve under weak limits, which are active."""
+    return to_cases(generate_serves(8, 3)[1:2], delay=0.4, limit_scale=0.7, dtype=jnp.float64)
 
 
-def hit_case():
-    """A serve planned late under weak limits, which press."""
-    serves = generate_serves(8, 3)[1:2]
-    return to_cases(serves, delay=0.4, limit_scale=0.7, dtype=jnp.float64)
-
-
-def easy_hit_case():
-    """A serve with time and strength to spare."""
+def easy_serve():
+    """Return a serve without active limits."""
     return to_cases(generate_serves(8, 5)[1:2], dtype=jnp.float64)
 
 
-def catch_case():
-    """A throw whose first guess is made by the decision."""
+def throw():
+    """Return a throw whose first guess is made by the decision."""
     return first_choice(Greedy(), draw(1, "throws", 3))
 
 
-PIECES = (0.2, 0.5, 1.0, 1.0, 1.0, 1.0)
-CASES = {
-    "hit": (
-        ExactHit(proportions=PIECES),
-        hit_case,
-        "stroke.time",
-        {"racket_height": 1e-3, "drag": 1e-4, "limits.body_rate": 1e-3},
-        {"curvature": "whole"},
-    ),
-    "hit by products": (
-        ExactHit(proportions=PIECES),
-        hit_case,
-        "stroke.time",
-        {"racket_height": 1e-3, "limits.body_rate": 1e-3},
-        {},
-    ),
-    "hit that no limit holds back": (
-        ExactHit(proportions=PIECES),
-        easy_hit_case,
-        "stroke.time",
-        {"racket_height": 1e-3, "drag": 1e-4},
-        {},
-    ),
-    "catch": (
-        ExactCatch(),
-        catch_case,
-        lambda plan: plan.times[-1],
-        {"net.height": 1e-3, "gravity": 1e-3, "limits.speed": 1e-3},
-        {"curvature": "whole"},
-    ),
+HIT = ExactHit(proportions=(0.2, 0.5, 1.0, 1.0, 1.0, 1.0))
+TIMES = {HIT: lambda plan: plan.stroke.time, ExactCatch(): lambda plan: plan.times[-1]}
+HEIGHT, RATE, DRAG = {"racket_height": 1e-3}, {"limits.body_rate": 1e-3}, {"drag": 1e-4}
+THROW = {"net.height": 1e-3, "gravity": 1e-3, "limits.speed": 1e-3}
+CASES = {  # planner, case, steps of the differences by places in the case, options
+    "hit": (HIT, late_serve, HEIGHT | DRAG | RATE, {"curvature": "whole"}),
+    "hit by products": (HIT, late_serve, HEIGHT | RATE, {}),
+    "hit without active limits": (HIT, easy_serve, HEIGHT | DRAG, {}),
+    "catch": (ExactCatch(), throw, THROW, {"curvature": "whole"}),
 }
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_gradient_at_an_optimum_is_that_of_plans_solved_anew(name, float64):
-    planner, make, quantity, steps, options = CASES[name]
-    case = first(make())
-    search = LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
+def test_the_gradient_at_an_optimum_matches_differences_of_optima(name, float64):
+    planner, make, steps, options = CASES[name]
+    case, quantity = double(pj.take(make(), 0)), TIMES[planner]
+    config = LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
 
     def objective_of(case):
         context = planner.prepare(case)
         return context, lambda x: planner.objective(x, context)
 
     @jax.jit
-    def solved(case, point):
-        """From a point near the optimum: Newton's method alone."""
+    def refine(case, point):
+        """Move a point near the optimum to it, and return the number of the plan."""
         context, objective = objective_of(case)
         point, _ = newton_refine(objective, point, max_steps=60, stationarity=1e-15)
-        plan = planner.decode(point, context)
-        return point, quantity(plan) if callable(quantity) else plan.stroke.time
+        return point, quantity(planner.decode(point, context))
 
     @jax.jit
-    def searched(case):
+    def search(case):
         context, objective = objective_of(case)
-        return minimise(objective, planner.guesses(context, 1)[0], search).point
+        return minimise(objective, planner.guesses(context, 1)[0], config).point
 
-    point, value = solved(case, searched(case))
+    point, value = refine(case, search(case))
     take = functools.partial(gradient_at, planner, quantity=quantity, by=tuple(steps), **options)
     found = jax.jit(take)(case, point)
     np.testing.assert_allclose(found.value, value, rtol=1e-12)
     for place, step in steps.items():
         here = part_of(case, place)
         ahead, behind = (
-            solved(_with_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
+            refine(_with_part(case, place, here + sign * step), point)[1] for sign in (1.0, -1.0)
         )
         numeric = (ahead - behind) / (2.0 * step)
         np.testing.assert_allclose(found.by[place], numeric, rtol=5e-3, atol=2e-4, err_msg=place)
