@@ -1,7 +1,7 @@
-"""Gives Brax 0.14's training loops the one function that JAX has dropped since 0.10.
+"""A replacement for `jax.device_put_replicated`, which JAX 0.10 removed and Brax 0.14 calls.
 
-`brax.training` calls `jax.device_put_replicated` when training starts (PPO, SAC and APG alike)
-and nothing else that is gone. Call `install()` once, before the first `train`.
+The training loops of Brax call the function once when a training starts. Call `install()` before
+the first `train`.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """One copy of a pytree on each device, stacked along a new leading axis.
+    """Copy a pytree to each device, stacked along a new leading axis.
 
-    The stack has to be sharded, not merely stacked: Brax reads a replica back as the first
-    addressable shard of every leaf.
+    The stack has to be sharded, because Brax reads a replica back as the first addressable shard
+    of every leaf.
 
     Args:
         tree: pytree of array-likes; a leaf has any shape `(...)`.
@@ -36,6 +36,6 @@ def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
 
 
 def install() -> None:
-    """Sets `jax.device_put_replicated` where this JAX has none; otherwise changes nothing."""
+    """Set `jax.device_put_replicated` if the installed JAX lacks it."""
     if not hasattr(jax, "device_put_replicated"):
         setattr(jax, "device_put_replicated", device_put_replicated)  # noqa: B010

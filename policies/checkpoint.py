@@ -1,8 +1,8 @@
-"""Files of trained policies: weights and what they are for, without pickle.
+"""Checkpoints of trained policies: reading and writing, without pickle.
 
-A checkpoint is a NumPy archive: one array a weight, by its path in the network, and `about`, a
-line of JSON with the format's version, the network and its sizes, the features that it sees, and
-what it was trained on.
+A checkpoint is a NumPy archive. It has one array for each weight, named by the weight's path in
+the network, and `about`, a line of JSON with the format, the network and its sizes, the number of
+features, the suites and the seed.
 """
 
 import dataclasses
@@ -22,29 +22,29 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
 FORMAT = 2
-SHIPPED = ("catch", "rush6")  # one for eight suites, and one for `rush6` alone
-_OF_FLAX = ("parent", "name")  # fields of every module
+SHIPPED = ("catch", "rush6")  # trained on eight suites, and on `rush6` alone
+_OF_FLAX = ("parent", "name")  # fields of every Flax module
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained policy."""
+    """A trained policy as read from a file."""
 
-    params: Any  # of the network, NumPy leaves
-    network: Any  # a module of `networks`
-    about: dict[str, Any]  # what it was trained on
+    params: Any  # weights, NumPy leaves
+    network: Any  # a module from `networks`
+    about: dict[str, Any]  # suites and seed of the training
 
 
 def save_checkpoint(
     path: str | os.PathLike, params: Any, network: Any, about: dict[str, Any]
 ) -> None:
-    """Write a checkpoint; it is there whole or not at all.
+    """Write a checkpoint atomically.
 
     Args:
-        path: of the file.
-        params: of the network.
-        network: a module of `networks`.
-        about: what it was trained on, plain JSON.
+        path: path of the file.
+        params: weights of the network.
+        network: a module from `networks`.
+        about: suites and seed of the training, plain JSON.
     """
     name, sizes = name_and_sizes(network)
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
@@ -55,17 +55,17 @@ def save_checkpoint(
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
-    """What a network is called, and the fields that shape it."""
+    """Return the name of a network and the fields that determine its shape."""
     (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
     fields = (field.name for field in dataclasses.fields(network))
     return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}
 
 
 def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """The policy in a file.
+    """Read the policy in a file.
 
     Raises:
-        ArgumentError: there is none, it is no checkpoint, or one of another version.
+        ArgumentError: the file is missing, is not a checkpoint, or has another format.
     """
     require_path_name("checkpoint", path)
     name = os.fspath(path)
@@ -102,11 +102,11 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
 
 
 def checkpoint_of(file: str | os.PathLike) -> Checkpoint:
-    """The policy in a file, or one of `SHIPPED` by its name; errors as `load_checkpoint`."""
-    return shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
+    """Read a file, or one of `SHIPPED` by its name; raises as `load_checkpoint`."""
+    return load_shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
 
 
-def shipped_checkpoint(name: str) -> Checkpoint:
-    """A policy that comes with the library, one of `SHIPPED`."""
+def load_shipped_checkpoint(name: str) -> Checkpoint:
+    """Read a policy that is shipped with the library, one of `SHIPPED`."""
     with resources.as_file(resources.files("planner_jax.policies") / f"{name}.npz") as path:
         return load_checkpoint(path)

@@ -1,9 +1,9 @@
-"""How trainings went: a picture of one run, or of several with their mean and spread.
+"""Learning curves of one training run, or the mean and spread of several runs.
 
     python -m planner_jax.policies.curves RUN [RUN ...] [--out curves.png]
 
-Several runs are to differ in their seed only. A line is then their mean and the band around it one
-standard deviation to each side, as far as all of them have come.
+Several runs must differ in their seed only. A line then shows their mean, and the band one standard
+deviation to each side, up to the decisions of the shortest run.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.policies.progress import read_asked, read_rows
+from planner_jax.policies.progress import read_rows, read_settings
 from planner_jax.runs import style
 
 _TERMS = {
@@ -27,20 +27,20 @@ _TERMS = {
     "ratio": ("Optimal time ratio", "mean of solved cases", 1.0),
     "violation": ("Violation", "mean of other cases", 1.0),
 }
-_OF_RUN = ("digest", "code", "version")  # of what is asked, what runs may differ in, too
+_OF_RUN = ("digest", "code", "version")  # runs may differ in these entries as well
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.GREY)
 Rows = list[dict[str, Any]]
 
 
 def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -> None:
-    """Draw the curves of runs, and write the picture whole.
+    """Draw the learning curves of runs and write the picture atomically.
 
     Args:
-        folders: of trainings, at least one.
-        path: of the picture, a PNG.
+        folders: folders of trainings, at least one.
+        path: path of the picture, a PNG.
 
     Raises:
-        ArgumentError: a folder is no training's, or they differ in more than their seed.
+        ArgumentError: a folder does not hold a training, or runs differ in more than their seed.
     """
     _require_alike([Path(folder) for folder in folders])
     runs = [read_rows(Path(folder)) for folder in folders]
@@ -48,20 +48,20 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
 
 
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
-    """Reward and raw terms over decisions; by suite what the policy was worth after every part."""
-    told = [[row for row in rows if "reward" in row] for rows in runs]
-    judged = [[row for row in rows if "suites" in row] for rows in runs]
-    worth = all(judged)
-    panels = list(figure.subplots(2, 4 if worth else 3, sharex=True).flat)
-    shown = len(_TERMS) + 3 * worth
+    """Draw reward and terms over decisions, and the evaluation of each suite after every part."""
+    curve = [[row for row in rows if "reward" in row] for rows in runs]
+    evaluated = [[row for row in rows if "suites" in row] for rows in runs]
+    evaluations = all(evaluated)
+    panels = list(figure.subplots(2, 4 if evaluations else 3, sharex=True).flat)
+    shown = len(_TERMS) + 3 * evaluations
     for axes in panels[shown:]:
         axes.remove()
     for axes, (name, (title, unit, scale)) in zip(panels, _TERMS.items(), strict=False):
-        _line(axes, told, lambda row, name=name: row[name], scale, color=style.BLUE)
+        _line(axes, curve, lambda row, name=name: row[name], scale, color=style.BLUE)
         style.label(axes, "decisions", unit, title)
-    if worth:
-        _draw_worth(panels[len(_TERMS) :], judged)
-    ends = [row["decisions"] for row in judged[0]][1:-1]
+    if evaluations:
+        _draw_evaluations(panels[len(_TERMS) :], evaluated)
+    ends = [row["decisions"] for row in evaluated[0]][1:-1]
     for axes in panels[:shown]:
         axes.ticklabel_format(axis="x", style="sci", scilimits=(0, 3))
         axes.tick_params(labelbottom=True)
@@ -69,19 +69,19 @@ def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
             axes.axvline(end, color=style.PALE, linewidth=1.0)
 
 
-def _draw_worth(panels: Sequence[Axes], judged: Sequence[Rows]) -> None:
-    """Success, last catch beside that in the beginning, and optimal time ratio, a line a suite."""
+def _draw_evaluations(panels: Sequence[Axes], evaluated: Sequence[Rows]) -> None:
+    """Draw success, relative last catch and optimal time ratio, one line for each suite."""
 
-    def of(suite: str, name: str) -> Any:
+    def value_of(suite: str, name: str) -> Any:
         return lambda row: row["suites"][suite][name]
 
-    for k, suite in enumerate(judged[0][0]["suites"]):
+    for k, suite in enumerate(evaluated[0][0]["suites"]):
         look: Any = {"color": _COLOURS[k % len(_COLOURS)], "label": suite, "marker": "."}
-        _line(panels[0], judged, of(suite, "success"), 100.0, **look)
-        _line(panels[1], judged, of(suite, "last"), 100.0, relative=True, **look)
-        _line(panels[2], judged, of(suite, "ratio"), **look)
+        _line(panels[0], evaluated, value_of(suite, "success"), 100.0, **look)
+        _line(panels[1], evaluated, value_of(suite, "last"), 100.0, relative=True, **look)
+        _line(panels[2], evaluated, value_of(suite, "ratio"), **look)
     style.label(panels[0], "decisions", "share [%]", "Success, by suite")
-    style.label(panels[1], "decisions", "of that in the beginning [%]", "Last catch, by suite")
+    style.label(panels[1], "decisions", "share of the first value [%]", "Last catch, by suite")
     style.label(panels[2], "decisions", "mean of solved cases", "Optimal time ratio, by suite")
     panels[0].legend(fontsize=8.0)
 
@@ -94,7 +94,7 @@ def _line(
     relative: bool = False,
     **look: Any,
 ) -> None:
-    """A value over decisions, or relative to the first one: the mean of runs and their spread."""
+    """Draw the mean and spread of a value over decisions, or relative to its first value."""
     num = min(len(rows) for rows in runs)
     values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)
     if relative:
@@ -110,7 +110,7 @@ def _line(
 def _require_alike(folders: Sequence[Path]) -> None:
     first: dict[str, Any] = {}
     for folder in folders:
-        found = read_asked(folder)
+        found = read_settings(folder)
         asked = {name: value for name, value in found.items() if name not in _OF_RUN}
         first = first or asked
         for name in (name for name in first if name != "seed" and asked.get(name) != first[name]):
@@ -122,11 +122,11 @@ def _require_alike(folders: Sequence[Path]) -> None:
 
 
 def main() -> None:
-    """Draw the picture of the runs that are named."""
+    """Draw the learning curves of the runs on the command line."""
     parser = argparse.ArgumentParser("python -m planner_jax.policies.curves", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="folder of a training")
-    parser.add_argument("--out", type=Path, default=Path("curves.png"), help="of the picture")
+    parser.add_argument("--out", type=Path, default=Path("curves.png"), help="path of the picture")
     options = parser.parse_args()
     try:
         draw_curves(options.runs, options.out)

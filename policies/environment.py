@@ -1,9 +1,11 @@
-"""A Brax environment in which one step is one decision, and its reward what became of the plan.
+"""A Brax environment for decisions about catches: one step is one decision.
 
-It is batched itself: `reset` takes a batch of keys and `step` a batch of actions, so that the
-planner in it solves all cases together, by the kernels of a GPU too. The lanes are shared among
-the suites evenly, each planned at its own number of targets. As in [Yu2023catch, IV-B], an episode
-is one step: the next cases are drawn in it, and never the same again.
+The reward of a step follows from the plan that the decision leads to. As in
+[Yu2023catch, Section IV-B], an episode has one step, and each step draws new cases.
+
+The environment is batched: `reset` takes a batch of keys and `step` a batch of actions, so that
+one call of the planner solves all cases. The batch is divided evenly among the suites, and the
+cases of each suite keep their own number of targets.
 """
 
 import functools
@@ -29,19 +31,23 @@ from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
 from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw_by_key
 
-# Terms of a reward that count only of cases that are solved, lest a policy be paid for early
-# catches that it does not make; `violation` counts only of others.
+# These terms count for solved cases only. Otherwise a policy would be rewarded for early catches
+# that no plan achieves. The term `violation` counts for the other cases only.
 _GATED = ("solved", "last", "ratio", "caught")
 
 
 class CatchEnv(Env):
-    """Decisions about catches, planned by `ExactCatch` from one start or estimated.
+    """An environment that rewards decisions by plans of `ExactCatch`, or by an estimate.
+
+    Suites with the same shapes of cases and the same number of iterations share one call of the
+    planner, which starts from one guess a case.
 
     Args:
-        suites: whose cases are drawn.
-        iterations: of the planner, one number a suite; zero has the estimate judge instead.
-            Suites whose cases are alike in shape, and which are planned alike, are planned in one.
-        weights: of the terms of `judged`, by name, each one number or one a suite.
+        suites: names of the suites from which cases are drawn.
+        iterations: number of planner iterations for each suite; zero replaces the planner by the
+            estimate of `task.catch.estimate`.
+        weights: weights of the terms of `evaluate_actions` by name, each a number or one number
+            for each suite.
     """
 
     def __init__(
@@ -58,14 +64,14 @@ class CatchEnv(Env):
         self.size = max(SUITES[suite].num_targets for suite in suites)
 
     def reset(self, rng: Array) -> State:
-        """States of a batch of keys (B, 2); B is a multiple of the number of suites."""
+        """Return the first states for keys (B, 2); B is a multiple of the number of suites."""
         num = rng.shape[0]
         if num % len(self.suites):
             raise ArgumentError(
                 "lanes", f"a multiple of {len(self.suites)}, one share a suite", num
             )
         key, own = jax.random.split(rng[0])
-        cases = self._drawn(own, num)
+        cases = self._draw(own, num)
         zero = jnp.zeros(num)
         steps = {"sum_reward": zero, "length": zero}
         info = {
@@ -75,17 +81,17 @@ class CatchEnv(Env):
             "episode_done": zero,
             "episode_metrics": {**steps, **{name: zero for name in WEIGHTS}},
         }
-        return State(None, self._seen(cases), zero, zero, {}, info)
+        return State(None, self._observe(cases), zero, zero, {}, info)
 
     def step(self, state: Any, action: Array) -> State:
-        """What became of the actions (B, size * PER_TARGET), and the next cases."""
+        """Reward the actions (B, size * PER_TARGET) and draw the next cases."""
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
         actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
-        terms = self._judged(state.info["cases"], actions)
+        terms = self._evaluate(state.info["cases"], actions)
         share = num // len(self.suites)
-        reward = rewarded(terms, {k: np.repeat(one, share) for k, one in self.weights.items()})
-        cases, one = self._drawn(own, num), jnp.ones(num)
+        reward = weight_terms(terms, {k: np.repeat(one, share) for k, one in self.weights.items()})
+        cases, one = self._draw(own, num), jnp.ones(num)
         steps = {"sum_reward": reward, "length": one}
         info = {
             **state.info,
@@ -94,10 +100,10 @@ class CatchEnv(Env):
             "episode_done": one,
             "episode_metrics": {**steps, **terms},
         }
-        return state.replace(obs=self._seen(cases), reward=reward, done=one, info=info)
+        return state.replace(obs=self._observe(cases), reward=reward, done=one, info=info)
 
-    def _judged(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
-        """The raw terms (B,) of actions (S, B / S, size, PER_TARGET) on the cases of S suites."""
+    def _evaluate(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
+        """Return the unweighted reward terms (B,) of actions (S, B / S, size, PER_TARGET)."""
         alike: dict[Any, list[int]] = {}
         for k, some in enumerate(cases):
             key = (*map(jnp.shape, jax.tree.leaves(some)), jax.tree.structure(some))
@@ -106,7 +112,7 @@ class CatchEnv(Env):
         for (iterations, *_), places in alike.items():
             together = jax.tree.map(lambda *x: jnp.concatenate(x), *(cases[k] for k in places))
             acts = jnp.concatenate([actions[k, :, : together.num_targets] for k in places])
-            terms = judged(together, acts, iterations)
+            terms = evaluate_actions(together, acts, iterations)
             for place, k in enumerate(places):
                 share = actions.shape[1]
                 own = slice(place * share, (place + 1) * share)
@@ -114,13 +120,13 @@ class CatchEnv(Env):
         in_order = [parts[k] for k in range(len(cases))]
         return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *in_order)
 
-    def _drawn(self, key: Array, num: int) -> tuple[CatchCase, ...]:
+    def _draw(self, key: Array, num: int) -> tuple[CatchCase, ...]:
         share = num // len(self.suites)
         keys = jax.random.split(key, len(self.suites))
         return tuple(draw_by_key(k, share, s) for k, s in zip(keys, self.suites, strict=True))
 
-    def _seen(self, cases: tuple[CatchCase, ...]) -> Array:
-        """Observations (B, size * FEATURES), zero for absent targets."""
+    def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
+        """Return the observations (B, size * FEATURES), zero for absent targets."""
 
         def of_suite(cases: CatchCase) -> Array:
             seen = jax.vmap(lambda case: observe(case, timetable(case)))(cases)
@@ -132,42 +138,44 @@ class CatchEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Of one lane."""
+        """Number of features in the observation of one case."""
         return self.size * FEATURES
 
     @property
     def action_size(self) -> int:
-        """Of one lane."""
+        """Number of components in the action for one case."""
         return self.size * PER_TARGET
 
     @property
     def backend(self) -> str:
-        """No physics: what is planned is not flown."""
+        """Name of the backend; plans are rewarded without a physics simulation."""
         return "planner_jax"
 
 
-def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array]:
-    """The raw terms (B,) of actions (B, N, PER_TARGET) on a batch, without a gate.
+def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array]:
+    """Return the unweighted reward terms (B,) of actions (B, N, PER_TARGET).
 
     Args:
-        cases: (B,).
-        actions: from -1 to 1.
-        iterations: of the planner; zero has the estimate judge instead.
+        cases: batch of B cases.
+        actions: components from -1 to 1.
+        iterations: number of planner iterations; zero replaces the planner by the estimate.
 
     Returns:
-        solved: 1 or 0.
-        last: how much earlier the last catch is than the estimate of `Greedy`, relative; zero
-            where targets are optional.
-        caught: how many more targets are taken than by `Greedy`, relative; zero but there.
-        ratio: the optimal time ratio [Yu2023catch, eq. 29]; zero by the estimate.
-        violation: of the plan, 2 at most; by the estimate log(1 + metres out of reach).
+        solved: 1 for a solved case, else 0.
+        last: (t_greedy - t) / t_greedy for the time t of the last catch and its estimate under
+            the decision `Greedy`; zero in suites with optional targets.
+        caught: (n - n_greedy) / n_greedy for the number n of targets taken; zero in suites
+            without optional targets.
+        ratio: optimal time ratio [Yu2023catch, eq. 29]; zero with the estimate.
+        violation: violation of the plan, at most 2; with the estimate log(1 + d) for the distance
+            d [m] that the quadrotor falls short of the targets.
     """
     tables = jax.vmap(timetable)(cases)
     choices = jax.vmap(choice_of)(cases, tables, actions)
     nothing = jnp.zeros_like(cases.horizon)
     greedy = jax.vmap(earliest_next)(cases, tables, nothing)
     if iterations:
-        choices, found = _planned(cases, choices, iterations)
+        choices, found = _plan(cases, choices, iterations)
         solved, times = is_solved(found.status), found.times
         off = jnp.abs(times - choices.times) / jnp.maximum(times, 1e-3)
         taken = jnp.take_along_axis(choices.taken, choices.order, axis=1)
@@ -188,15 +196,15 @@ def judged(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array
         "caught": caught,
         "violation": violation,
     }
-    # A lane that overflows is a bad one, and no more.
+    # A case whose terms overflow gets a poor reward and does not spoil the batch.
     return {
         name: jnp.clip(jnp.nan_to_num(jnp.asarray(term, jnp.float32), nan=2.0), -2.0, 2.0)
         for name, term in terms.items()
     }
 
 
-def _planned(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
-    """Choices (B, N) and their plans; where targets are optional, in the length that is best."""
+def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
+    """Plan the choices (B, N); with optional targets keep the longest solved prefix."""
     if not cases.optional:
         return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
@@ -205,7 +213,7 @@ def _planned(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[C
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
     found = solve_batch(ExactCatch(), _attempt(iterations), tried)
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
-    # The first that is solved is the longest.
+    # Lengths decrease along the axis: the first solved choice is the longest.
     best = jnp.argmax(is_solved(each[1].status), axis=1)
     return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
 
@@ -215,12 +223,12 @@ def _attempt(iterations: int) -> Round:
     return Round(starts=1, solver=LbfgsConfig(max_steps=iterations))
 
 
-def rewarded(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:
-    """The reward (B,) of raw terms: what a solved case is worth, or what an unsolved one costs.
+def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:
+    """Return the reward (B,): weighted terms of solved cases, weighted violation of the others.
 
     Args:
-        terms: of `judged`.
-        weights: of each, () or (B,).
+        terms: unweighted terms from `evaluate_actions`.
+        weights: weight of each term, () or (B,).
     """
     good = sum(weights[name] * terms[name] for name in _GATED)
     bad = weights["violation"] * terms["violation"]

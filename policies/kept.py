@@ -1,4 +1,4 @@
-"""What each part of a training leaves: parameters, kept by Orbax, with a digest beside them."""
+"""Parameters after each part of a training, stored by Orbax, each with a digest."""
 
 import hashlib
 import json
@@ -16,12 +16,12 @@ from planner_jax.runs.manifest import JsonError, parse_written, to_write
 
 
 class KeptParts:
-    """The parameters after every part, a folder each and a file with their digest.
+    """Storage of the parameters after every part: a folder and a file with the digest for each.
 
-    What does not agree with its digest is forgotten, with a word on the standard error stream.
+    Parameters that do not match their digest are ignored, with a message on standard error.
 
     Args:
-        folder: that holds them, which need not exist.
+        folder: folder of the storage; it is created if it does not exist.
     """
 
     def __init__(self, folder: Path):
@@ -29,7 +29,7 @@ class KeptParts:
         folder.mkdir(parents=True, exist_ok=True)
 
     def save(self, number: int, params: Any) -> None:
-        """Keep the parameters after a part."""
+        """Store the parameters after a part."""
         place = self._place(number)
         if place.exists():
             shutil.rmtree(place)
@@ -39,12 +39,12 @@ class KeptParts:
         with replacing(self._note(number)) as scratch:
             scratch.write_text(text + "\n", encoding="utf-8")
 
-    def restored(self, number: int, like: Any) -> Any | None:
-        """The parameters after a part; None where there are none, or not those that were kept.
+    def restore(self, number: int, like: Any) -> Any | None:
+        """Return the stored parameters after a part; None if they are missing or damaged.
 
         Args:
-            number: of the part.
-            like: parameters of the same shapes.
+            number: number of the part.
+            like: parameters with the same shapes.
         """
         try:
             with open_plain(self._note(number)) as file:
@@ -52,12 +52,12 @@ class KeptParts:
             found = jax.device_get(self._keeper.restore(self._place(number), like))
             if _digest(found) == note["sha256"]:
                 return found
-            why = "its digest is another"
+            why = "its digest differs"
         except FileNotFoundError:
             return None
         except JsonError as error:
             why = f"its note {error}"
-        except Exception as error:  # of whatever kind Orbax and what it reads with may raise
+        except Exception as error:  # Orbax and its readers raise many kinds
             why = type(error).__name__
         place = self._place(number)
         print(

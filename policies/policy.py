@@ -1,4 +1,4 @@
-"""A learned decision about catches: `pj.catch.planner(decide="policy")`."""
+"""A learned policy that decides the order and times of catches: `decide="policy"`."""
 
 import functools
 import os
@@ -20,24 +20,25 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
 
-# Training rewards times from which few iterations lead to a plan. The planner has more, and makes
-# plans from earlier times as well: so much earlier costs nothing, and catches come 3 to 4 % sooner.
+# Training rewards times from which few iterations lead to a plan. The planner has more iterations
+# and also solves from earlier times: with this factor the last catch is 3 to 4 % earlier.
 _EARLIER = 0.95
 
 
 @struct.dataclass
 class Policy(CatchDecision):
-    """Order and times by a network; its weights are leaves.
+    """A decision whose order and times come from a network; the weights are leaves.
 
-    Of several proposals the first is the network's mean, and the others are drawn around it, the
-    same ones for every case; the planner plans them all and keeps the earliest.
+    The first of several proposals is the mean of the network's distribution. The others are drawn
+    around the mean with the same noise for every case. The planner plans all proposals and keeps
+    the one with the earliest last catch.
     """
 
-    params: Any  # of the network
+    params: Any  # weights of the network
     network: Any = struct.field(pytree_node=False)
     proposals: int = struct.field(pytree_node=False, default=1)
-    spread: float = struct.field(pytree_node=False, default=1.0)  # factor on deviations
-    # Factor on the times: above one a plan needs fewer iterations, and its last catch is later.
+    spread: float = struct.field(pytree_node=False, default=1.0)  # factor on standard deviations
+    # Factor on the times. Above 1 a plan needs fewer iterations, and its last catch is later.
     stretch: float = struct.field(pytree_node=False, default=1.0)
 
     def __post_init__(self) -> None:
@@ -57,7 +58,7 @@ class Policy(CatchDecision):
             )
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The proposals for one case, leaves (K, N), or more if targets are optional."""
+        """Return the proposals for one case, leaves (K, N); more than K with optional targets."""
         table = timetable(case)
         numbers = self.network.apply(self.params, observe(case, table))
         mean, spread = numbers[:, :PER_TARGET], numbers[:, PER_TARGET:]
@@ -73,18 +74,19 @@ class Policy(CatchDecision):
 
 
 def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
-    """The policy of a checkpoint.
+    """Load a policy from a checkpoint.
 
     Args:
-        file: that `planner-jax train` wrote, or the name of one that is shipped: "catch", which
-            was trained on suites of one to twelve targets, or "rush6", on that suite alone.
-        **options: `proposals`, `spread` and `stretch` of `Policy`; `stretch` is 0.95 unless given,
-            and 1 for the times as they were trained.
+        file: path of a file written by `planner-jax train`, or the name of a shipped policy:
+            "catch", trained on suites of one to twelve targets, or "rush6", trained on the suite
+            `rush6` alone.
+        **options: `proposals`, `spread` and `stretch` of `Policy`; the default of `stretch` is
+            0.95, and 1 gives the times as trained.
 
     Raises:
-        TypeError: an option is of another kind.
-        ValueError: there is no proposal, or an option is negative, zero or not finite.
-        ArgumentError: it is no checkpoint of a policy, or of another version; one line.
+        TypeError: an option has the wrong type.
+        ValueError: `proposals` is below 1, or another option is negative, zero or not finite.
+        ArgumentError: the file is not a checkpoint of a policy, or has another format.
     """
     found = checkpoint_of(file)
     params = jax.tree.map(jnp.asarray, found.params)  # sent to the device once, not each time

@@ -1,12 +1,16 @@
-"""How a training is watched: rows of the run folder, a bar, and event files of TensorBoard.
+"""Progress of a training: rows in the run folder, a progress bar, and TensorBoard event files.
 
-Every row of `progress.jsonl` has `part` and `decisions`, of all parts until then. Rows of the curve
-have the means of the decisions since the last one: `reward`, `solved`, of solved cases `last` and
-`ratio`, of others `violation`, as `environment.judged` has them, beside `per_second` decisions and
-what PPO did: `divergence` of an update, `learning_rate`, and `spread`, the standard deviation of
-actions. Rows with `suites` say what the policy's decisions were worth then, planned in full. The
-first line has the format, how many rows follow, and their digest. `training.json` says what is
-trained, in which format, and by which code.
+Every row of `progress.jsonl` has the number of the `part` and the `decisions` of the whole run up
+to the row. There are two kinds of rows:
+
+* Rows of the curve hold means over the decisions since the previous row: `reward`, `solved`,
+  `last` and `ratio` of solved cases, `violation` of the others (see
+  `environment.evaluate_actions`), decisions `per_second`, the `divergence` of a PPO update, the
+  `learning_rate`, and `spread`, the standard deviation of the actions.
+* Rows with `suites` hold the evaluation of the policy by the full planner.
+
+The first line of the file has the format, the number of rows and their digest. `training.json`
+holds the settings, the format and the version of the code.
 """
 
 import contextlib
@@ -34,16 +38,16 @@ from planner_jax.runs.manifest import (
 )
 from planner_jax.runs.run_folder import RunFolder
 
-FILE, ASKED = "progress.jsonl", "training.json"
+FILE, SETTINGS = "progress.jsonl", "training.json"
 _EVENTS = "tensorboard"
 
 
 @contextlib.contextmanager
-def reported_terms() -> Iterator[None]:
-    """Have Brax's PPO report reward and raw terms, as means of all decisions, with its metrics.
+def report_terms() -> Iterator[None]:
+    """Make the PPO of Brax report the means of reward and unweighted terms with its metrics.
 
-    Brax itself reports them by calls from the compiled program to the host. It does so of 100
-    lanes only, and JAX keeps no program with such calls in its cache.
+    Brax itself reports them for 100 environments only, by calls from the compiled program to the
+    host. JAX does not store programs with such calls in its compilation cache.
     """
     plain = losses.compute_ppo_loss
 
@@ -68,7 +72,7 @@ def reported_terms() -> Iterator[None]:
 
 
 def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """A row of the curve from Brax's metrics with `reported_terms`."""
+    """Convert metrics of Brax under `report_terms` to a row of the curve."""
     found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     solved, others = found["solved"], 1.0 - found["solved"]
     return {
@@ -87,11 +91,11 @@ def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 class Progress:
     """The rows of a run.
 
-    The file is replaced as a whole with every row, and read again where a run goes on.
+    Every new row replaces the whole file. A resumed run reads the file first.
 
     Args:
-        folder: of the run.
-        show: a bar on the standard error stream.
+        folder: folder of the run.
+        show: show a progress bar on standard error.
     """
 
     def __init__(self, folder: Path, show: bool):
@@ -100,17 +104,17 @@ class Progress:
 
     @contextlib.contextmanager
     def part(
-        self, number: int, title: str, begun: int, decisions: int
+        self, number: int, title: str, before: int, decisions: int
     ) -> Iterator[Callable[[int, Mapping[str, Any]], None]]:
-        """What Brax is to call with decisions of a part and its metrics, while the part trains.
+        """Yield the callback that Brax calls with the decisions and metrics of a part.
 
-        What an interrupted run left of the part, or of later ones, is forgotten.
+        Rows of this part and of later parts from an interrupted run are removed first.
 
         Args:
-            number: of the part.
-            title: of the bar.
-            begun: decisions before the part.
-            decisions: of the part.
+            number: number of the part.
+            title: title of the progress bar.
+            before: decisions before the part.
+            decisions: decisions of the part.
         """
         self.rows = [row for row in self.rows if row["part"] < number]
         place, suffix = self._folder / _EVENTS, f".part-{number:03d}"
@@ -125,10 +129,10 @@ class Progress:
             def tell(done: int, metrics: Mapping[str, Any]) -> None:
                 stopping.check()
                 row = _row_of(metrics)
-                self.add(number, begun + done, row)
+                self.add(number, before + done, row)
                 for name, value in row.items():
                     if value is not None:
-                        events.add_scalar(f"training/{name}", value, begun + done)
+                        events.add_scalar(f"training/{name}", value, before + done)
                 events.flush()
                 shown = f"reward {row['reward']:.3f}, solved {100.0 * (row['solved'] or 0.0):.1f} %"
                 bar.set_postfix_str(shown, refresh=False)
@@ -136,8 +140,8 @@ class Progress:
 
             yield tell
 
-    def judge(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
-        """Add what a policy's decisions are worth, by suite, as in `training.judge_policy`."""
+    def add_evaluation(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
+        """Add an evaluation of the policy by suite, as `training.evaluate_policy` returns it."""
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
@@ -147,17 +151,17 @@ class Progress:
 
 
 def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The contents of `progress.jsonl`."""
+    """Return the contents of `progress.jsonl`."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
     head = {"rows": len(rows), "sha256": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(to_write(head)) + "\n" + text
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """The rows of a run, in the order of their decisions.
+    """Read the rows of a run in order of decisions.
 
     Raises:
-        ArgumentError: the folder is not that of a training, or a row is not as it was written.
+        ArgumentError: the folder does not hold a training, or the file does not match its digest.
     """
     shown = repr(str(folder))
     try:
@@ -170,7 +174,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     try:
         head = parse_written(first)
         if head.get("sha256") != hashlib.sha256(rest).hexdigest():
-            raise JsonError("has other rows than were written")
+            raise JsonError("does not match its digest")
         rows = [parse_object(line) for line in rest.splitlines()]
     except JsonError as error:
         rule = f"a training whose {FILE} is whole"
@@ -178,10 +182,10 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def read_asked(folder: Path) -> dict[str, Any]:
-    """What a training was asked for, of `training.json`.
+def read_settings(folder: Path) -> dict[str, Any]:
+    """Read the settings of a training from `training.json`.
 
     Raises:
-        ArgumentError: the folder is not that of a training, or it is not as it was written.
+        ArgumentError: the folder does not hold a training, or the file is damaged.
     """
-    return read_written(folder / ASKED, "run", "a training")
+    return read_written(folder / SETTINGS, "run", "a training")

@@ -8,9 +8,9 @@ from planner_jax.runs.settings import option, require_count
 from planner_jax.task.catch.spec import SUITES
 
 _MOST_DECISIONS = 1e12
-_CASE_BYTES = 20_000  # of memory, estimated, of a case that is decided with others
+_CASE_BYTES = 20_000  # estimated memory of one case in a batch
 NETWORK_NAMES = ("attention", "mlp")
-# Of the terms of a reward, see `environment.judged`.
+# Weights of the terms of the reward, see `environment.evaluate_actions`.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
 LEARNING_RATE = 1e-4
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
@@ -18,26 +18,26 @@ _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
-    """The arguments of a training. `training.Training` has more of them, for programs.
+    """The arguments of `planner-jax train`; `training.Training` has further ones.
 
     Raises:
         ArgumentError: a value breaks its rule.
     """
 
-    suite: str = option(",".join(_PAPER), "A,B", "whose cases are decided on, one or more")
-    network: str = option("attention", "NAME", "attention, for any number of targets, or mlp")
+    suite: str = option(",".join(_PAPER), "A,B", "suites to train on, one or more")
+    network: str = option("attention", "NAME", "attention (any number of targets) or mlp")
     decisions: tuple[float, ...] = option(
-        (2e6, 4e6, 4e6, 4e6), "N", "of each part, after which the run may be interrupted"
+        (2e6, 4e6, 4e6, 4e6), "N", "decisions of each part; a run can be interrupted between parts"
     )
-    learning_rate: float = option(LEARNING_RATE, "R", "at the start of each part")
+    learning_rate: float = option(LEARNING_RATE, "R", "learning rate at the start of each part")
     init_from: str | None = option(
-        None, "FILE", "a checkpoint of first weights, or the name of a shipped one: catch, rush6"
+        None, "FILE", "checkpoint with the initial weights, or a shipped policy: catch, rush6"
     )
     num_envs: int | None = option(
         None, "B", "cases that are decided in parallel (default: 8190, 510 on a CPU)"
     )
     eval_cases: int = option(256, "N", "cases of each suite for the evaluation after each part")
-    seed: int = option(0, "K", "of weights and cases")
+    seed: int = option(0, "K", "seed of weights and cases")
 
     DESCRIPTION: ClassVar[str] = (
         "Train a policy that decides when and in what order to catch, by Brax's PPO with the\n"
@@ -70,7 +70,7 @@ class TrainSettings:
 
 
 def usual_iterations(suite: str) -> int:
-    """Return the iterations of the planner in a training; 0: the estimate judges."""
+    """Return the planner iterations for a suite in training; 0 means the estimate is used."""
     if SUITES[suite].optional:
         return 0
     return 25 if SUITES[suite].num_targets <= 3 else 80

@@ -1,10 +1,11 @@
-"""Training by Brax's PPO [Schulman2017; Yu2023catch, eqs 5 and 7]: in parts, so that it can go on.
+"""Training of a policy by PPO [Schulman2017; Yu2023catch, eqs 5, 7], resumable between parts.
 
-A run is a row of parts, each one call of `brax.training.agents.ppo.train` from the weights of the
-last, with rewards by the planner or by the estimate. What a part leaves is kept by Orbax before
-the next one begins, and the seed of a part follows from the run's and its number: a run that was
-interrupted goes on to the same weights, bit for bit. Adam's moments start anew with each part,
-since Brax does not return them. `progress` says how a run is watched, and `curves` draws it.
+A run consists of parts. Each part is one call of `brax.training.agents.ppo.train` from the weights
+of the previous part, with rewards by the planner or by the estimate. Orbax stores the weights after
+each part. The seed of a part follows from the seed of the run and the number of the part, so that
+an interrupted run continues to the same weights, bit for bit. The moments of Adam start at zero in
+each part, because Brax does not return them. The module `progress` records a run and `curves` draws
+it.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ from planner_jax.policies.kept import KeptParts
 from planner_jax.policies.networks import LEAST_STD, NETWORKS, Value
 from planner_jax.policies.observation import FEATURES, PER_TARGET
 from planner_jax.policies.policy import Policy
-from planner_jax.policies.progress import ASKED, Progress, read_asked, reported_terms
+from planner_jax.policies.progress import SETTINGS, Progress, read_settings, report_terms
 from planner_jax.policies.settings import (
     LEARNING_RATE,
     WEIGHTS,
@@ -54,8 +55,8 @@ from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
-_ROWS = 50  # of a part's curve, at most
-_JUDGED_SEED = 4242  # of the cases by which a run is watched; no figure of the results is of them
+_ROWS = 50  # greatest number of rows of a part's curve
+_EVAL_SEED = 4242  # seed of the evaluation cases, which no published figure uses
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,78 +64,77 @@ class Part:
     """One call of PPO."""
 
     steps: int  # decisions
-    iterations: tuple[int, ...] = ()  # of the planner, one a suite; none: the estimate judges
-    learning_rate: float = LEARNING_RATE  # to begin with; then as far as the divergence allows
+    iterations: tuple[int, ...] = ()  # planner iterations for each suite; empty: the estimate
+    learning_rate: float = LEARNING_RATE  # first learning rate; the divergence adapts it
 
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """What is trained, on what and for how long."""
+    """The settings of a training."""
 
     suites: tuple[str, ...]
     parts: tuple[Part, ...]
     network: str = "attention"
     seed: int = 0
-    num_envs: int = 8190  # decided at once; a multiple of the number of suites
-    updates: int = 4  # of all data
+    num_envs: int = 8190  # cases decided in parallel; a multiple of the number of suites
+    updates: int = 4  # passes over each batch of decisions
     minibatches: int = 6
-    divergence: float = 0.01  # wanted of an update, by which the learning rate is set
+    divergence: float = 0.01  # target KL divergence of an update; it sets the learning rate
     entropy: float = 1e-4
-    # Of each term, one or one a suite.
+    # Weight of each term, one number or one for each suite.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
-    init_from: str | None = None  # a checkpoint by whose weights it begins, or a shipped one's name
-    eval_cases: int = 256  # cases of each suite by which it is watched; 0: it is not
+    init_from: str | None = None  # checkpoint or shipped policy with the initial weights
+    eval_cases: int = 256  # cases of each suite for evaluations; 0 for no evaluation
 
 
 def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
-    """Train a policy, or go on where an interrupted run of the same folder and settings ended.
+    """Train a policy, or resume the interrupted run in a folder.
 
     Args:
-        training: what is asked for.
+        training: settings of the training.
         out: folder of the run: `training.json`, `parts/`, `progress.jsonl`, `tensorboard/`,
-            `curves.png` after each part, and `policy.npz` in the end.
-        progress: show a bar, and a line on every part, on the standard error stream.
+            `curves.png` after each part, and `policy.npz` at the end.
+        progress: show a bar and a line after each part on standard error.
 
     Returns:
         The policy after the last part.
 
     Raises:
-        ArgumentError: the folder is that of a run with other settings or of other code, or another
-            process writes it.
-        ArgumentError: the one to begin with cannot be read, or is of another network.
+        ArgumentError: the folder holds a run with other settings or other code, another process
+            writes to the folder, or the initial checkpoint cannot be read or has another network.
     """
     brax_compat.install()
     folder = Path(out)
     network = NETWORKS[training.network]()
     params = _first_params(training, network)  # before anything is written
     with RunFolder(folder).owned():
-        _require_same(folder, training)
+        _record_settings(folder, training)
         return _train_parts(training, folder, network, params, progress)
 
 
 def _train_parts(
     training: Training, folder: Path, network: Any, params: Any, progress: bool
 ) -> Policy:
-    """All parts that have not been trained yet, from the parameters that the first begins with."""
+    """Train all parts that are not stored yet, from the initial parameters."""
     keeper = KeptParts(folder / "parts")
-    told, begun = Progress(folder, progress), 0
+    rows, before = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
         stopping.check()
         decisions = math.prod(_rows_and_updates(part, training.num_envs)) * training.num_envs
-        kept = keeper.restored(number, params)
+        kept = keeper.restore(number, params)
         if kept is not None:
             params = kept
-            begun += decisions
+            before += decisions
             continue
         title = f"part {number + 1} of {len(training.parts)}"
-        with told.part(number, title, begun, decisions) as tell:
+        with rows.part(number, title, before, decisions) as tell:
             if number == 0 and training.eval_cases:
-                told.judge(number, 0, judge_policy(training, network, params[1]))
-            params = _by_ppo(training, part, number, network, params, tell)
-        begun += decisions
+                rows.add_evaluation(number, 0, evaluate_policy(training, network, params[1]))
+            params = _train_part(training, part, number, network, params, tell)
+        before += decisions
         if training.eval_cases:
-            suites = judge_policy(training, network, params[1])
-            told.judge(number, begun, suites)
+            suites = evaluate_policy(training, network, params[1])
+            rows.add_evaluation(number, before, suites)
             if progress:
                 print(f"{title}: {_sentence(suites)}", file=sys.stderr)
         draw_curves([folder], folder / "curves.png")
@@ -144,11 +144,11 @@ def _train_parts(
     return Policy(params=params[1], network=network)
 
 
-def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
-    """Train as `planner-jax train` does; arguments and errors of `train`."""
+def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Policy:
+    """Train with the settings of `planner-jax train`; raises as `train`."""
     lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
-    step = len(settings.suites) * minibatches  # one share a suite, and even minibatches
+    step = len(settings.suites) * minibatches  # equal shares of suites and minibatches
     iterations = tuple(map(usual_iterations, settings.suites))
     training = Training(
         suites=settings.suites,
@@ -165,12 +165,12 @@ def train_as_asked(settings: TrainSettings, out: str | os.PathLike) -> Policy:
     return train(training, out)
 
 
-def judge_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
-    """What a policy's decisions are worth, by suite: success, last catch and ratio."""
+def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
+    """Return success, last catch and optimal time ratio of a policy by suite."""
     decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
     figures = {}
     for suite in training.suites:
-        cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _JUDGED_SEED))
+        cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _EVAL_SEED))
         plans = plan(decided, cases)
         good = solved(plans)
         figures[suite] = {
@@ -191,24 +191,24 @@ def _sentence(suites: Mapping[str, Any]) -> str:
     return "; ".join(words)
 
 
-def _require_same(folder: Path, training: Training) -> None:
-    """Write down what is trained and by what, or raise `ArgumentError` if the folder has others."""
+def _record_settings(folder: Path, training: Training) -> None:
+    """Write settings and digest of the code; raise `ArgumentError` if the folder has others."""
     asked = json.loads(json.dumps(dataclasses.asdict(training)))
     maker = {"version": str(installed_version("planner-jax")), "code": code_digest()}
     wanted = {**maker, **asked}
-    if (folder / ASKED).exists():
-        found = read_asked(folder)
+    if (folder / SETTINGS).exists():
+        found = read_settings(folder)
         for name, value in wanted.items():
             if found.get(name) != value:
                 raise ArgumentError(
                     name, f"{found.get(name)}, as in the run of {str(folder)!r}", value
                 )
         return
-    RunFolder(folder).write_text(ASKED, json.dumps(to_write(wanted), indent=1) + "\n")
+    RunFolder(folder).write_text(SETTINGS, json.dumps(to_write(wanted), indent=1) + "\n")
 
 
 def _first_params(training: Training, network: Any) -> Any:
-    """Normaliser, which is not used, and parameters of policy and value."""
+    """Return the initial normaliser (unused) and the parameters of policy and value."""
     env = _environment(training, training.parts[0])
     one, other = jax.random.split(jax.random.key(training.seed))
     seen = jnp.zeros((1, env.size, FEATURES))
@@ -239,13 +239,13 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """How many rows the curve of a part has, and updates each of them."""
+    """Return the number of rows of a part's curve, and the number of updates per row."""
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each
 
 
-def _by_ppo(
+def _train_part(
     training: Training,
     part: Part,
     number: int,
@@ -253,15 +253,15 @@ def _by_ppo(
     params: Any,
     tell: Callable[[int, Mapping[str, Any]], None],
 ) -> Any:
-    """Parameters after one part, NumPy leaves.
+    """Train one part and return the parameters after it, NumPy leaves.
 
     Args:
-        training: of the part.
-        part: what is asked for.
-        number: of the part, by which its seed is made.
-        network: of the policy.
-        params: before the part.
-        tell: called with decisions of the part and their metrics, once a row of the curve.
+        training: settings of the training.
+        part: settings of the part.
+        number: number of the part, which enters its seed.
+        network: network of the policy.
+        params: parameters before the part.
+        tell: callback with the decisions and metrics of each row of the curve.
     """
     env = _environment(training, part)
     rows, each = _rows_and_updates(part, training.num_envs)
@@ -287,26 +287,26 @@ def _by_ppo(
         seed=training.seed * 1000 + number,
         restore_params=params,
         run_evals=False,
-        num_evals=rows + 1,  # the first one before all training
-        num_eval_envs=len(training.suites),  # Brax makes them even so
+        num_evals=rows + 1,  # the first row comes before all training
+        num_eval_envs=len(training.suites),  # Brax creates them even with run_evals=False
         progress_fn=tell,
     )
-    with reported_terms():
+    with report_terms():
         _, found, _ = ppo.train(**how)
     return jax.device_get(found)
 
 
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
-    """Policy and value as Brax has them, on observations that are flat."""
+    """Return policy and value in the form of Brax, for flat observations."""
     value = Value()
 
-    def seen(flat: Array) -> Array:
+    def unflatten(flat: Array) -> Array:
         return flat.reshape(*flat.shape[:-1], size, FEATURES)
 
     def numbers(_: Any, params: Any, flat: Array) -> Array:
-        found = network.apply(params, seen(flat))
-        # What is decided about absent targets does not count, and is no surprise.
-        found = jnp.where(seen(flat)[..., -1:] > 0.5, found, 0.0)
+        found = network.apply(params, unflatten(flat))
+        # Constant distributions for absent targets keep them out of the divergence.
+        found = jnp.where(unflatten(flat)[..., -1:] > 0.5, found, 0.0)
         means, spreads = found[..., :PER_TARGET], found[..., PER_TARGET:]
         shape = (*flat.shape[:-1], -1)
         return jnp.concatenate([means.reshape(shape), spreads.reshape(shape)], axis=-1)
@@ -319,7 +319,7 @@ def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONe
         ),
         value_network=brax_networks.FeedForwardNetwork(
             init=lambda key: value.init(key, one),
-            apply=lambda _, params, flat: value.apply(params, seen(flat)),
+            apply=lambda _, params, flat: value.apply(params, unflatten(flat)),
         ),
         parametric_action_distribution=NormalTanhDistribution(size * PER_TARGET, min_std=LEAST_STD),
     )

@@ -166,7 +166,7 @@ def test_the_command_line_names_a_decision_that_takes_no_file(capsys, tmp_path):
     "given, says",
     [
         (["--suite", "triangle9"], "--suite must be one or more of throws"),
-        (["--network", "deep"], "--network must be attention or mlp, got deep"),
+        (["--network", "deep"], "--network must be attention or mlp, got 'deep'"),
         (["--learning-rate", "0"], "--learning-rate must be > 0 and at most 1, got 0"),
         (["--suite", "triangle3", "--init-from", "nowhere.npz"], "that `planner-jax train` wrote"),
     ],
@@ -208,7 +208,7 @@ def test_a_reward_pays_early_catches_only_where_they_are_made():
         "caught": jnp.array([0.0, 0.5]),
         "violation": jnp.array([0.0, 1.0]),
     }
-    reward = environment.rewarded(terms, WEIGHTS)
+    reward = environment.weight_terms(terms, WEIGHTS)
     np.testing.assert_allclose(reward, [1.0 + 0.5 - 0.25, -0.5])
 
 

@@ -124,14 +124,14 @@ def _train(given: Options) -> None:
     require_backend()
     keep_compiled_programs()
     try:
-        from planner_jax.policies.training import train_as_asked
+        from planner_jax.policies.training import train_from_settings
     except ModuleNotFoundError as error:
         raise MissingExtra("train", error.name, "policies") from None
     rest = functools.partial(
         _how_to_continue, Path(out), f"go on with: {_own_command()}", "training.json"
     )
     with stopping.under_way(rest), _tell_how_to_continue(rest):
-        train_as_asked(settings, out)
+        train_from_settings(settings, out)
     print(f"{Path(out) / 'policy.npz'}")
 
 
