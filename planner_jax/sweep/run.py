@@ -248,19 +248,19 @@ def plan_baselines(
     return pa.concat_tables(tables)
 
 
-_OF_NETWORKS = ("parent", "name")  # fields of a Flax module that are none of its sizes
+_OF_NETWORKS = ("parent", "name")  # fields of every Flax module
 
 
 def _fields_of(planner: object) -> Entries:
-    """Return sizes and switches of a planner, for the manifest; of arrays, their shapes.
+    """Return the static fields of a planner for the manifest.
 
-    Of a network's weights it is how many there are.
+    Arrays appear as their shapes, the weights of a network as their number.
     """
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
-        value = vars(planner)[field.name]
         if field.name in _OF_NETWORKS:
             continue
+        value = vars(planner)[field.name]
         if dataclasses.is_dataclass(value):
             value = {"class": type(value).__name__, **_fields_of(value)}
         elif isinstance(value, dict):
