@@ -207,7 +207,7 @@ def test_inverse_kinematics_is_right_to_rounding_in_float32():
     angles = some_angles(arm, NUM)
     at = everything(arm, angles)
     assert at.branches.dtype == np.float32 and np.max(at.off[at.found]) < 2e-6
-    # Where the arm is stretched, or the wrist straight, angles are roots of what was rounded.
+    # If the arm is stretched or the wrist straight, angles are roots of rounded numbers.
     assert np.max(from_the_nearest(at, angles)) < 1e-2
 
 
@@ -217,11 +217,11 @@ def test_the_branches_move_as_the_jacobian_says():
     velocity, spin = np.random.default_rng(2).normal(size=(2, *middle.shape)).astype(np.float32)
     branches, found, rates = map(np.asarray, move_branches(arm, rotation, middle, velocity, spin))
     driven = np.einsum("nij,nj->ni", everything(arm, branches[found]).jacobian, rates[found])
-    wanted = np.concatenate([velocity, spin], axis=1)
-    np.testing.assert_allclose(driven, wanted[np.nonzero(found)[0]], atol=1e-3)
+    expected = np.concatenate([velocity, spin], axis=1)
+    np.testing.assert_allclose(driven, expected[np.nonzero(found)[0]], atol=1e-3)
 
 
-# Shields of the IRB 1600 that look along +x, with the wrist's centre at these places [m].
+# Positions [m] of the wrist centre of the IRB 1600 with its shield facing +x; whether it reaches.
 EDGES = {
     "straight wrist": ((0.75, 0.0, 0.9615), True),
     "straight arm": ((1.225, 0.0, 0.4865), True),
@@ -263,25 +263,19 @@ def test_every_product_asks_for_full_precision():
 
 def test_the_regimes_differ_in_speed_acceleration_and_end():
     speeds = [150.0, 160.0, 170.0, 320.0, 400.0, 450.0]  # [deg/s], of the datasheet
-    for name, factor, acceleration, ends_at_rest in (
-        ("R1", 2.0, 60.0, False),
-        ("R2", 1.0, 30.0, True),
-        ("R3", 2.0, 60.0, True),
-    ):
+    regimes = {"R1": (2.0, 60.0, False), "R2": (1.0, 30.0, True), "R3": (2.0, 60.0, True)}
+    for name, (factor, acceleration, ends_at_rest) in regimes.items():
         limits = REGIMES[name].limits
         np.testing.assert_allclose(np.rad2deg(limits.velocity) / factor, speeds, rtol=1e-6)
         np.testing.assert_array_equal(limits.acceleration, np.full(6, acceleration))
         assert REGIMES[name].ends_at_rest is ends_at_rest
 
 
-def test_the_packaged_arm_is_read_once_as_float32():
+def test_a_file_is_read_as_its_text_wherever_its_base_stands_and_packaged_once(tmp_path):
     assert irb1600() is irb1600()
-    assert {(type(leaf), leaf.dtype.name) for leaf in jax.tree.leaves(irb1600())} == {
+    assert {(type(x), x.dtype.name) for x in jax.tree.leaves(irb1600())} == {
         (np.ndarray, "float32")
     }
-
-
-def test_a_file_is_read_as_its_text_and_wherever_its_base_stands(tmp_path):
     place = tmp_path / "arm.xml"
     place.write_text(IRB1600.replace('<body name="base">', '<body name="base" pos="1 2 3">'))
     assert jax.tree.all(jax.tree.map(np.array_equal, read_arm(str(place)), irb1600()))
@@ -292,11 +286,7 @@ BAD = [
     ("<worldbody>", "<default/><worldbody>", "<default> in <mujoco .*> is not supported"),
     ('angle="radian"', 'angle="turn"', 'angle must be degree or radian, got "turn"'),
     ('angle="radian"', 'eulerseq="xYz"', 'eulerseq must be three of xyz or of XYZ, got "xYz"'),
-    (
-        '<joint name="joint_4"',
-        '<joint type="slide"',
-        "six links .*, got hinge, hinge, hinge, s",
-    ),
+    ('<joint name="joint_4"', '<joint type="slide"', "six links .*, got hinge, hinge, hinge, s"),
     ('<joint name="joint_4" axis="1 0 0" range="-3.4906 3.4906"/>', "", "hinge, none, hinge, hin"),
     ('name="link_2"', 'euler="0 0 0" quat="1 0 0 0"', "<body .*> must have quat or euler, not"),
     ('name="link_2"', 'quat="0 0 0 0"', "<body .*>: quat must be other than zero"),
@@ -333,10 +323,8 @@ def test_unknown_attributes_and_numbers_that_are_none_are_refused_in_every_eleme
     known = {"mujoco", "compiler", "body", "joint", "inertial", "geom"}
     arm = [root, root.find("compiler"), *root.find("worldbody/body").iter()]
     for element in (each for each in arm if each.tag in known):
-        numbers = {"pos", "quat", "axis", "range", "mass", "diaginertia", "size"} & {
-            *element.keys()
-        }
-        for name in ("unknown", *numbers):
+        numbers = ("pos", "quat", "axis", "range", "mass", "diaginertia", "size")
+        for name in ("unknown", *(each for each in numbers if each in element.attrib)):
             value = element.attrib.get(name)
             rule = rf"{name} (is not supported|must be . finite number\(s\))$"
             for bad in ("x", f"{value} nan", f"inf {value}"):

@@ -136,14 +136,10 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     """Check random positions of pole, floor and beams, for poses with the planner's margin."""
     rng, num = np.random.default_rng(3), 2000
     arm, scene = irb1600(), paper_scene()
-    moved = {
-        "pole": rng.uniform(-1.2, 1.2, (num, 2)),
-        "floor": rng.uniform(-0.6, -0.3, num),
-        "beam_ends": scene.beam_ends + rng.uniform(-0.3, 0.3, (num, 1, 1, 3)),
-    }
-    case = pj.block.case(
-        np.full((num, 3), 9.0), np.ones(3), angles=rng.uniform(arm.lower, arm.upper, (num, 6))
-    )
+    moved = {"pole": rng.uniform(-1.2, 1.2, (num, 2)), "floor": rng.uniform(-0.6, -0.3, num)}
+    moved["beam_ends"] = scene.beam_ends + rng.uniform(-0.3, 0.3, (num, 1, 1, 3))
+    angles = rng.uniform(arm.lower, arm.upper, (num, 6))
+    case = pj.block.case(np.full((num, 3), 9.0), np.ones(3), angles=angles)
     case = dataclasses.replace(case, scene=dataclasses.replace(case.scene, **moved))
     each = jax.jit(jax.vmap(lambda case: clearances(case.arm, case.scene, case.angles[None])[:, 0]))
     least = each(case).min(axis=1)
@@ -152,7 +148,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     kinds = referee_clearances(leaves, arm.capsule_link, angles, np.ones((num, 1), bool))
     distances = np.array([kinds[kind][0] for kind in KINDS])
     theirs = distances.min(axis=0)
-    assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # what the referee allows
+    assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # tolerance of the referee
     free = theirs > 0.01
     np.testing.assert_allclose(least[free], theirs[free], atol=6e-3)
     nearest = np.array([kinds[kind][2] for kind in KINDS])[distances.argmin(axis=0), np.arange(num)]

@@ -42,9 +42,8 @@ def test_a_table_has_units_every_number_bit_for_bit_and_100_rows_a_second(tmp_pa
 
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
-    profile, [(schema, channel, record, message)] = bag(
-        as_it_is(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
-    )
+    path = as_it_is(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    profile, [(schema, channel, record, message)] = bag(path)
     kind = "JointTrajectory" if robot == "arm" else "MultiDOFJointTrajectory"
     assert (profile, schema.encoding, channel.message_encoding) == ("ros2", "ros2msg", "cdr")
     assert schema.name == f"trajectory_msgs/msg/{kind}" and record.log_time == 0
@@ -104,6 +103,8 @@ def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
 @pytest.mark.parametrize("robot", ["car", "arm"])
 def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, robot):
     """Stand-ins of its classes have the fields of the message definitions and no others."""
+    with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
+        ros2.trajectory_message(arm())
     for kind, definition in ros2.TYPES.items():
         package, name = kind.split("/")
         slots = [line.split()[1] for line in definition.splitlines()]
@@ -118,11 +119,6 @@ def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, 
     time = made.points[-1].time_from_start
     assert type(time).__name__ == "Duration"
     assert time.nanosec == plain["points"][-1]["time_from_start"]["nanosec"]
-
-
-def test_without_ros_a_message_is_refused_with_what_is_missing():
-    with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
-        ros2.trajectory_message(arm())
 
 
 @pytest.mark.parametrize("powers", [6, 8])
@@ -158,9 +154,7 @@ def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
     assert len(poly4d(quadrotor(num=31))) == 31
     with pytest.raises(ArgumentError, match="^plan must have at most 31 pieces, .* got 32$"):
         poly4d(quadrotor(num=32))
-    with pytest.raises(
-        ArgumentError, match="^plan must be of degree 7 or less for a Crazyflie, got 9$"
-    ):
+    with pytest.raises(ArgumentError, match="^plan must be of degree 7 or less .*, got 9$"):
         poly4d(quadrotor(powers=10))
     high = quadrotor(powers=10)
     nought = high.trajectory.coeffs * (np.arange(10)[:, None] < 8)
