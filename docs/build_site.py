@@ -1,8 +1,8 @@
 """Build the documentation site into build/site; `make docs` runs this.
 
-Pages from outside of docs/ are staged beside those of docs/ in build/pages, with links as the site
-has them. A link to a file that is no page, such as a module, becomes plain text if the file exists.
-The build fails for a broken link or anchor, and if a public name is missing from the API reference.
+All pages, also those from outside of docs/, are staged in build/pages with the links of the site. A
+link to a file that is no page, such as a module, becomes plain text if the file exists. The build
+fails for a broken link or anchor, and if a public name is missing from the API reference.
 """
 
 import importlib.util

@@ -18,7 +18,7 @@ from planner_jax.cli.main import _make_parser
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-BY_DEFAULT = ("README", "overview", "extending", "own_ball")  # the others are slow
+BY_DEFAULT = ("README", "overview", "extending", "own_ball", "controllers")  # the others are slow
 FENCE = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```", re.MULTILINE | re.DOTALL)
 NOT_RUN = re.compile(r"<!-- not run: .+ -->\s*$")
 SMALL = {"draw(1000": "draw(16", "draw(100,": "draw(16,", "draw(100)": "draw(16)"}
@@ -86,7 +86,7 @@ def test_the_command_lines_of_a_page_parse(page):
     for line in command_lines(page):
         words = shlex.split(line.partition(" > ")[0], comments=True)
         if words[0] == "planner-jax":
-            only_named = len(words) == 2  # such as `planner-jax fly`
+            only_named = all(word.isalpha() and word.islower() for word in words[1:])
             parse(line, [*words[1:], "--help"] if only_named else words[1:])
         else:
             find_options_of_benchmark(line, words)
