@@ -32,10 +32,7 @@ def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
 def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
     """Compile all programs, since compilation must not count as search time.
 
-    Args:
-        tree: structure of (arm, scene).
-        layout: shape and type of each leaf.
-        dtype: of the angles.
+    `tree` is the structure of (arm, scene), `layout` the shape and type of each leaf.
     """
     arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
     for size in _BATCHES:
@@ -46,12 +43,7 @@ class FreeSpace:
     """The collision-free angles of one case's arm within its position limits."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
-        """Compile the programs for a case.
-
-        Args:
-            case: one case with NumPy leaves.
-            margin: [m], least distance from obstacles and from the arm itself.
-        """
+        """Compile the programs for a case with NumPy leaves and a margin [m] from obstacles."""
         self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
         self._dtype = np.asarray(case.angles).dtype
         self._arm, self._scene = jax.device_put((case.arm, case.scene))
@@ -75,9 +67,7 @@ class FreeSpace:
     def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return which straight joint motions are collision-free, ends included, (N,) bool.
 
-        Args:
-            begins: (N, 6) [rad], or (6,) for all.
-            ends: (N, 6) [rad].
+        They lead from angles (N, 6), or (6,) for all, to angles (N, 6) [rad].
         """
         begins = np.broadcast_to(begins, ends.shape)
         lengths = np.linalg.norm(ends - begins, axis=1)

@@ -47,19 +47,10 @@ class Candidates:
 
 
 def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Array, Array]:
-    """Return the time at which a target first falls through a height.
+    """Return the time () [s] at which a target first falls through a height, and whether it does.
 
-    The first of `nodes` equal intervals that starts above and ends below the height is bisected.
-
-    Args:
-        target: one path.
-        height: () [m].
-        horizon: () [s], end of the search.
-        nodes: number of intervals.
-
-    Returns:
-        time: () [s]; the horizon if the target does not fall through the height before it.
-        found: () bool.
+    The first of `nodes` equal intervals of the horizon that starts above and ends below the height
+    is bisected. The time is the horizon if there is none.
     """
 
     def above(time: Array) -> Array:
@@ -184,11 +175,8 @@ class MppCatch(Planner):
     ) -> Candidates:
         """Return the candidate primitives of one segment.
 
-        Args:
-            head_state: (4, 3), start of the segment, position to jerk.
-            ball: the target at the catch.
-            duration: () [s], of the segment.
-            case: for gravity and the net.
+        The segment starts at `head_state` (4, 3), position to jerk, and lasts `duration` () [s]
+        until it catches the ball.
         """
         ends = self.end_states(ball, case)
         tried = jax.vmap(minimum_jerk_after_ramp, in_axes=(None, 0, None, None))(

@@ -52,13 +52,9 @@ COST_UNIT = 1e3  # scales the Hessian to moderate entries
 
 
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
-    """Return the excess over speed, body rate, thrust and ground limits (eqs 26-28).
+    """Return the excess of samples over speed, body rate, thrust and ground limits (eqs 26-28).
 
-    Squares are in their own units.
-
-    Args:
-        motion: samples of a trajectory.
-        given: gravity and limits of a case.
+    Squares are in their own units. `given` is a case's gravity and limits.
     """
     gravity, limits = given
     return (
@@ -70,14 +66,10 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
 
 
 def steep_hinge(x: Array, width: float | Array) -> Array:
-    """Return L_eps(x): cubic up to eps, then a far steeper cubic [Yu2023catch, eq. 23].
+    """Return L_eps(x) for eps = width: cubic up to eps, then far steeper [Yu2023catch, eq. 23].
 
     Above eps it is eps^3 + (x - eps)^2 x / eps^4, as printed. The value is continuous at eps, but
     the slope drops from 3 eps^2 to 0.
-
-    Args:
-        x: (...) violation.
-        width: eps > 0.
     """
     inside = jnp.clip(x, 0.0, width)
     beyond = jnp.maximum(x - width, 0.0)
@@ -85,13 +77,10 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
 
 
 def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
-    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f, as the code of [Yu2023catch] does.
+    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f of accelerations (..., 3).
 
-    Args:
-        acc: (..., 3) [m/s^2].
-        gravity: () [m/s^2].
-        least: () [m/s^2], per unit mass.
-        most: () [m/s^2], per unit mass.
+    The code of [Yu2023catch] has this form. The thrust limits are per unit mass [m/s^2]; their
+    middle and half width are `middle` and `half`.
     """
     x, y, z = components(acc)
     z = z + gravity

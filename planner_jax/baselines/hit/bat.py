@@ -189,11 +189,9 @@ class BatHit(OptimisedPlanner):
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """Return the impact that the last five variables describe, and the defect of eqs 13-14.
+        """Return the impact of the last five variables, and the defect of eqs 13-14.
 
-        Args:
-            natural: (5,) log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
-            context: of the case.
+        They are log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
         """
         case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)

@@ -27,13 +27,9 @@ class BezierCurve:
     horizon: Array  # () T [s], duration of all pieces together
 
     def at(self, time: Array, order: int = 0) -> Array:
-        """Return the value of one curve, or a derivative by time, at times (...) [s].
+        """Return the value of one curve, or its derivative of an order, at times (...) [s].
 
         Before 0 and after the horizon the nearest piece is extrapolated.
-
-        Args:
-            time: (...) [s].
-            order: of the derivative; 0 for the value.
         """
         pieces, degree = self.points.shape[0], self.points.shape[1] - 1
         place = time / self.horizon * pieces

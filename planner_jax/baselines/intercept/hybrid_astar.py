@@ -32,10 +32,10 @@ class HybridAstar:
     """
 
     cell: float = 0.1  # [m], side of a cell
-    headings: int = 72  # bins of a turn
-    turn_price: float = 0.05  # of a metre at the tightest curvature, in metres
-    # By how much, relative, the heuristic is stretched (weighted A* [Pohl1970]), and so how far
-    # the cost may be above the least on the lattice.
+    headings: int = 72  # heading bins of a full turn
+    turn_price: float = 0.05  # added cost [m] per metre driven at the greatest curvature
+    # Relative inflation of the heuristic (weighted A* [Pohl1970]), and thereby a bound on the
+    # relative excess over the least cost on the lattice.
     slack: float = 0.1
     margin: float = 0.01  # [m], distance from polygons; covers the gaps between samples
     poses: int = 129  # number of poses of the result

@@ -323,16 +323,7 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Collect the path to a node and the shot after it: curvatures [1/m] and lengths [m].
-
-    Args:
-        tree: reached nodes.
-        node: where the shot starts.
-        primitives: arcs between nodes.
-        lengths: (3,) [m], parts of the shot.
-        senses: (3,), 1 for left, -1 for right, 0 for straight, of these parts.
-        curvature: [1/m], greatest curvature.
-    """
+    """Collect the path to a node and its shot: curvatures [1/m] and lengths [m] of all parts."""
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]

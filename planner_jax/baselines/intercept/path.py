@@ -144,9 +144,7 @@ def path_beside(
 def nearness(push: Array, miss: float) -> Quadratic:
     """Return the quadratic model of the squared distance of samples (K, S) from given positions.
 
-    Args:
-        push: (K, S, 2), half the gradient by the position of each sample.
-        miss: [m], distance of unit cost.
+    `push` is half the gradient (K, S, 2) by positions; `miss` [m] is the distance of unit cost.
     """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)

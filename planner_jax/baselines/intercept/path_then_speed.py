@@ -130,13 +130,7 @@ class PathThenSpeed(Planner):
     def solve_in_layers(
         self, case: InterceptCase, attempt: Search, layers: Array | None
     ) -> InterceptPlan:
-        """Return the plan of one case from a reach set with a given number of layers.
-
-        Args:
-            case: one case.
-            attempt: the search for paths.
-            layers: () int32, layers of the reach set; None derives them from the case.
-        """
+        """Return the plan of one case; `layers` () int32 sets the reach set's number of layers."""
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
@@ -177,21 +171,14 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Create the planner that tries eight paths with curves in trapezoidal corridors.
-
-    Args:
-        **fields: fields of `PathThenSpeed`.
-    """
+    """Create the planner of eight paths with curves in corridors; options are its fields."""
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 
 def em(**fields: object) -> PathThenSpeed:
-    """Create the planner that combines the best path with the speed step of the EM planner.
+    """Create the planner with the best path and the speed step of the EM planner.
 
-    The speed step has the pieces and sample times of `lattice`.
-
-    Args:
-        **fields: fields of `PathThenSpeed`.
+    The speed step has the pieces and sample times of `lattice`; options are fields of the planner.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
@@ -200,9 +187,6 @@ def em(**fields: object) -> PathThenSpeed:
 def constant(**fields: object) -> PathThenSpeed:
     """Create the planner that drives the best path at constant speed, ignoring movers.
 
-    A short ramp from the initial speed comes first.
-
-    Args:
-        **fields: fields of `PathThenSpeed`.
+    A short ramp from the initial speed comes first; options are fields of the planner.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})

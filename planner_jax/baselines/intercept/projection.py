@@ -91,15 +91,7 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
 def project_obstacles(
     path: Path, movers: Obstacles, body: CarBody, horizon: Array, projection: Projection
 ) -> Blocked:
-    """Return P = M * runs * slabs quadrangles that cover everything M moving obstacles block.
-
-    Args:
-        path: path of the rear axle, N points.
-        movers: M obstacles.
-        body: body of the car.
-        horizon: () [s].
-        projection: sizes.
-    """
+    """Return P = M * runs * slabs quadrangles that cover everything M obstacles block."""
     half_step = 0.5 * path.length / (path.curvature.shape[0] - 1)
     begin, finish = overlap(path, movers, body, half_step, projection.margin)
     first, last = -_BEFORE * horizon, (1.0 + _BEFORE) * horizon
@@ -121,18 +113,11 @@ def project_obstacles(
 def overlap(
     path: Path, movers: Obstacles, body: CarBody, half_step: Array, margin: float
 ) -> tuple[Array, Array]:
-    """Return when the body overlaps obstacles at points of a path: start and end [s], (M, N) each.
+    """Return when the body overlaps M obstacles at N path points: start and end [s], (M, N) each.
 
-    The body is enlarged so that the interval is valid for half a step before and after each of the
-    N points. Without an overlap the interval starts after its end. For an obstacle at rest it may
-    be infinite.
-
-    Args:
-        path: path of the rear axle, N points.
-        movers: M obstacles.
-        body: body of the car.
-        half_step: () [m], half the distance of neighbouring points.
-        margin: [m], distance kept from obstacles.
+    The body is enlarged by the margin [m], and so that the interval is valid for half a step () [m]
+    before and after each point. Without an overlap the interval starts after its end. For an
+    obstacle at rest it may be infinite.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -195,15 +180,10 @@ def _least(values: list[Array]) -> Array:
 def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Cover one run with quadrangles (slabs,).
+    """Cover a run with quadrangles (slabs,).
 
-    Args:
-        own: (N,) bool, the points of the path that belong to the run.
-        begin: (N,) [s], when each point becomes blocked.
-        finish: (N,) [s], when each point becomes free again.
-        station: (N,) [m], of the points.
-        half_step: () [m], half the distance of neighbouring points.
-        slabs: number of quadrangles.
+    The run consists of the path points `own` (N,) bool, which are blocked from `begin` to `finish`
+    (N,) [s].
     """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))

@@ -67,8 +67,8 @@ class SpeedPlanner:
 
 
 # "tilted" lines are this library's choice, "edges" the choice of [Qu2022]. "em" is the speed step
-# of [Fan2018]: bounds at samples, every 0.1 s
-# of a horizon of 10 s, from intervals that are free for a whole piece.
+# of [Fan2018]: bounds at samples, every 0.1 s of a horizon of 10 s, from intervals that are free
+# for a whole piece.
 SPEED_PLANNERS = {
     "trapezoid": SpeedPlanner(),
     "trapezoid-edges": SpeedPlanner(lines="edges"),
@@ -157,12 +157,8 @@ def speed_bounds(
 ) -> tuple[Array, Array, Array]:
     """Return the right sides (3,), lower and upper bounds (M,) of one problem's program.
 
-    Lengths are in units of the path length, times in units of the horizon.
-
-    Args:
-        problem: one problem.
-        reference: the line whose side of each polygon the curve keeps.
-        planner: the planner whose program is bounded.
+    Lengths are in units of the path length, times in units of the horizon. The curve keeps to the
+    side of each polygon on which the reference line is.
     """
     pieces = planner.pieces
     around = corridor(problem, reference.station, pieces, planner.lines)

@@ -53,12 +53,9 @@ class PathSource:
     def paths(
         self, case: InterceptCase, attempt: Search, layers: Array | None = None
     ) -> StaticPaths:
-        """Find the paths of one case.
+        """Find the paths of one case; the attempt's `paths` is their number.
 
-        Args:
-            case: one case.
-            attempt: the search; its number of `paths` is returned.
-            layers: layers of the reach set, shared by a batch; see `search_reach`.
+        `layers` is the number of layers of the reach set; see `search_reach`.
         """
         still = without_movers(case)
         found = search_reach(still, attempt, is_time_free=True, layers=layers)

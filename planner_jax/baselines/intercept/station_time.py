@@ -185,13 +185,9 @@ def _parts_of_cells(num: int, parts: int) -> np.ndarray:
 
 
 def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
-    """Return whether the line passes above each polygon, (P,) bool.
+    """Return whether a line (N + 1,) [m] at equally spaced times passes above each polygon, (P,).
 
     Above a polygon means that the car passes before the obstacle.
-
-    Args:
-        problem: one problem.
-        station: (N + 1,) [m], the line, at equally spaced times from 0 to the horizon.
     """
     blocked = problem.blocked
     begin, finish = (jnp.clip(time, 0.0, problem.horizon) for time in (blocked.start, blocked.end))
@@ -202,12 +198,7 @@ def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
 
 
 def stations_at_joints(station: Array, pieces: int) -> Array:
-    """Return the stations (K + 1,) [m] of a line at the ends of K equal pieces.
-
-    Args:
-        station: (N + 1,) [m], the line, at equally spaced times.
-        pieces: K.
-    """
+    """Interpolate a line (N + 1,) [m] at the ends of K equal pieces, (K + 1,) [m]."""
     times = jnp.linspace(0.0, 1.0, station.shape[-1])
     return jnp.interp(jnp.linspace(0.0, 1.0, pieces + 1), times, station)
 
@@ -305,14 +296,10 @@ def corridor(
 
 
 def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Array, Array]:
-    """Return floor, ceiling and greatest speed of every piece, (K,) each.
+    """Return floor, ceiling and greatest speed (K,) of every piece.
 
-    The speed is the least limit on the parts of the path that the line passes in the piece. Floor
-    and ceiling exclude parts with a lower limit.
-
-    Args:
-        problem: one problem.
-        joints: (K + 1,) [m], stations of the line at the ends of the pieces.
+    The speed is the least limit on the parts of the path that the line, at stations (K + 1,) of the
+    joints, passes in the piece. Floor and ceiling exclude parts with a lower limit.
     """
     limit = problem.speed_limit
     edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1) * problem.end_station

@@ -172,10 +172,6 @@ def error_across(belief: EkfState, ball: BallState) -> Array:
 
     To first order in the error, it is the distance between expected and true contact on a shield
     that faces the ball.
-
-    Args:
-        belief: estimate at some time.
-        ball: true ball at that time.
     """
     off = belief.mean[:3] - ball.pos
     along = jnp.sum(off * ball.vel) / jnp.maximum(jnp.sum(ball.vel**2), 1e-12)

@@ -82,13 +82,7 @@ class Decided:
 def plan_with_aims(
     planner: Planner, cases: BlockCase | Replanning, aims: Sequence[Aim] = AIMS
 ) -> BlockPlan:
-    """Plan for a batch with fitted balls, by the first aim that leads to a plan.
-
-    Args:
-        planner: of these cases.
-        cases: a batch of B.
-        aims: one or more.
-    """
+    """Plan for a batch with fitted balls, by the first aim that leads to a plan."""
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
     for aim in aims:
@@ -223,11 +217,8 @@ class _Arms:
     ) -> None:
         """Switch to new motions for all arms that get one.
 
-        Args:
-            planner: of motions.
-            known: the balls as estimated, and when motions may start.
-            useful: (B,) int, number of aims worth trying.
-            aims: in the order of increasing offsets.
+        `known` has the balls as estimated, and when motions may start. `useful` (B,) is the number
+        of aims worth trying, in the order of increasing offsets.
         """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)

@@ -197,12 +197,9 @@ class AdaptBlock(Planner):
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
     def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return the shortfall of motions below the pole margin, (C,) [m]; <= 0 keeps the margin.
+        """Return the shortfall of motions (C, K, 6) below the pole margin, (C,) [m].
 
-        Args:
-            case: one case.
-            moves: (C, K, 6) [rad], steps of the motions.
-            samples: number of samples of each motion.
+        A shortfall <= 0 keeps the margin at all samples.
         """
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)

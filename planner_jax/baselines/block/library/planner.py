@@ -51,11 +51,7 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the library was built for the first of the cases.
-
-        Args:
-            cases: one case, or a batch.
-        """
+        """Raise `ArgumentError` unless the library was built for the first of the cases."""
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)
