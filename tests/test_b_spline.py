@@ -95,7 +95,7 @@ def test_the_curve_is_exact_to_rounding_in_float32():
     np.testing.assert_allclose(value, scipy_curve(3, points)(SHARES), atol=2e-6)
 
 
-def test_gradients_by_control_points_and_duration_are_those_of_differences(float64):
+def test_gradients_by_control_points_and_duration_match_differences(float64):
     weights = np.random.default_rng(0).normal(size=(3, len(SHARES), 6))
 
     def total(point):
@@ -116,6 +116,6 @@ def test_gradients_by_control_points_and_duration_are_those_of_differences(float
         (lambda: basis(3, 5, np.nan), "shares must be from 0 to 1, got nan"),
     ],
 )
-def test_what_makes_no_spline_is_refused_in_one_line(call, message):
+def test_invalid_splines_are_rejected_in_one_line(call, message):
     with pytest.raises(ValueError, match=f"^{message}"):
         call()

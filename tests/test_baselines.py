@@ -157,7 +157,7 @@ def sum_of_hit(thrust_xz, ball_vel, xi):
         ((5.0, 1.0, 0.0), (5.0, 0.0, 0.0), (1e-3, 0.0)),
     ],
 )
-def test_a_hit_that_cannot_be_is_finite_and_says_so(xi, ball_vel, thrust):
+def test_an_impossible_hit_is_finite_and_has_a_defect(xi, ball_vel, thrust):
     (_, hit), gradient = sum_of_hit(jnp.array(thrust), jnp.array(ball_vel), jnp.array(xi))
     assert hit.defect > 0.0
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((hit, gradient)))
@@ -238,7 +238,7 @@ def test_first_waypoints_lie_on_the_primitives(cases, transition):
 # the plans
 
 
-def test_juggle_is_at_rest_first_and_in_its_fixed_stroke_last(cases, juggle_plans):
+def test_juggle_starts_at_rest_and_ends_in_its_fixed_stroke(cases, juggle_plans):
     verdict = referee_hits(cases, juggle_plans)
     assert verdict.head_error.max() < 1e-6
     assert verdict.continuity_error.max() < 1e-4
@@ -290,7 +290,7 @@ def test_bat_meets_the_ball_and_reaches_the_target_on_every_lane(cases, bat_plan
 
 
 @pytest.mark.parametrize("name", ["bat_plans", "juggle_plans"])
-def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(cases, name, request):
+def test_a_plan_that_breaks_a_limit_has_a_failure_status(cases, name, request):
     plans = request.getfixturevalue(name)
     verdict = referee_hits(cases, plans)
     refused = np.isin(verdict.failed_limit, ["speed", "acceleration", "body rate", "apex low"])
@@ -299,13 +299,13 @@ def test_a_lane_that_breaks_a_limit_carries_a_status_that_says_so(cases, name, r
     assert (plans.violation[refused] > 0.0).all()
 
 
-def test_juggle_decides_nothing_and_so_never_asks_for_more_iterations(juggle_plans):
+def test_juggle_takes_no_iterations(juggle_plans):
     assert (juggle_plans.iterations == 0).all()
     assert set(np.asarray(juggle_plans.status)) <= {Status.CONVERGED, Status.INFEASIBLE}
 
 
 @pytest.mark.parametrize("make", [BatHit, JuggleHit])
-def test_no_equation_leaks_a_nan_and_its_neighbours_do_not_notice(make, cases):
+def test_degenerate_cases_stay_finite_and_leave_other_lanes_unchanged(make, cases):
     broken = jax.tree.map(lambda a, b: np.concatenate([b[:9], a]), serves_gone_wrong(), cases)
     found = plan(make(), broken)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found))
@@ -338,6 +338,6 @@ def test_the_published_planners_have_a_single_start():
     assert {attempt.starts for each in (BAT, JUGGLE) for attempt in each.attempts} == {1}
 
 
-def test_one_piece_has_no_waypoint_to_decide_on():
+def test_one_piece_is_rejected():
     with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
         BatHit(num_pieces=1)

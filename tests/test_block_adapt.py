@@ -74,7 +74,7 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
 
 
 @pytest.mark.slow
-def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
+def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
     """The ball differs from the ball of the stored motions; limits at knots are exact."""
     own = planner(has_pole=False)
     scene = paper_scene(has_pole=False)
@@ -103,7 +103,7 @@ def test_warped_motions_end_where_the_ball_is_and_open_ones_keep_their_limits():
 
 
 @pytest.mark.slow
-def test_a_stored_motion_for_the_very_ball_is_not_warped():
+def test_a_stored_motion_for_the_same_ball_is_not_warped():
     """The plan is one of the stored straight motions, in the available time."""
     own = planner(has_pole=False)
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
@@ -139,7 +139,7 @@ def planned():
 GOOD = [0, 6, 7]
 
 
-def test_statuses_of_a_batch_say_why_and_the_referee_confirms_what_is_solved(planned):
+def test_statuses_name_the_reason_and_the_referee_confirms_solved_plans(planned):
     _, cases, plans = planned
     S = pj.Status
     assert plans.status[1] == S.OUT_OF_REACH and plans.status[2] == S.BAD_INPUT
@@ -148,7 +148,7 @@ def test_statuses_of_a_batch_say_why_and_the_referee_confirms_what_is_solved(pla
     assert pj.solved(plans)[GOOD].all() and verdict.success[GOOD].all()
 
 
-def test_what_is_wrong_with_a_file_or_with_cases_is_named(tmp_path):
+def test_invalid_files_and_cases_are_rejected(tmp_path):
     with pytest.raises(ValueError, match="adapt:FILE, which `planner-jax library build FILE`"):
         pj.block.planner("adapt")
     with pytest.raises(ArgumentError, match="^library must be a file, got 'no/file'"):

@@ -43,7 +43,7 @@ def test_one_fit_after_a_quarter_of_a_second_is_within_reach_of_the_shield():
     assert np.mean(off(cases, seen.fits) < 0.1) >= 0.9
 
 
-def test_planners_get_the_fitted_ball_from_when_the_fit_is_there():
+def test_planners_get_the_fitted_ball_and_the_delay():
     cases = pj.block.draw(4, seed=5)
     seen = see(cases, eye(std=1e-4, rate=120.0), 0.25, overhead=0.05, seed=2)
     np.testing.assert_allclose(seen.cases.delay, 0.3, rtol=1e-6)
@@ -54,7 +54,7 @@ def test_planners_get_the_fitted_ball_from_when_the_fit_is_there():
     np.testing.assert_array_equal(again.cases.ball.pos, seen.cases.ball.pos)
 
 
-def test_a_camera_that_never_sees_the_ball_is_a_status_all_the_way():
+def test_an_unseen_ball_is_a_status_of_fit_and_plan():
     """The fit and the plan carry a status, and the referee rejects the plan."""
     cases = pj.block.draw(6, seed=5, regime="R1", wide=True)
     away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
@@ -79,7 +79,7 @@ def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
         np.testing.assert_array_equal(pj.block.judge(cases, met).success[solved], True)
 
 
-def test_a_ball_that_comes_later_meets_a_braking_arm_that_was_there_in_time():
+def test_a_late_ball_meets_the_braking_arm():
     """A ball 10 ms later moves the contact by about 10 ms, to the shield's position then."""
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
     near_middle = cautious(cases, offset=0.01)
@@ -96,7 +96,7 @@ def test_a_ball_that_comes_later_meets_a_braking_arm_that_was_there_in_time():
     np.testing.assert_allclose(verdict.height[solved], 0.0, atol=1e-3)
 
 
-def test_planners_are_to_be_cautious_with_balls_that_seem_to_pass_by():
+def test_cautious_cases_enlarge_the_box_for_balls_that_miss_it():
     cases = pj.block.draw(4, seed=1, wide=True)
     ball = dataclasses.replace(cases.ball, vel=cases.ball.vel.at[1, 2].add(9.0))
     cases = dataclasses.replace(cases, ball=ball)
@@ -107,7 +107,7 @@ def test_planners_are_to_be_cautious_with_balls_that_seem_to_pass_by():
     np.testing.assert_array_equal(given.scene.inner.lower[:, 2], cases.scene.inner.lower[:, 2])
 
 
-def test_frames_count_from_the_first_to_the_moment_itself():
+def test_frames_include_the_first_and_the_moment_itself():
     assert len(frame_times(eye(rate=60.0), 0.25)) == 16
     assert len(frame_times(eye(rate=30.0), 0.08)) == 3
     assert frame_times(eye(rate=120.0), 0.0).tolist() == [0.0]
@@ -122,6 +122,6 @@ def test_frames_count_from_the_first_to_the_moment_itself():
         (lambda cases: see(cases, eye(), 0.1, overhead=-1.0), "overhead must be >= 0, got -1"),
     ],
 )
-def test_what_cannot_be_is_refused_in_a_line(make, message):
+def test_invalid_arguments_are_rejected(make, message):
     with pytest.raises(ValueError, match=message):
         make(jax.tree.map(jnp.asarray, pj.block.draw(2)))

@@ -105,15 +105,12 @@ def _no_boxes():
     return Box(behind, behind + 1.0), outer
 
 
-def test_points_on_edges_are_in_one_cell_whichever_face_they_are_said_to_be_of():
+def test_points_on_edges_are_in_exactly_one_cell():
     box = paper_scene().outer
     at = jax.jit(lambda point: cell_of(TINY.outer, box, tuple(point)))
     assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the one with greater y
     assert at(jnp.array([1.0, 0.0, 0.9250001])) == (3, True)
-    assert at(jnp.array([1.0, 0.3, 1.85])) == (
-        3,
-        True,
-    )  # an edge: the face normal to x
+    assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # an edge: the face normal to x
     assert at(jnp.array([0.999, 0.3, 1.85])) == (5, True)
     assert at(jnp.array([1.0, 1.0, 0.1])) == (2, True)
     assert not at(jnp.array([0.3, 1.0, 0.1]))[1]  # no cells on +y
@@ -170,7 +167,7 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
     assert np.isinf(farthest_crossing(outer, inner, behind, rotation))
 
 
-def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
+def test_a_lookup_returns_the_stored_motion_and_its_contact():
     """From both homes; contact time and position follow the parabola."""
     library = make_library(homes=2)
     scene = paper_scene()
@@ -193,7 +190,7 @@ def test_a_lookup_gives_back_what_is_stored_and_when_the_ball_is_there():
         np.testing.assert_allclose(plans.cost, 0.4)
 
 
-def test_one_ball_is_looked_up_as_many_are():
+def test_one_ball_gets_the_answer_of_a_batch():
     library = make_library(homes=2)
     cases = pj.block.draw(40, seed=2)
     of_many = jax.jit(jax.vmap(lookup, (None, 0, 0, None)))
@@ -210,7 +207,7 @@ def test_one_ball_is_looked_up_as_many_are():
     assert not one.answer(cases.ball.pos[missed], cases.ball.vel[missed]).stored
 
 
-def test_statuses_say_why_a_stored_motion_will_not_do():
+def test_statuses_name_the_reason_of_a_failure():
     library = make_library()
     # Balls through the cell y, z > 0 of both boxes, and balls that fail.
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
@@ -241,7 +238,7 @@ def test_statuses_say_why_a_stored_motion_will_not_do():
     assert pj.plan(LibraryBlock(library), strict).status == S.INFEASIBLE
 
 
-def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
+def test_motions_that_end_in_motion_wait_and_others_start_at_once():
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     for regime in ("R1", "R3"):
         case = pj.block.case(*good, regime=regime, delay=0.05, anywhere=True)
@@ -253,7 +250,7 @@ def test_motions_that_end_in_motion_wait_and_others_begin_at_once():
         )
 
 
-def test_a_library_of_other_cases_is_refused_with_both_hashes():
+def test_a_library_of_other_cases_is_rejected_with_both_hashes():
     planner = LibraryBlock(make_library())
     planner.check(pj.block.draw(2))
     with pytest.raises(ArgumentError, match=r"one of [0-9a-f]{12} for cases of [0-9a-f]{12}$"):
@@ -280,7 +277,7 @@ def test_a_file_holds_the_library_and_is_mapped(tmp_path):
     assert not list(tmp_path.glob("*.tmp"))
 
 
-def test_what_is_wrong_with_a_file_is_told_in_one_line(tmp_path, monkeypatch):
+def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
     path = tmp_path / "a.lib"
 
     def rejects(says):
@@ -324,7 +321,7 @@ def counted(monkeypatch):
     return calls
 
 
-def test_a_build_that_is_interrupted_goes_on_to_the_same_library(tmp_path, counted, monkeypatch):
+def test_a_resumed_build_gives_the_same_library(tmp_path, counted, monkeypatch):
     homes = np.stack([irb1600().home, irb1600().home])
     homes[1, 0] += 0.1
     given = (setting(), homes, TINY)
@@ -353,7 +350,7 @@ def test_a_build_that_is_interrupted_goes_on_to_the_same_library(tmp_path, count
     )
 
 
-def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkeypatch):
+def test_parts_of_another_library_are_discarded(tmp_path, counted, monkeypatch):
     parts = tmp_path / "a.parts"
     plain = building.plan_pairs
     monkeypatch.setattr(building, "save_library", lambda *_: (_ for _ in ()).throw(OSError))
@@ -369,7 +366,7 @@ def test_parts_of_another_library_are_not_gone_on_with(tmp_path, counted, monkey
     assert len(counted) == 2 * num
 
 
-def test_a_repair_plans_anew_only_what_is_no_longer_free(counted, monkeypatch):
+def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
     library = make_library(LAYOUTS["A"])
     pairs = np.arange(LAYOUTS["A"].num_pairs)
     hit = (pairs % 100 == 3) & library.found[0]
@@ -405,7 +402,7 @@ def test_a_repair_needs_the_same_boxes():
         building.repair(make_library(), other)
 
 
-def test_a_home_in_collision_is_refused(tmp_path):
+def test_a_home_in_collision_is_rejected(tmp_path):
     home = irb1600().home.copy()
     home[1] = 1.9
     with pytest.raises(ValueError, match="^homes must be free, got -.* m to .* at home 0$"):
@@ -427,7 +424,7 @@ def test_a_home_in_collision_is_refused(tmp_path):
         ({"home": [0.0] * 7}, "^home must be six angles for each home, got 7 numbers$"),
     ],
 )
-def test_what_is_wrong_with_a_build_is_named(options, says, tmp_path):
+def test_invalid_builds_are_rejected(options, says, tmp_path):
     with pytest.raises(ArgumentError, match=says):
         command.build_library(str(tmp_path / "a"), **options)
 
@@ -445,7 +442,7 @@ def test_a_library_is_shown_with_a_map(tmp_path, capsys):
         command.repair_library(str(path), pole=[0.8, float("nan")], out=str(tmp_path / "b.lib"))
 
 
-def test_the_command_line_shows_a_library_and_refuses_what_is_none(tmp_path, capsys):
+def test_the_command_line_shows_a_library_and_rejects_other_files(tmp_path, capsys):
     path = tmp_path / "a.lib"
     save_library(path, make_library())
     assert main(["library", "show", str(path)]) == 0
@@ -472,7 +469,7 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
-def test_the_referee_confirms_what_is_built(regime, starts, tmp_path, monkeypatch):
+def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypatch):
     """Every pair has a motion, shields block nearly all balls, and all claims are true.
 
     Starts are tried one after another, as on a CPU, or at once.

@@ -72,7 +72,7 @@ def torques(arm, motion, gravity):
     return motion_torques(arm, motion, gravity, samples=64)
 
 
-def test_an_arm_that_stands_exerts_what_gravity_asks(float64):
+def test_an_arm_at_rest_exerts_the_torque_of_gravity(float64):
     arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
     still = PiecewisePolynomial(coeffs=arm.home[None, None], durations=jnp.array([0.7]))
     found = torques(arm, still, 9.81)
@@ -99,7 +99,7 @@ def test_constant_acceleration_takes_the_torque_of_inertia(float64):
     assert found.peak[0] == pytest.approx(acceleration * inertia)
 
 
-def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
+def test_direct_is_confirmed_by_the_referee_and_reports_each_failure():
     cases = jax.tree.map(np.array, pj.block.draw(6, "open", seed=8))
     cases.ball.vel[1, 0] *= -1.0  # flies away
     cases.ball.pos[2] = np.nan
@@ -117,7 +117,7 @@ def test_direct_is_confirmed_by_the_referee_and_says_what_became_of_each_ball():
 
 
 @pytest.mark.slow
-def test_edges_are_free_where_all_of_their_samples_are():
+def test_edges_are_free_if_all_their_samples_are():
     case = pj.take(jax.tree.map(np.asarray, pj.block.draw(1, seed=8)), 0)
     free = FreeSpace(case, 0.003)
     ends = case.angles + np.random.default_rng(0).uniform(-1.0, 1.0, (30, 6))
@@ -133,7 +133,7 @@ def test_edges_are_free_where_all_of_their_samples_are():
     assert not free.is_free(case.arm.upper[None] + 0.01).any()
 
 
-def test_a_straight_way_takes_the_time_of_its_closed_form():
+def test_a_straight_path_takes_the_time_of_its_closed_form():
     pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
     for far in (0.1, 1.5):
@@ -147,7 +147,7 @@ def test_a_straight_way_takes_the_time_of_its_closed_form():
         assert motion[1].sum() == pytest.approx(expected, rel=5e-3)
 
 
-def test_ways_with_corners_are_timed_within_limits():
+def test_paths_with_corners_are_timed_within_limits():
     pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
     points = np.cumsum(np.random.default_rng(1).normal(0.0, 0.4, (7, 6)), axis=0)
@@ -168,7 +168,7 @@ def test_ways_with_corners_are_timed_within_limits():
         assert (np.abs(rise) <= 1.0005 * acceleration).all()
 
 
-def test_planners_on_the_host_say_why_there_is_no_plan():
+def test_planners_on_the_host_report_why_there_is_no_plan():
     cases = jax.tree.map(np.array, pj.block.draw(5, "open", seed=8))
     cases.scene.floor[0] = 0.5  # above the shield
     cases.ball.vel[1, 0] *= -1.0  # flies away
@@ -187,7 +187,7 @@ def test_planners_on_the_host_say_why_there_is_no_plan():
 
 
 @pytest.mark.parametrize(("name", "package"), [("rrt-connect", "ompl"), ("epase", "toppra")])
-def test_without_the_extra_the_error_says_what_to_install(name, package, monkeypatch):
+def test_without_the_extra_the_error_names_it(name, package, monkeypatch):
     if name == "rrt-connect":
         pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     monkeypatch.setitem(sys.modules, package, None)
@@ -216,7 +216,7 @@ def plan_and_confirm(name, regime, **options):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 @pytest.mark.parametrize("name", ["rrt-connect", "epase"])
-def test_ways_that_are_timed_are_confirmed_by_the_referee(name, regime):
+def test_timed_paths_are_confirmed_by_the_referee(name, regime):
     for package in ("ompl", "toppra"):
         pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
     _, plans, verdict = plan_and_confirm(name, regime)
@@ -239,7 +239,7 @@ def test_splines_are_confirmed_by_the_referee(regime):
 
 
 @pytest.mark.parametrize("name", ["direct", "insat", "epase"])
-def test_an_arm_that_waits_where_the_ball_comes_stays(name):
+def test_an_arm_at_the_contact_pose_stays(name):
     if name == "epase":
         pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
     cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8))

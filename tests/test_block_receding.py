@@ -64,7 +64,7 @@ def test_with_exact_fits_deciding_again_changes_nothing(cases):
 
 
 @pytest.mark.slow
-def test_what_is_put_together_is_one_motion_of_rates_within_their_limits(cases):
+def test_composed_pieces_are_one_motion_within_rate_limits(cases):
     done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
     verdict, solved = judge(done)
     assert (done.motions[solved] >= 1).all() and done.motions.max() >= 2
@@ -84,7 +84,7 @@ def test_a_ball_that_is_never_seen_leaves_the_arm_at_home(cases):
 
 
 @pytest.mark.slow
-def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(cases):
+def test_replanning_starts_from_the_motion_with_the_new_ball(cases):
     plans = pj.plan(SMALL, cases)
     solved = pj.solved(plans)
     off = np.array([0.0, 0.03, 0.03], np.float32)
@@ -98,7 +98,7 @@ def test_replanning_goes_on_from_the_motion_for_the_ball_as_it_is_now_known(case
     np.testing.assert_array_equal(again.contact_time[both], warm.contact_time[both])
 
 
-def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
+def test_a_late_motion_has_a_later_contact_or_fails(cases):
     plans = pj.plan(SMALL, cases)
     solved = pj.solved(plans)
     in_time = delay_motion(cases, plans, np.zeros(6, np.float32))
@@ -111,7 +111,7 @@ def test_a_motion_that_begins_late_is_met_later_or_not_in_time(cases):
 
 
 @pytest.mark.slow
-def test_the_noise_of_a_throw_can_be_its_own_in_any_batch(cases):
+def test_the_noise_of_a_throw_does_not_depend_on_its_batch(cases):
     seeds = np.arange(6, dtype=np.uint32)
     every = decide(SMALL, cases, eye(std=0.02), [0.2], seed=seeds, aims=AIMS[:1])
     some = decide(SMALL, take(cases, slice(2, 5)), eye(std=0.02), [0.2], seed=seeds[2:5], aims=AIMS)
@@ -129,7 +129,7 @@ def test_the_noise_of_a_throw_can_be_its_own_in_any_batch(cases):
         ({"planner": pj.block.planner("direct")}, TypeError, "DirectBlock decides once"),
     ],
 )
-def test_what_cannot_be_decided_is_refused_in_a_line(cases, change, error, message):
+def test_invalid_decisions_are_rejected(cases, change, error, message):
     given = {"planner": SMALL, "moments": [0.2, 0.3], **change}
     with pytest.raises(error, match=message):
         decide(given.pop("planner"), cases, eye(), **given)
@@ -145,13 +145,13 @@ def test_what_cannot_be_decided_is_refused_in_a_line(cases, change, error, messa
         ({"perception": True, "replan": 20.0, "observe_longer": 0.1}, "observe_longer"),
     ],
 )
-def test_settings_that_do_not_fit_are_named(given, name):
+def test_contradictory_settings_are_rejected(given, name):
     with pytest.raises(ArgumentError, match=f"^{name} must be"):
         BlockSettings(**given)
 
 
 @pytest.mark.slow
-def test_sweeps_show_what_was_seen_and_how_long_planning_took(tmp_path):
+def test_sweeps_report_observations_and_planning_times(tmp_path):
     seen = BlockSettings(planner="direct", regime="R1", wide=True, num=4, perception=True)
     manifest = start_sweep(TASK, seen, tmp_path / "seen", progress=False)
     assert 0.0 < manifest["summary"]["fit_error_median"] < 0.3

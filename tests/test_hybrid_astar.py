@@ -131,7 +131,7 @@ def test_distances_are_those_of_the_library_up_to_their_cap():
 
 
 @pytest.mark.parametrize("end_heading", [None, 2.5])
-def test_without_walls_the_way_is_the_shortest_to_within_a_primitive(end_heading):
+def test_without_walls_the_path_is_the_shortest_to_within_a_primitive(end_heading):
     rng = np.random.default_rng(1)
     for meeting in rng.uniform(2.0, 6.0, (8, 2)):
         path = find_path(meeting, (), end_heading)
@@ -162,13 +162,13 @@ def test_more_slack_costs_more_and_no_more_than_allowed():
     assert loose.cost <= 1.5 * exact.cost
 
 
-def test_a_start_in_the_trap_finds_the_way_out():
+def test_a_start_in_the_trap_finds_a_path_out():
     start, meeting = np.array([2.8, 3.9, 0.0]), np.array([6.5, 4.0])
     path = find_path(meeting, TRAP, start=start)
     assert_drivable(path, meeting, TRAP, start)
 
 
-def test_walls_all_round_leave_no_way():
+def test_walls_all_around_leave_no_path():
     ring = [box(5.0, 3.0, 7.0, 3.2), box(5.0, 4.8, 7.0, 5.0)]
     ring += [box(5.0, 3.2, 5.2, 4.8), box(6.8, 3.2, 7.0, 4.8)]
     path = find_path((6.0, 4.0), ring, max_expansions=3000)
@@ -188,7 +188,7 @@ def test_a_goal_in_a_wall_or_off_the_map_is_blocked(meeting):
     assert path.blocked and not path.found and path.expansions == 0
 
 
-def test_the_case_turned_and_mirrored_has_the_mirrored_way():
+def test_a_mirrored_case_has_the_mirrored_path():
     """The grid is symmetric, so that cells are rounded alike."""
     meeting = np.array([6.5, 4.4])
     flip = np.array([1.0, -1.0, -1.0])
@@ -202,7 +202,7 @@ def test_the_case_turned_and_mirrored_has_the_mirrored_way():
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"start": (0.0, 0.0)}, r"start must be \(3,\) and finite"),
         ({"meeting": (np.nan, 0.0)}, r"meeting must be \(2,\) and finite"),
@@ -215,14 +215,14 @@ def test_the_case_turned_and_mirrored_has_the_mirrored_way():
         ({"settings": HybridAstar(headings=3)}, "headings must be >= 8"),
     ],
 )
-def test_what_is_out_of_its_range_is_told_in_a_line(change, words):
+def test_arguments_out_of_range_are_rejected(change, message):
     given = {"start": START, "meeting": (6.0, 4.0), "walls": obstacles([])}
     given |= {"curvature": CURVATURE, "body": BODY, "lower": (0.0, 0.0), "upper": (8.0, 8.0)}
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=message):
         hybrid_astar(**(given | change))
 
 
-def test_without_numba_the_error_says_what_to_install(monkeypatch):
+def test_without_numba_the_error_names_the_extra(monkeypatch):
     monkeypatch.delitem(sys.modules, "planner_jax.baselines.intercept.hybrid_astar_kernels")
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ModuleNotFoundError, match=r"pip install .*\[baselines\]'"):

@@ -73,7 +73,7 @@ def excess(num, planner=PLANNER):
 
 
 @pytest.mark.parametrize("pieces", [4, 8])
-def test_guess_costs_what_the_published_protocol_says(pieces):
+def test_the_guess_has_the_published_cost(pieces):
     planner = PaperCatch(num_pieces=pieces)
 
     @jax.jit
@@ -120,7 +120,7 @@ def test_objective_gradient_agrees_with_finite_differences():
     assert np.isfinite(value_and_gradient(cost)(np.zeros_like(shift))[1]).all()
 
 
-def test_energy_gradient_at_the_catch_is_the_papers():
+def test_the_energy_gradient_at_the_catch_matches_the_paper():
     """Eqs 19b-c, with the fourth derivatives of minimum snap, agree with the closed form.
 
     The gradients by coefficients and durations are pulled back to the catching state, the waypoints
@@ -146,7 +146,7 @@ def test_energy_gradient_at_the_catch_is_the_papers():
         np.testing.assert_allclose(analytic, automatic, rtol=1e-9, atol=1e-9 * np.abs(slopes[2]))
 
 
-def test_sizes_that_make_no_sense_are_refused():
+def test_invalid_sizes_are_rejected():
     with pytest.raises(ValueError, match="num_pieces must be >= 2, got 1"):
         PaperCatch(num_pieces=1)
     case = jax.tree.map(lambda leaf: leaf[0], rows("paper", 1)[0])

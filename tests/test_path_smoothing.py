@@ -97,7 +97,7 @@ def crooked():
     return line + rng.normal(0.0, 0.06, line.shape)
 
 
-def test_the_slope_of_the_cost_is_that_of_finite_differences(crooked, float64):
+def test_the_gradient_of_the_cost_matches_finite_differences(crooked, float64):
     walls = walls_of()
     unit = np.float64(0.21)
     slope = np.asarray(cost_and_slope(crooked, unit, walls)[1])
@@ -184,7 +184,7 @@ def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
     np.testing.assert_allclose(steps[..., 2], mean * spacing, atol=0.01)
 
 
-def test_a_path_that_cannot_be_made_smooth_is_kept_and_leaves_its_neighbours_alone(batch):
+def test_a_path_that_cannot_be_smoothed_is_returned_and_others_stay(batch):
     """One path runs through a wall, another one is NaN."""
     (poses, bends, length), found = batch
     poses, length = poses.copy(), length.copy()
@@ -197,6 +197,6 @@ def test_a_path_that_cannot_be_made_smooth_is_kept_and_leaves_its_neighbours_alo
     np.testing.assert_allclose(again.poses[[0, 3]], found.poses[[0, 3]], atol=1e-5)
 
 
-def test_a_number_of_poses_that_does_not_fit_is_told_in_a_line():
+def test_an_invalid_number_of_poses_is_rejected():
     with pytest.raises(ValueError, match="poses must be 2 k"):
         smooth(jnp.zeros((64, 3)), jnp.zeros(64), jnp.asarray(1.0), walls_of())

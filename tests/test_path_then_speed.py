@@ -155,7 +155,7 @@ def test_speed_is_limited_by_lateral_acceleration_and_by_the_steering_rate():
     np.testing.assert_allclose(limits_along(step), [2.0 / (0.3 * 10.0)], rtol=1e-5)
 
 
-def test_the_way_of_a_drive_is_that_of_the_car():
+def test_the_path_of_a_drive_is_the_path_of_the_car():
     rng = np.random.default_rng(1)
     speed = np.append(rng.uniform(0.2, 1.2, 16), 0.0).astype(np.float32)
     curvature = rng.uniform(-1.5, 1.5, 17).astype(np.float32)
@@ -199,7 +199,7 @@ STEP = SpeedStep()
 
 
 @pytest.mark.slow
-def test_without_movers_a_straight_way_costs_what_the_least_acceleration_does():
+def test_without_movers_a_straight_path_has_the_cost_of_least_acceleration():
     case = scene((6.0, 4.0))
     plan = drive(case, STRAIGHT)
     assert plan.status == pj.Status.CONVERGED
@@ -249,7 +249,7 @@ def test_constant_speed_is_reached_by_the_shortest_ramp_and_ends_in_time(length)
     assert np.isin(np.round(np.abs(rise), 2), [0.0, 1.0]).sum() >= 999 and speed[0] == 0.5
 
 
-def test_ways_on_either_side_of_a_wall_differ_by_a_turn_and_others_by_none():
+def test_paths_differ_by_a_turn_just_if_a_wall_is_between_them():
     walls = obstacles([SQUARE + [4.0, 4.0], SQUARE + [4.0, 1.0]])
     start, goal = np.float32([1.0, 4.0]), np.float32([7.0, 4.1])
     turning = jax.jit(count_turns)
@@ -292,7 +292,7 @@ def scenes():
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_case_is_solved_or_says_why_not_and_the_referee_agrees(scenes, name):
+def test_a_case_is_solved_or_has_a_failure_status_and_the_referee_agrees(scenes, name):
     k, status = list(SCENES).index(name), SCENES[name][1]
     case, plan = pj.take(scenes, k)
     assert plan.status == status
@@ -300,7 +300,7 @@ def test_a_case_is_solved_or_says_why_not_and_the_referee_agrees(scenes, name):
     assert verdict.success == (status == pj.Status.CONVERGED), verdict.sentence()
 
 
-def test_what_is_claimed_of_drawn_cases_the_referee_confirms(scenes):
+def test_the_referee_confirms_claims_about_drawn_cases(scenes):
     cases = jax.tree.map(np.asarray, pj.intercept.draw(8, "hard", 7))
     plans = pj.plan(PLANNER, cases)
     solved = pj.solved(plans)

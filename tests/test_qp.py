@@ -74,7 +74,7 @@ def test_a_batch_is_its_lanes_one_by_one(solved):
 
 
 @float64
-def test_without_bounds_the_solution_is_that_of_the_equalities_at_no_step():
+def test_without_bounds_the_solution_needs_no_step():
     right_side = PROGRAMS[0][0]
     free = one(right_side, np.full(ROWS, -np.inf), np.full(ROWS, np.inf))
     matrix = np.block([[HESSIAN, BOTH.T], [BOTH, np.zeros((3, 3))]])
@@ -98,7 +98,7 @@ def test_the_least_square_sum_on_a_line_beside_a_bound_and_a_row_that_the_line_d
 
 
 @float64
-def test_multipliers_are_slopes_of_the_cost_and_gradients_those_of_differences(solved):
+def test_multipliers_are_cost_slopes_and_gradients_match_differences(solved):
     k = int(np.argmax(solved.steps))
     given = tuple(each[k] for each in PROGRAMS)
     weights = RNG.normal(size=UNKNOWNS)
@@ -136,7 +136,7 @@ def test_every_failure_has_its_status_and_leaves_the_other_lanes_alone(solved):
 
 
 @float64
-def test_too_few_places_for_active_bounds_are_told_from_no_solution(solved):
+def test_too_few_slots_for_active_bounds_differ_from_no_solution(solved):
     k = int(np.argmax(solved.steps))
     solve = jax.jit(lambda *program: solve_qp(TEMPLATE, *program, QpConfig(active=2)))
     assert solve(*(each[k] for each in PROGRAMS)).status == Status.MAX_STEPS
@@ -149,6 +149,6 @@ def test_too_few_places_for_active_bounds_are_told_from_no_solution(solved):
         ((0.0 * HESSIAN, EQUALITIES, MATRIX), "hessian must be positive definite"),
     ],
 )
-def test_matrices_that_make_no_program_are_named(matrices, message):
+def test_invalid_matrices_are_rejected(matrices, message):
     with pytest.raises(ValueError, match=message):
         qp_template(*matrices)

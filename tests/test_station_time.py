@@ -180,9 +180,7 @@ def test_nothing_between_the_lines_of_a_corridor_is_inside_of_a_polygon(lines, c
     assert num > 1000
 
 
-def test_with_a_piece_an_edge_the_tilted_corridor_holds_the_line_and_is_the_widest(
-    lines, corridors
-):
+def test_the_tilted_corridor_holds_the_line_and_is_the_widest(lines, corridors):
     _, found = lines
     station = found.station[:, :-1, None] + np.diff(found.station)[..., None] * np.linspace(0, 1, 9)
     is_inside = {

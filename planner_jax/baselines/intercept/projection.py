@@ -20,9 +20,8 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-_SLOPES = np.linspace(
-    -2.0, 2.0, 17
-)  # candidate slopes of an edge, in (height of the slab) / duration
+# Candidate slopes of an edge, in (height of the slab) / duration.
+_SLOPES = np.linspace(-2.0, 2.0, 17)
 _BEFORE = 0.05  # fraction of the horizon that is projected before its start and after its end
 
 

@@ -75,7 +75,7 @@ def bang_bang(
     below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)
     peak = jnp.where(d < u * duration - 0.5 * u**2 / a, below, above)
     rises = jnp.abs(peak - u) / a  # [s], until a joint coasts
-    brakes = duration - peak / a  # [s], when it begins to brake
+    brakes = duration - peak / a  # [s], when it starts to brake
     first = jnp.sign(peak - u) * a
 
     times = jnp.sort(jnp.clip(jnp.concatenate([rises, brakes]), 0.0, duration))

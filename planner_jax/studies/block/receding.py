@@ -50,9 +50,9 @@ _LONG = 100.0  # [s], standstill after a motion
 class Aim:
     """Reserves for meeting a ball that is not known exactly; see `cautious`."""
 
-    offset: float  # [m]
+    offset: float  # [m], greatest distance of the contact from the shield's centre
     at_rest: bool = False
-    edge: float = 0.0  # [m]
+    edge: float = 0.0  # [m], reserve at both ends of the ball's trajectory between the boxes
 
 
 # Each aim is tried for the balls that the previous aims left without a plan.
@@ -241,7 +241,7 @@ class _Arms:
         if not good.any():
             return
         lanes, found = lanes[good], take(found, good)
-        if not self.motions.any():  # from now on motions are of this shape
+        if not self.motions.any():  # the first motions determine the shape
             still = _still(self.cases, found.motion.coeffs.shape[1:3])
             self.plans = dataclasses.replace(self.plans, motion=still)
         until = np.array(self.since)
