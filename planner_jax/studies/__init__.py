@@ -1,1 +1,1 @@
-"""Experiments that answered a question and are not part of the public interface."""
+"""Finished experiments, which are not part of the public interface."""

@@ -109,7 +109,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Give a state its spline, and return whether there is one."""
+        """Compute the spline of a state, and return whether there is one."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False

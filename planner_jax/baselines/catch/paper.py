@@ -91,7 +91,7 @@ def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) ->
 
 @struct.dataclass
 class Catch:
-    """The N catches that a point describes."""
+    """The N catches that a point of the search space describes."""
 
     times: Array  # (N,) [s]
     durations: Array  # (N,) [s], of the segments

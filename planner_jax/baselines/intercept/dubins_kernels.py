@@ -1,7 +1,8 @@
-"""Closed forms of Dubins's paths, compiled by numba, which this module needs.
+"""Closed forms of Dubins paths, compiled by numba; importing this module requires numba.
 
-Inside the closed forms the tightest radius is the unit of length, and the start is the origin of
-the frame. All code is scalar and runs on the host in float64.
+A Dubins word is a sequence of left turns L, right turns R and straight lines S, such as LSL. The
+unit of length is the least turning radius, and the start is the origin of the frame. All code is
+scalar and runs on the host in float64.
 """
 
 import math
@@ -21,7 +22,7 @@ def _positive(angle):
 
 @njit(cache=True)
 def words_to_pose(x, y, heading, lengths):
-    """Write the lengths (6, 3) of the parts of Dubins's words to a pose, infinite without a path.
+    """Write the lengths (6, 3) of the parts of Dubins words to a pose, infinite without a path.
 
     Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR, as in `SENSES`.
     """
@@ -54,7 +55,7 @@ def words_to_pose(x, y, heading, lengths):
             lengths[row + 1, 2] = _positive(angle - heading)
 
 
-# Senses of the parts of every word: 1 to the left, -1 to the right, 0 straight.
+# Turning directions of the parts of every word: 1 left, -1 right, 0 straight.
 SENSES = np.array(
     [[1, 0, 1], [1, 0, -1], [1, -1, 1], [-1, 0, -1], [-1, 0, 1], [-1, 1, -1]], np.float64
 )
@@ -105,7 +106,7 @@ def length_to_point(x, y):
 
 @njit(cache=True)
 def in_frame(pose, goal, curvature):
-    """Return the goal's position ahead and to the left of a pose, in tightest radii."""
+    """Return the goal's position ahead and to the left of a pose, in least turning radii."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     east, north = goal.pose[0] - pose[0], goal.pose[1] - pose[1]
     return (cos * east + sin * north) * curvature, (cos * north - sin * east) * curvature
@@ -115,14 +116,14 @@ def in_frame(pose, goal, curvature):
 def least_length(pose, goal, middle, curvature, lengths):
     """Return the least length [m] from a pose to a goal without obstacles.
 
-    Where the heading at the goal is free, it is a lower bound.
+    If the heading at the goal is free, it is a lower bound.
 
     Args:
         pose: (3,).
         goal: a `Goal`.
-        middle: [m], how far the body's middle is ahead of the rear axle.
-        curvature: [1/m], the tightest.
-        lengths: (6, 3), to work with.
+        middle: [m], distance of the body's centre ahead of the rear axle.
+        curvature: [1/m], greatest curvature.
+        lengths: (6, 3), workspace.
     """
     x, y = in_frame(pose, goal, curvature)
     if goal.has_heading:

@@ -75,7 +75,7 @@ def _delay_each(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
 
 
 def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
-    """Return one plan up to its contact."""
+    """Cut one plan at its contact with the ball."""
     motion = append_braking(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:

@@ -30,7 +30,7 @@ class Sight(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """A sentence for the user, with the remedy."""
+        """A sentence for the user that also names the remedy."""
         return _MESSAGES[self]
 
 

@@ -1,1 +1,1 @@
-"""Blocks looked up: motions for every pair of cells of both boxes [Natarajan2024, Algorithm 1]."""
+"""Stored motions for every pair of cells of both boxes [Natarajan2024, Algorithm 1]."""

@@ -252,7 +252,7 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """Return the entry time () [s] of a pose, whether or not the arm touches something there."""
+    """Return the entry time () [s] of a pose, ignoring collisions."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
