@@ -28,6 +28,7 @@ import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
@@ -107,8 +108,7 @@ def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePo
 
 
 def _spans(degree: int, num: int) -> int:
-    if num <= degree:
-        raise ArgumentError("control points", f"more than the degree {degree}", num)
+    require(num > degree, "control points", f"more than the degree {degree}", num)
     return num - degree
 
 

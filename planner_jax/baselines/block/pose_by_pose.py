@@ -25,7 +25,7 @@ from planner_jax.baselines.block.direct import poses_in_time
 from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.path_timing import DEGREE, PIECES, import_extra, time_path
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, require_settings, take
 from planner_jax.task.block.case import BlockCase
@@ -73,10 +73,8 @@ class PoseByPose(Planner, abc.ABC):
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if not (self.budget > 0.0 and self.longest > 0.0):
-            raise ArgumentError(
-                "budget and longest", "> 0", shown=f"{self.budget:g} and {self.longest:g}"
-            )
+        shown = f"{self.budget:g} and {self.longest:g}"
+        require(min(self.budget, self.longest) > 0.0, "budget and longest", "> 0", shown=shown)
 
     @abc.abstractmethod
     def motion_to(

@@ -12,6 +12,7 @@ from jax import Array, lax
 from planner_jax.ball.flight import BallState, gravity_vector
 from planner_jax.ball.target import state_at
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, outcome, require_settings, take
@@ -112,8 +113,7 @@ class MppCatch(Planner):
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if not 0.0 < self.height < 2.0:
-            raise ArgumentError("height", "> 0 and < 2", self.height)
+        require(0.0 < self.height < 2.0, "height", "> 0 and < 2", self.height)
         if not self.speeds or not self.thrusts:
             raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 

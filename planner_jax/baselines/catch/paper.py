@@ -10,7 +10,7 @@ from jax import Array
 
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
 from planner_jax.core.arithmetic import components
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.along import Along, integrate_along
 from planner_jax.cost.quadrotor import ground_excess, speed_excess
@@ -149,8 +149,7 @@ class PaperCatch(OptimisedPlanner):
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if self.num_pieces < 2:
-            raise ArgumentError("num_pieces", ">= 2", self.num_pieces)
+        require_size("num_pieces", self.num_pieces, 2)
         if not self.scale:
             object.__setattr__(self, "scale", (_OFFSET_SCALE,) * self.num_offsets + _CATCH_SCALE)
 
@@ -170,8 +169,7 @@ class PaperCatch(OptimisedPlanner):
 
     def guesses(self, context: CatchContext, num: int) -> Array:
         """Return minimum-jerk primitives between standstills below every ball, (1, n)."""
-        if num != 1:
-            raise ArgumentError("starts", "1", num)
+        require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
         ball = targets_at(context.targets, context.times)

@@ -14,7 +14,7 @@ from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require, require_size
 from planner_jax.core.protocol import require_settings
 from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge
 from planner_jax.optimise.planner import OptimisedPlanner, pending
@@ -164,15 +164,13 @@ class BatHit(OptimisedPlanner):
 
     def __post_init__(self) -> None:
         require_settings(self)
-        if self.num_pieces < 2:
-            raise ArgumentError("num_pieces", ">= 2", self.num_pieces)
+        require_size("num_pieces", self.num_pieces, 2)
         if not self.scale:
             place, time, speed, thrust = _UNITS
             terminal = (time, speed, speed, thrust, thrust)
             object.__setattr__(self, "scale", (place,) * self.num_offsets + terminal)
-        if len(self.scale) != self.num_offsets + 5:
-            rule = f"of {self.num_offsets + 5} numbers"
-            raise ArgumentError("scale", rule, len(self.scale))
+        size = self.num_offsets + 5
+        require(len(self.scale) == size, "scale", f"of {size} numbers", len(self.scale))
 
     @property
     def maps(self) -> ProportionalMinco:
@@ -205,8 +203,7 @@ class BatHit(OptimisedPlanner):
 
     def guesses(self, context: HitContext, num: int) -> Array:
         """Return the initial values of Section VI-A with waypoints on the primitives, (1, n)."""
-        if num != 1:
-            raise ArgumentError("starts", "1", num)
+        require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
         # A ball that lands sooner, because planning starts late, is hit before it lands.

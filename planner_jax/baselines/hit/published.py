@@ -11,6 +11,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.task.hit import court
@@ -63,8 +64,7 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
     """Return the paths of a folder's trial files, by scenario index and planner letter."""
     folder = Path(folder)
-    if not folder.is_dir():
-        raise ArgumentError("serves", "an existing folder", str(folder))
+    require(folder.is_dir(), "serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}
     for path in sorted(folder.iterdir()):
         if match := _FILE_NAME.fullmatch(path.name):
@@ -77,10 +77,8 @@ def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
                     shown=f"{path.name} ({name}, the mirror image of another)",
                 )
             files.setdefault(court.SCENARIOS.index(name), {})[match[4]] = path
-    if not files:
-        raise ArgumentError(
-            "serves", "a folder of S_L_T_M.csv files", shown=f"none in {str(folder)!r}"
-        )
+    shown = f"none in {str(folder)!r}"
+    require(bool(files), "serves", "a folder of S_L_T_M.csv files", shown=shown)
     return files
 
 
@@ -127,8 +125,8 @@ def _vector(name: str, cell: str, size: int) -> list[float]:
         vector = [float(word) for word in cell.split()]
     except ValueError:
         vector = []
-    if len(vector) != size or not all(map(math.isfinite, vector)):
-        raise ArgumentError(name, f"{size} finite numbers", cell)
+    is_valid = len(vector) == size and all(map(math.isfinite, vector))
+    require(is_valid, name, f"{size} finite numbers", cell)
     return vector
 
 

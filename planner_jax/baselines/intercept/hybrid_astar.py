@@ -16,7 +16,8 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import ArrayLike
 
-from planner_jax.core.errors import ArgumentError, MissingExtra
+from planner_jax.core.choices import require
+from planner_jax.core.errors import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
 _DISCS = 3  # number of discs that cover the body
@@ -155,32 +156,22 @@ def _kernels() -> ModuleType:
 
 def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:
     """Raise `ArgumentError` if an argument is out of its range."""
-    shapes = {
-        "start": (start, 3),
-        "meeting": (meeting, 2),
-        "lower": (lower, 2),
-        "upper": (upper, 2),
-    }
-    for name, (value, size) in shapes.items():
-        if value.shape != (size,) or not np.isfinite(value).all():
-            raise ArgumentError(name, f"({size},) and finite", value)
-    if not (upper > lower).all():
-        raise ArgumentError("upper", "> lower", shown=f"{upper} and {lower}")
-    if not (body[0] < body[1] and body[2] > 0.0):
-        raise ArgumentError("body", "(behind, ahead > behind, half width > 0)", body)
-    if end_heading is not None and not np.isfinite(end_heading):
-        raise ArgumentError("end_heading", "finite", end_heading)
-    positive = {"curvature": curvature, "cell": settings.cell}
-    for name, value in (positive | {"max_expansions": settings.max_expansions}).items():
-        if not (np.isfinite(value) and value > 0):
-            raise ArgumentError(name, "> 0 and finite", value)
-    chosen = vars(settings)
+    points = {"meeting": (meeting, 2), "lower": (lower, 2), "upper": (upper, 2)}
+    for name, (value, size) in ({"start": (start, 3)} | points).items():
+        is_finite = value.shape == (size,) and np.isfinite(value).all()
+        require(bool(is_finite), name, f"({size},) and finite", value)
+    require(bool((upper > lower).all()), "upper", "> lower", shown=f"{upper} and {lower}")
+    is_body = body[0] < body[1] and body[2] > 0.0
+    require(bool(is_body), "body", "(behind, ahead > behind, half width > 0)", body)
+    is_finite = end_heading is None or np.isfinite(end_heading)
+    require(bool(is_finite), "end_heading", "finite", end_heading)
+    chosen = {"curvature": curvature, **vars(settings)}
+    for name in ("curvature", "cell", "max_expansions"):
+        require(bool(0 < chosen[name] < np.inf), name, "> 0 and finite", chosen[name])
     for name in ("turn_price", "slack", "margin"):
-        if not 0.0 <= chosen[name] < np.inf:
-            raise ArgumentError(name, ">= 0 and finite", chosen[name])
+        require(bool(0.0 <= chosen[name] < np.inf), name, ">= 0 and finite", chosen[name])
     for name, least in (("headings", 8), ("poses", 2)):
-        if chosen[name] < least:
-            raise ArgumentError(name, f">= {least}", chosen[name])
+        require(chosen[name] >= least, name, f">= {least}", chosen[name])
 
 
 def _sample_arcs(

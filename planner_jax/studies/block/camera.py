@@ -15,7 +15,7 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 
 Kind = TypeVar("Kind")
 
@@ -56,12 +56,10 @@ def looking_at(
     """
     position, target = np.asarray(position, float), np.asarray(target, float)
     ahead = target - position
-    if not np.hypot(*ahead[:2]) > 1e-6:
-        raise ArgumentError("target", "beside the camera, not above, below or within it", shown="")
-    if not 0.0 < field_of_view < np.pi:
-        raise ArgumentError("field_of_view", "between 0 and pi", field_of_view)
-    if not min(size) >= 1:
-        raise ArgumentError("size", ">= 1 each way", size)
+    is_beside = bool(np.hypot(*ahead[:2]) > 1e-6)
+    require(is_beside, "target", "beside the camera, not above, below or within it", shown="")
+    require(bool(0.0 < field_of_view < np.pi), "field_of_view", "between 0 and pi", field_of_view)
+    require(min(size) >= 1, "size", ">= 1 in both directions", size)
     z = ahead / np.linalg.norm(ahead)
     x = np.cross(z, [0.0, 0.0, 1.0])
     x /= np.linalg.norm(x)

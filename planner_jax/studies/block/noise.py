@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.studies.block.camera import (
     Camera,
     back_project,
@@ -64,13 +64,10 @@ def stereo_noise(
     """
     given = locals()
     for name, value in given.items():
-        if not value >= 0.0:
-            raise ArgumentError(name, ">= 0", value)
-    if not baseline > 0.0:
-        raise ArgumentError("baseline", "> 0", baseline)
+        require(bool(value >= 0.0), name, ">= 0", value)
+    require(bool(baseline > 0.0), "baseline", "> 0", baseline)
     for name in ("dropout", "mismatch"):
-        if not given[name] < 1.0:
-            raise ArgumentError(name, "< 1", given[name])
+        require(bool(given[name] < 1.0), name, "< 1", given[name])
     return from_numbers(StereoNoise, **given)
 
 

@@ -15,7 +15,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.studies.block.camera import Camera, looking_at
 from planner_jax.studies.block.flight_fit import (
     FlightFit,
@@ -69,10 +69,8 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
     Raises:
         ArgumentError: a number is not positive.
     """
-    if not rate > 0.0:
-        raise ArgumentError("rate", "> 0", rate)
-    if std is not None and not std > 0.0:
-        raise ArgumentError("std", "> 0", std)
+    require(bool(rate > 0.0), "rate", "> 0", rate)
+    require(std is None or bool(std > 0.0), "std", "> 0", std)
     return Eye(
         camera=mast_camera() if camera is None else camera,
         noise=stereo_noise() if std is None else IsotropicNoise(std=host_leaf(std, np.float32)),
@@ -161,8 +159,7 @@ def see(
         ArgumentError: a time is negative.
     """
     for name, value in (("seconds", seconds), ("overhead", overhead)):
-        if not value >= 0.0:
-            raise ArgumentError(name, ">= 0", value)
+        require(bool(value >= 0.0), name, ">= 0", value)
     times = jnp.asarray(frame_times(eye, seconds), cases.gravity.dtype)
     places = watch(cases, eye, times, jax.random.key(seed))
     balls, fits = fit_throws(cases, eye, times, places, times[-1])

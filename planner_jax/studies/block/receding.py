@@ -18,6 +18,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.arithmetic import host_leaf
+from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Status, is_solved, select_into, take
@@ -138,8 +139,7 @@ def decide(
     moments = [float(moment) for moment in moments]
     if len(moments) == 0 or moments[0] < 0.0 or not np.all(np.diff(moments) > 0.0):
         raise ArgumentError("moments", "from 0 or later", moments, verb="rise")
-    if not overhead >= 0.0:
-        raise ArgumentError("overhead", ">= 0", overhead)
+    require(bool(overhead >= 0.0), "overhead", ">= 0", overhead)
     if len(moments) > 1 and not isinstance(planner, OnlineBlock):
         raise TypeError(f"{type(planner).__name__} decides once: give it one moment")
     cases = jax.tree.map(np.asarray, cases)

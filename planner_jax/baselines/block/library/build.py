@@ -36,7 +36,7 @@ from planner_jax.baselines.block.library.table import (
     with_scene,
 )
 from planner_jax.core.arithmetic import host_leaf
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.protocol import solved
 from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
@@ -178,10 +178,8 @@ def _require_free(setting: Setting, homes: ArrayLike) -> None:
     """Raise `ArgumentError` if the arm touches something at a home."""
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
-        if not near > 0.0:
-            raise ArgumentError(
-                "homes", "free", shown=f"{near:.3g} m to what is nearest at home {k}"
-            )
+        shown = f"{near:.3g} m to the nearest obstacle at home {k}"
+        require(near > 0.0, "homes", "free", shown=shown)
 
 
 def plan_pairs(

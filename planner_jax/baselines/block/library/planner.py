@@ -18,7 +18,7 @@ from planner_jax.baselines.block.library.table import (
     lookup,
     setting_of,
 )
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
 from planner_jax.task.block.case import BlockCase
@@ -56,18 +56,12 @@ class LibraryBlock(Planner):
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)
         own, other = fingerprint(self.library.setting), fingerprint(setting_of(first))
-        if own != other:
-            raise ArgumentError(
-                "library",
-                "of the cases' arm, limits and scene",
-                shown=f"one of {own} for cases of {other}",
-            )
+        shown = f"one of {own} for cases of {other}"
+        require(own == other, "library", "of the cases' arm, limits and scene", shown=shown)
         homes = np.asarray(self.library.table.homes)
         off = np.abs(homes - first.angles).max(axis=1).min()
-        if off > _SAME_START:
-            raise ArgumentError(
-                "angles", f"a home of the library to {_SAME_START} rad", shown=f"{off:.3g} rad off"
-            )
+        rule, shown = f"a home of the library to {_SAME_START} rad", f"{off:.3g} rad off"
+        require(bool(off <= _SAME_START), "angles", rule, shown=shown)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plan of one case; pure."""

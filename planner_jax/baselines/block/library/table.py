@@ -19,7 +19,7 @@ from jax import Array
 
 from planner_jax.ball.flight import BallState
 from planner_jax.baselines.block.library.cells import Layout, cell_of
-from planner_jax.core.errors import ArgumentError
+from planner_jax.core.choices import require
 from planner_jax.robot.arm import Arm, ArmLimits
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.scene import Box, Scene, entry_time
@@ -211,6 +211,6 @@ def with_scene(library: Library, scene: Scene) -> Library:
     """
     own = library.setting.scene
     for name, old, new in (("inner", own.inner, scene.inner), ("outer", own.outer, scene.outer)):
-        if not np.array_equal([old.lower, old.upper], [new.lower, new.upper]):
-            raise ArgumentError(f"scene.{name}", "the library's", shown="another box")
+        is_same = np.array_equal([old.lower, old.upper], [new.lower, new.upper])
+        require(is_same, f"scene.{name}", "the library's", shown="another box")
     return dataclasses.replace(library, setting=dataclasses.replace(library.setting, scene=scene))
