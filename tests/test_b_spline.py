@@ -38,26 +38,15 @@ def sample(degree, points, duration, order):
 
 
 @every_size
-def test_the_basis_times_control_points_is_the_curve(degree, num):
-    points = control_points(num)
-    expected = scipy_curve(degree, points)(SHARES)
-    np.testing.assert_allclose(basis(degree, num, SHARES) @ points, expected, atol=1e-12)
-    # One share, or any array of them.
-    np.testing.assert_allclose(
-        basis(degree, num, 0.3), basis(degree, num, np.full((1, 1), 0.3))[0, 0]
-    )
-
-
-@every_size
-def test_the_basis_is_not_negative_and_sums_to_one(degree, num):
-    values = basis(degree, num, SHARES)
+def test_the_basis_is_a_partition_of_unity_and_gives_the_curve(degree, num):
+    points, values = control_points(num), basis(degree, num, SHARES)
+    np.testing.assert_allclose(values @ points, scipy_curve(degree, points)(SHARES), atol=1e-12)
     assert (values >= 0.0).all()
     np.testing.assert_allclose(values.sum(axis=-1), 1.0, atol=1e-14)
-
-
-@every_size
-def test_a_curve_begins_and_ends_at_its_first_and_last_point(degree, num):
     np.testing.assert_array_equal(basis(degree, num, np.arange(2)), np.eye(num)[[0, -1]])
+    # A single position, or any array of positions.
+    single, grid = basis(degree, num, 0.3), basis(degree, num, np.full((1, 1), 0.3))
+    np.testing.assert_allclose(single, grid[0, 0])
 
 
 @every_size

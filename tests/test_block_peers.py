@@ -26,6 +26,11 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 LIMITS = REGIMES["R2"].limits
 
 
+def require_peers(*packages):
+    for package in packages:
+        pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
+
+
 @jax.jit
 def quickest(turn, rate, stretch):
     """Return samples of the motion in `stretch` times the least duration, and the least times."""
@@ -134,8 +139,8 @@ def test_edges_are_free_if_all_their_samples_are():
 
 
 def test_a_straight_path_takes_the_time_of_its_closed_form():
-    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
-    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    require_peers("toppra")
+    velocity, acceleration = (x.astype(float) for x in (LIMITS.velocity, LIMITS.acceleration))
     for far in (0.1, 1.5):
         points = np.array([np.zeros(6), far * np.array([1.0, -0.5, 0.3, 0.2, 0.1, 1.0])])
         fastest = (velocity / np.abs(points[1])).min()
@@ -148,8 +153,8 @@ def test_a_straight_path_takes_the_time_of_its_closed_form():
 
 
 def test_paths_with_corners_are_timed_within_limits():
-    pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
-    velocity, acceleration = (np.asarray(x, float) for x in (LIMITS.velocity, LIMITS.acceleration))
+    require_peers("toppra")
+    velocity, acceleration = (x.astype(float) for x in (LIMITS.velocity, LIMITS.acceleration))
     points = np.cumsum(np.random.default_rng(1).normal(0.0, 0.4, (7, 6)), axis=0)
     motion = time_path(points, velocity, acceleration)
     assert motion is not None
@@ -189,7 +194,7 @@ def test_planners_on_the_host_report_why_there_is_no_plan():
 @pytest.mark.parametrize(("name", "package"), [("rrt-connect", "ompl"), ("epase", "toppra")])
 def test_without_the_extra_the_error_names_it(name, package, monkeypatch):
     if name == "rrt-connect":
-        pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+        require_peers("toppra")
     monkeypatch.setitem(sys.modules, package, None)
     how = re.escape(install_line("arm-peers"))
     message = rf"^rrt-connect or epase needs {package}: {how}$"
@@ -217,8 +222,7 @@ def plan_and_confirm(name, regime, **options):
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 @pytest.mark.parametrize("name", ["rrt-connect", "epase"])
 def test_timed_paths_are_confirmed_by_the_referee(name, regime):
-    for package in ("ompl", "toppra"):
-        pytest.importorskip(package, reason="the extra `arm-peers` is not installed")
+    require_peers("ompl", "toppra")
     _, plans, verdict = plan_and_confirm(name, regime)
     np.testing.assert_allclose(verdict.execution_time, plans.cost, rtol=1e-5)
     quickest = pj.plan(pj.block.planner("direct", points=6), pj.block.draw(2, "open", seed=8))
@@ -241,7 +245,7 @@ def test_splines_are_confirmed_by_the_referee(regime):
 @pytest.mark.parametrize("name", ["direct", "insat", "epase"])
 def test_an_arm_at_the_contact_pose_stays(name):
     if name == "epase":
-        pytest.importorskip("toppra", reason="the extra `arm-peers` is not installed")
+        require_peers("toppra")
     cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8))
     motion = pj.plan(pj.block.planner("direct", points=6), cases).motion
     ends = np.sum(motion.durations, axis=1)

@@ -62,9 +62,9 @@ def run_longer():
     return dataclasses.replace(PLANNER, rounds=(dataclasses.replace(full, solver=patient),))
 
 
-def excess(num, planner=PLANNER):
+def excess(planner):
     """Return relative excess over the published optima, time errors, cases and plans."""
-    (easy, published), (hard, of_hard) = (rows(name, num) for name in NAMES)
+    (easy, published), (hard, of_hard) = map(rows, NAMES)
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), easy, hard)
     plans = plan(planner, cases)
     cost = np.concatenate([published["cost_ref"], of_hard["cost_ref"]])
@@ -88,22 +88,19 @@ def test_the_guess_has_the_published_cost(pieces):
 
 
 @pytest.mark.slow
-def test_converged_cost_is_the_published_optimum():
-    gap, late, cases, plans = excess(4)
+def test_converged_costs_are_the_published_optima():
+    gap, late, _, _ = excess(run_longer())
     np.testing.assert_allclose(gap, 0.0, atol=1e-4)
     np.testing.assert_allclose(late, 0.0, atol=1e-3)
+    gap, late, cases, plans = excess(PLANNER)
+    assert np.abs(gap).max() <= 1e-3 and (np.abs(gap) > 1e-4).sum() <= 1
+    first = np.append(np.arange(4), len(gap) // 2 + np.arange(4))  # of both files
+    np.testing.assert_allclose(gap[first], 0.0, atol=1e-4)
+    np.testing.assert_allclose(late[first], 0.0, atol=1e-3)
     # The penalties are soft: the protocol's tolerance is 5 %, and its net is a ball.
+    cases, plans = pj.take(cases, first), pj.take(plans, first)
     verdict = referee_catches(cases, plans, tolerance=0.05, net_test="ball")
     assert verdict.success.all(), [verdict.sentence(k) for k in np.flatnonzero(~verdict.success)]
-
-
-@pytest.mark.slow
-def test_converged_costs_are_the_published_optima_on_every_row():
-    gap, late, _, _ = excess(None, run_longer())
-    np.testing.assert_allclose(gap, 0.0, atol=1e-4)
-    np.testing.assert_allclose(late, 0.0, atol=1e-3)
-    own = np.abs(excess(None)[0])
-    assert own.max() <= 1e-3 and (own > 1e-4).sum() <= 1
 
 
 def test_objective_gradient_agrees_with_finite_differences():

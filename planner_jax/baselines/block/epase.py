@@ -63,7 +63,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one step away in open cells that are reached by a shorter path."""
+        """Return the states one step away in open cells, if no shorter path leads there."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -82,7 +82,7 @@ class OpenStates:
 
 
 def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
-    """Return the cell of angles (6,)."""
+    """Return the grid cell of angles (6,) as six indices."""
     return tuple(np.round(angles / CELL).astype(int).tolist())
 
 
@@ -96,7 +96,7 @@ class EpaseBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a free path, or None."""
+        """Return points (N, 6) [rad] of a collision-free path, or None."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

@@ -40,7 +40,7 @@ class RrtConnectBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a free path, or None."""
+        """Return points (N, 6) [rad] of a collision-free path, or None."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)

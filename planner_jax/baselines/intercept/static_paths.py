@@ -32,7 +32,7 @@ _OTHER_SIDE = 8.0  # [m], added distance of paths that pass a wall on different 
 
 @struct.dataclass
 class StaticPaths:
-    """P paths of one case."""
+    """P paths of one case, and the quality of the drives along them."""
 
     paths: Path  # leaves (P, ...)
     violation: Array  # (P,), largest relative excess of the refined drive; <= 0 keeps all limits

@@ -289,7 +289,7 @@ class _Arms:
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Return motions of zero duration with the given numbers of pieces and powers, at the arms."""
+    """Return zero-duration motions of a shape (pieces, powers) at the arms' initial states."""
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
     coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]

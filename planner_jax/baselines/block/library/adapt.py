@@ -66,7 +66,7 @@ class Warped:
     """C warped motions, the most promising first."""
 
     points: Array  # (C, 6 K + 1), unknowns of `OnlineBlock`
-    penalty: Array  # (C,) [rad^2], expected quality, less is better; infinite without a motion
+    penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a motion
     is_open: Array  # (C,) bool, whether limits hold at knots and the pole margin at a few samples
 
 

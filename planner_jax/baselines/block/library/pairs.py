@@ -183,7 +183,7 @@ class PairPlanner(Planner):
         )
 
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the plan of a point after the checks of `OnlineBlock` and of the whole tunnel."""
+        """Return the plan of a point, with the checks of `OnlineBlock` and of the whole tunnel."""
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)
