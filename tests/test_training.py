@@ -116,7 +116,7 @@ def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, 
     asked = dataclasses.replace(asked, parts=(PART, PART))
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     one = training.train(asked, whole, progress=False)
-    plain = training._by_ppo
+    plain = training._train_part
 
     def stopping(asked: Any, part: Any, number: int, *others: Any) -> Any:
         *others, tell = others
@@ -128,10 +128,10 @@ def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, 
 
         return plain(asked, part, number, *others, told)
 
-    monkeypatch.setattr(training, "_by_ppo", stopping)
+    monkeypatch.setattr(training, "_train_part", stopping)
     with pytest.raises(KeyboardInterrupt):
         training.train(asked, cut, progress=False)
-    monkeypatch.setattr(training, "_by_ppo", plain)
+    monkeypatch.setattr(training, "_train_part", plain)
     assert ROWS < len(read_rows(cut)) < 2 * ROWS
     (cut / "parts" / "001.orbax-checkpoint-tmp-0").mkdir()
     again = training.train(asked, cut, progress=False)
