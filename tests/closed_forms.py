@@ -15,3 +15,16 @@ def region_of(x, y):
     middle = np.where(depth < court.NEAR_LINE, 1, 2)
     side = np.where(np.asarray(y) > 0.0, 3, 4)
     return np.where(inside, np.where(aside < court.LANE_LINE, middle, side), 0)
+
+
+def positions_on(path, times):
+    """Return positions (..., [T,] 2) of `TurningPath`s (...) at a time or at times (..., T)."""
+    times = np.asarray(times, float)
+    pos, vel = (np.asarray(leaf, float) @ [1.0, 1.0j] for leaf in (path.pos, path.vel))
+    rate = np.asarray(path.turn_rate, float)
+    if times.ndim:
+        pos, vel, rate = pos[..., None], vel[..., None], rate[..., None]
+    angle = rate * times
+    safe = np.where(angle == 0.0, 1.0, angle)
+    point = pos + vel * times * np.where(angle == 0.0, 1.0, np.expm1(1j * safe) / (1j * safe))
+    return np.stack([point.real, point.imag], axis=-1)

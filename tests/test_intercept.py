@@ -1,4 +1,4 @@
-"""Interceptions: the car's way, the planner, what it says of cases that cannot be solved."""
+"""Interceptions: the car's motion, the planner, and the status of unsolvable cases."""
 
 import dataclasses
 
@@ -23,28 +23,28 @@ START = np.array([0.8, 4.0, 0.3])
 
 
 @pytest.fixture
-def way():
+def knots():
     rng = np.random.default_rng(0)
     return rng.uniform(0.2, 1.5, 9), rng.uniform(-2.0, 2.0, 9)
 
 
-def test_the_way_is_that_of_the_car(way, float64):
-    times = np.linspace(0.0, 4.0, 5 * (len(way[0]) - 1) + 1)[1:]
+def test_the_motion_is_the_car_s(knots, float64):
+    times = np.linspace(0.0, 4.0, 5 * (len(knots[0]) - 1) + 1)[1:]
 
     @jax.jit
     def both(speed, curvature):
         poses = jax.vmap(lambda t: pose_at(START, 4.0, speed, curvature, t))(times)
         return motion(jnp.asarray(START), 4.0, speed, curvature, 5), poses
 
-    found, poses = jax.device_get(both(*way))
+    found, poses = jax.device_get(both(*knots))
     np.testing.assert_allclose(found.pos.reshape(-1, 2), poses[:, :2], atol=2e-5)
     np.testing.assert_allclose(found.heading.ravel(), poses[:, 2], atol=1e-12)
     np.testing.assert_allclose(found.time.ravel(), times, atol=1e-12)
     np.testing.assert_allclose(found.direction[..., 0], np.cos(found.heading), atol=1e-12)
 
 
-def test_gradient_and_curvature_by_the_unknowns_are_those_of_tangents(way, float64):
-    speed, curvature = map(jnp.asarray, way)
+def test_gradient_and_curvature_by_the_unknowns_match_automatic_differentiation(knots, float64):
+    speed, curvature = map(jnp.asarray, knots)
     num, samples = len(speed) - 1, 3
     rng = np.random.default_rng(1)
     roots = rng.normal(size=(num, samples, 4, 4)), rng.normal(size=(num, 5, 5))
@@ -56,55 +56,53 @@ def test_gradient_and_curvature_by_the_unknowns_are_those_of_tangents(way, float
         piece_stiffness=squares[1],
     )
 
-    def knots(point):
+    def unpack(point):
         v, c = jnp.append(speed[:1], point[:num]), jnp.append(curvature[:1], point[num:-1])
         return v, c, point[-1]
 
     def samples_of(point):
-        v, c, time = knots(point)
+        v, c, time = unpack(point)
         found = motion(jnp.asarray(START), time, v, c, samples)
         return jnp.concatenate([found.pos, found.heading[..., None], found.time[..., None]], -1)
 
     def pieces_of(point):
-        v, c, time = knots(point)
+        v, c, time = unpack(point)
         return jnp.stack([v[:-1], v[1:], c[:-1], c[1:], jnp.full(num, time)], axis=1)
 
     @jax.jit
     def both(point):
-        v, c, time = knots(point)
-        way = motion(jnp.asarray(START), time, v, c, samples)
+        v, c, time = unpack(point)
+        drive = motion(jnp.asarray(START), time, v, c, samples)
         slopes = jax.jacfwd(samples_of)(point), jax.jacfwd(pieces_of)(point)
-        return slopes, by_unknowns(way, cost, True), by_unknowns(way, cost, False)
+        return slopes, by_unknowns(drive, cost, True), by_unknowns(drive, cost, False)
 
     point = jnp.concatenate([speed[1:], curvature[1:], jnp.array([4.0])])
-    (of_samples, of_pieces), free, given = both(point)
+    (of_samples, of_pieces), free, fixed = both(point)
     gradient = np.einsum("ksi,ksin->n", cost.push, of_samples)
     gradient += np.einsum("ki,kin->n", cost.piece_push, of_pieces)
     curvature = np.einsum("ksin,ksij,ksjm->nm", of_samples, cost.stiffness, of_samples)
     curvature += np.einsum("kin,kij,kjm->nm", of_pieces, cost.piece_stiffness, of_pieces)
     np.testing.assert_allclose(free[0], gradient, atol=1e-10)
     np.testing.assert_allclose(free[1], curvature, atol=1e-10)
-    np.testing.assert_allclose(given[0], gradient[:-1], atol=1e-10)
-    np.testing.assert_allclose(given[1], curvature[:-1, :-1], atol=1e-10)
+    np.testing.assert_allclose(fixed[0], gradient[:-1], atol=1e-10)
+    np.testing.assert_allclose(fixed[1], curvature[:-1, :-1], atol=1e-10)
 
 
-def test_a_pose_is_the_integral_of_the_car_s_kinematics(way, float64):
-    speed, curvature = way
+def test_a_pose_is_the_integral_of_the_car_s_kinematics(knots, float64):
     num = 40000
-    time = (np.arange(num) + 0.5) / num * 2.3
-    knots = np.linspace(0.0, 4.0, 9)
-    v, rate = np.interp(time, knots, speed), np.interp(time, knots, speed * 0.0 + 1.0)
-    turn = v * np.interp(time, knots, curvature) * rate * 2.3 / num
+    time, knot_times = (np.arange(num) + 0.5) / num * 2.3, np.linspace(0.0, 4.0, 9)
+    v, c = (np.interp(time, knot_times, values) for values in knots)
+    turn = v * c * 2.3 / num
     heading = START[2] + np.cumsum(turn) - 0.5 * turn
     step = v * 2.3 / num
     expected = START + [np.sum(step * np.cos(heading)), np.sum(step * np.sin(heading)), turn.sum()]
-    found = jax.jit(pose_at)(START, 4.0, speed, curvature, 2.3)
+    found = jax.jit(pose_at)(START, 4.0, *knots, 2.3)
     np.testing.assert_allclose(found, expected, atol=1e-7)
 
 
-# The one that picks the time has the other's unknowns, and the time.
+# "early" has the unknowns of "given", and the time.
 @pytest.mark.parametrize("meet", [pytest.param("given", marks=pytest.mark.slow), "early"])
-def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet):
+def test_the_gradient_of_the_cost_matches_finite_differences(knots, float64, meet):
     case = jax.tree.map(
         lambda leaf: jnp.asarray(leaf[0], jnp.float64 if leaf.dtype != bool else bool),
         pj.intercept.draw(1, "hard", 5),
@@ -113,17 +111,17 @@ def test_the_gradient_of_a_cost_is_that_of_finite_differences(way, float64, meet
     planner = pj.intercept.planner(pieces=8, meet=meet)
     problem = planner.problem
     field = jax.jit(lambda case: make_field(case, make_grid(case, SEARCHES[0].lattice)))(case)
-    places = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
+    positions = np.random.default_rng(3).uniform(1.0, 7.0, (8, 2))
     model = jax.jit(
-        lambda point: problem.build_model(point, case, field, Weights(follow=1.0), places)
+        lambda point: problem.build_model(point, case, field, Weights(follow=1.0), positions)
     )
-    speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in way)
+    speed, curvature = (jnp.asarray(1.2 * each[1:]) for each in knots)
     point = problem.pack(speed, curvature, jnp.array(9.0))
     found = model(point)
     assert found.cost > 1.0 and found.violation > 0.0
     steps = 1e-6 * jnp.eye(point.size)
     slopes = [(model(point + step).cost - model(point - step).cost) / 2e-6 for step in steps]
-    # Half of it, and without what the gain of the steering changes by.
+    # The model holds half the gradient, and neglects changes of the steering's gain.
     scale = np.abs(found.gradient).max()
     np.testing.assert_allclose(2.0 * found.gradient, slopes, rtol=2e-3, atol=2e-3 * scale)
 
@@ -134,7 +132,7 @@ def planned():
     return cases, pj.plan(PLANNER, cases)
 
 
-def test_what_the_planner_claims_the_referee_confirms(planned):
+def test_the_referee_confirms_the_planner(planned):
     cases, plans = planned
     verdict = pj.intercept.judge(cases, plans)
     solved = pj.solved(plans)
@@ -145,7 +143,7 @@ def test_what_the_planner_claims_the_referee_confirms(planned):
 
 
 @pytest.mark.slow
-def test_best_also_solves_starts_beside_walls_that_leave_no_room_for_margins():
+def test_best_also_solves_starts_beside_walls_without_space_for_margins():
     cases = pj.take(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
     usual, best = (pj.plan(pj.intercept.planner(name), cases) for name in ("spacetime", "best"))
     success = pj.intercept.judge(cases, best).success
@@ -158,11 +156,8 @@ def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     one = pj.take(plans, k).sample(50.0)
     assert one.time.shape == (501,) and one.pos.shape == (501, 2)
     np.testing.assert_allclose(one.pos[0], cases.start[k, :2], atol=1e-5)
-    np.testing.assert_allclose(
-        np.linalg.norm(np.diff(one.pos, axis=0), axis=1) * 50.0,
-        0.5 * (one.speed[1:] + one.speed[:-1]),
-        atol=0.02,
-    )
+    rate = np.linalg.norm(np.diff(one.pos, axis=0), axis=1) * 50.0
+    np.testing.assert_allclose(rate, 0.5 * (one.speed[1:] + one.speed[:-1]), atol=0.02)
     np.testing.assert_allclose(one.yaw_rate, one.speed * one.curvature, atol=1e-5)
     middle = one.pos[-1] + 0.15 * np.array([np.cos(one.heading[-1]), np.sin(one.heading[-1])])
     assert np.linalg.norm(middle - plans.meeting[k]) <= 0.05
@@ -177,14 +172,17 @@ def still(x, y):
 
 
 WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
-AIDE = {"movers": pj.obstacles([], room=(4, 6))}
+HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
 
 
 def scene(target, walls=(), **settings):
-    """A case with the room of drawn ones, so that they share a program."""
-    return pj.intercept.case(
-        still(*target), walls=pj.obstacles(walls, room=(12, 6)), **AIDE, **settings
-    )
+    """Make a case of the shapes of drawn cases, so that all share a compiled program."""
+    walls, movers = pj.obstacles(walls, room=(12, 6)), pj.obstacles([], room=(4, 6))
+    return pj.intercept.case(still(*target), walls=walls, movers=movers, **settings)
+
+
+def stack(cases):
+    return jax.tree.map(lambda *leaves: np.stack([np.asarray(x) for x in leaves]), *cases)
 
 
 NEAR = (6.0, 4.0)
@@ -204,13 +202,12 @@ SCENES = {
 
 @pytest.fixture(scope="module")
 def scenes():
-    cases = [jax.tree.map(np.asarray, case) for case, _ in SCENES.values()]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
+    batch = stack([case for case, _ in SCENES.values()])
     return batch, jax.device_get(pj.plan(PLANNER, jax.tree.map(jnp.asarray, batch)))
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_a_case_that_cannot_be_solved_says_why_and_others_are_solved(scenes, name):
+def test_an_unsolvable_case_has_a_status_and_others_are_solved(scenes, name):
     k, status = list(SCENES).index(name), SCENES[name][1]
     case, plan = pj.take(scenes, k)
     assert plan.status == status
@@ -220,7 +217,7 @@ def test_a_case_that_cannot_be_solved_says_why_and_others_are_solved(scenes, nam
 
 
 @pytest.mark.parametrize("name, heading", [("north", 0.5 * np.pi), ("west", np.pi)])
-def test_a_given_heading_is_kept_at_the_meeting(scenes, name, heading):
+def test_a_specified_heading_is_reached_at_the_meeting(scenes, name, heading):
     plan = pj.take(scenes[1], list(SCENES).index(name))
     off = plan.sample(10.0).heading[-1] - heading
     assert abs(np.angle(np.exp(1j * off))) <= 0.051
@@ -228,28 +225,20 @@ def test_a_given_heading_is_kept_at_the_meeting(scenes, name, heading):
 
 @pytest.fixture(scope="module")
 def early():
-    """An open map, a wall to go round, and one across, for a planner that picks the time."""
-    cases = [scene((5.0, 5.0)), scene((6.0, 4.0), [HALF]), scene((6.0, 4.0), [WALL])]
-    cases = [jax.tree.map(np.asarray, case) for case in cases]
-    batch = jax.tree.map(lambda *leaves: np.stack(leaves), *cases)
-    planner = pj.intercept.planner(
-        meet="early", searches=(dataclasses.replace(SEARCHES[0], solver=LevenbergConfig(40)),)
-    )
-    return batch, pj.plan(planner, batch)
-
-
-HALF = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.5], [3.9, 5.5]]
+    """Plan early meetings on an open map, behind a wall with an end, and behind a wall across."""
+    batch = stack([scene((5.0, 5.0)), scene((6.0, 4.0), [HALF]), scene((6.0, 4.0), [WALL])])
+    search = dataclasses.replace(SEARCHES[0], solver=LevenbergConfig(40))
+    return batch, pj.plan(pj.intercept.planner(meet="early", searches=(search,)), batch)
 
 
 @pytest.mark.slow
-def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
+def test_an_early_meeting_is_little_later_than_a_straight_drive(early):
     cases, plans = early
     verdict = pj.intercept.judge(cases, plans)
     assert verdict.success[:2].all() and plans.status[2] == pj.Status.NO_PATH
-    # From 0.5 to 1.5 m/s in 1 s, and at that speed on: 1 m and the rest of the way.
-    start = cases.start[:, :2] + [0.15, 0.0]
-    way = np.linalg.norm(plans.meeting - start, axis=1)
-    least = 1.0 + (way - 0.05 - 1.0) / 1.5
+    # From 0.5 to 1.5 m/s in 1 s, on 1 m, then at the greatest speed.
+    distance = np.linalg.norm(plans.meeting - cases.start[:, :2] - [0.15, 0.0], axis=1)
+    least = 1.0 + (distance - 0.05 - 1.0) / 1.5
     assert np.all(plans.time[:2] > least[:2])
     assert plans.time[0] < least[0] + 0.6  # it has to turn by 15 degrees
     assert plans.time[0] < plans.time[1] < 10.0
@@ -257,7 +246,7 @@ def test_an_early_meeting_is_at_most_as_late_as_the_straight_line_takes(early):
 
 
 @pytest.mark.slow
-def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
+def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     cases, plans = planned
     good = np.flatnonzero(pj.solved(plans))
     cases, plans = pj.take((cases, plans), good)
@@ -270,7 +259,7 @@ def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
     np.testing.assert_allclose(again.meeting, plans.meeting, atol=1e-3)
     before, after = plans.sample(10.0), again.sample(10.0)
     np.testing.assert_allclose(after.pos[:, 0], before.pos[:, 20], atol=1e-4)
-    # The new way is beside what was left of the old one.
+    # The new path is close to the remainder of the old path.
     apart = np.linalg.norm(after.pos - before.pos[:, 20:], axis=-1)
     assert np.median(apart) < 0.1
     moved = dataclasses.replace(
@@ -289,7 +278,7 @@ def test_a_plan_goes_on_as_it_was_for_a_target_as_before(planned):
         pj.replan(PLANNER, cases, plans, -1.0, target=turned)
 
 
-def test_what_latency_plans_again_is_what_is_left_of_solved_plans(planned):
+def test_latency_plans_the_remainders_of_solved_plans_again(planned):
     cases, plans = planned
     planner, tasks = planned_again(PLANNER, cases, 2.0)
     assert planner == PLANNER.replanner()
@@ -301,20 +290,16 @@ def test_what_latency_plans_again_is_what_is_left_of_solved_plans(planned):
     np.testing.assert_allclose(goals[0], goals[1][pj.solved(plans)], atol=1e-4)
 
 
-def test_a_time_of_meeting_that_is_not_known_is_refused():
-    with pytest.raises(ValueError, match="meet must be given, early or least, got 'soon'"):
-        pj.intercept.planner(meet="soon")
-
-
 @pytest.mark.parametrize(
-    "settings, message",
+    ("make", "settings", "message"),
     [
-        ({"time": 0.0}, "time must be > 0"),
-        ({"curvature": -1.0}, "curvature must be > 0"),
-        ({"time": np.ones(3)}, r"target must have leaves that begin with the shape \(3,\)"),
+        (pj.intercept.planner, {"meet": "soon"}, "meet must be given, early or least, got 'soon'"),
+        (scene, {"time": 0.0}, "time must be > 0"),
+        (scene, {"curvature": -1.0}, "curvature must be > 0"),
+        (scene, {"time": np.ones(3)}, r"target must have leaves that begin with the shape \(3,\)"),
     ],
 )
-def test_bad_input_is_refused_in_one_line(settings, message):
+def test_bad_input_is_rejected_in_one_line(make, settings, message):
     with pytest.raises(ValueError, match=message) as caught:
-        pj.intercept.case(still(5.0, 5.0), **settings)
+        make(*[NEAR] * (make is scene), **settings)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Derivatives of interceptions: those of the point of least cost about a plan."""
+"""Derivatives of interceptions at the point of least cost near a plan."""
 
 import dataclasses
 import functools
@@ -17,12 +17,12 @@ from planner_jax.task.intercept.plan import make_straight_plan
 from planner_jax.task.intercept.searches import Search
 
 BY = ("movers.centre", "walls.centre", "limits.acceleration", "target.vel", "speed")
-# One search with few ways, a few unknowns.
+# One search with few paths, and few unknowns.
 SMALL = {"pieces": 8, "samples": 3, "searches": (Search(4, lattice=Lattice(layers=22)),)}
 
 
 def crossing(dtype, wall=0.0):
-    """A target that passes ahead, a mover that comes from the right, and so far a wall [m]."""
+    """Make a case with a target ahead, a mover from the right, and a wall at a distance [m]."""
     target = TurningPath(*(jnp.asarray(x, dtype) for x in ([3.5, 4.4], [0.0, -0.2], 0.0)))
     corners = np.array([(1.6, 4.0), (2.4, 4.0), (2.0, 5.0)]) + [0.0, wall]
     mover = [(2.5, 3.1), (3.0, 3.1), (3.0, 3.6), (2.5, 3.6)]
@@ -43,71 +43,76 @@ def duration(plan):
 
 @functools.cache
 def settle(planner):
-    """What leads from a case to the unknowns of least cost, compiled."""
+    """Return a compiled function from a case to the unknowns of least cost."""
     return jax.jit(lambda case: planner.guesses(planner.prepare(case), 1)[0])
 
 
-def at_rest(planner, case):
-    """The problem about a drive straight on, with a case that begins where its cost is least."""
-    smooth, begun = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
-    return smooth, dataclasses.replace(begun, begun=settle(smooth)(begun))
+def move_to_optimum(smooth, case):
+    """Return the case with the unknowns of least cost as its starting point."""
+    return dataclasses.replace(case, start_point=settle(smooth)(case))
+
+
+def optimum_near_straight(planner, case):
+    """Return the smooth planner near a straight drive, and the case at the point of least cost."""
+    smooth, case = planner.smooth_near(case, make_straight_plan(case, planner.pieces))
+    return smooth, move_to_optimum(smooth, case)
 
 
 @functools.cache
 def differentiate(planner, quantity, by, steps):
-    """What leads from a case at rest to a gradient, compiled."""
+    """Return a compiled function from a case at its optimum to a gradient."""
     options = {"steps": steps, "curvature": "whole"}
     return jax.jit(
         lambda case: gradient_at(planner, case, case.start_point, quantity, by, **options)
     )
 
 
-def moved(case, name, by):
+def move(case, name, by):
     first, _, rest = name.partition(".")
     inner = getattr(case, first)
-    new = moved(inner, rest, by) if rest else inner + by
+    new = move(inner, rest, by) if rest else inner + by
     return dataclasses.replace(case, **{first: new})
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("meet", "binding"), [("early", "movers"), ("given", "walls")])
-def test_gradients_are_those_of_plans_made_anew(meet, binding, float64):
-    """Central differences; a drive is planned anew from the one that is differentiated."""
+def test_gradients_match_differences_of_new_plans(meet, binding, float64):
+    """A changed case is planned again from the plan that is differentiated."""
     planner = pj.intercept.planner(meet=meet, **SMALL)
-    smooth, case = at_rest(planner, crossing(jnp.float64))
+    smooth, case = optimum_near_straight(planner, crossing(jnp.float64))
     quantity = duration if meet == "early" else "cost"
     steps = 1 if meet == "early" else 0
     found = differentiate(smooth, quantity, BY, steps)(case)
 
     @jax.jit
-    def settled_value(case):
+    def value(case):
         point = settle(smooth)(case)
         if meet == "early":
             return smooth.decode(point, smooth.prepare(case)).time
         return smooth.objective(point, smooth.prepare(case)).cost
 
-    assert found.value == pytest.approx(float(settled_value(case)))
+    assert found.value == pytest.approx(float(value(case)))
     rng = np.random.default_rng(2)
     for name in BY:
         part = functools.reduce(getattr, name.split("."), case)
         direction = jnp.asarray(rng.normal(size=part.shape))
-        ends = [moved(case, name, sign * 1e-4 * direction) for sign in (1.0, -1.0)]
-        difference = (settled_value(ends[0]) - settled_value(ends[1])) / 2e-4
+        ends = [value(move(case, name, sign * 1e-4 * direction)) for sign in (1.0, -1.0)]
+        difference = (ends[0] - ends[1]) / 2e-4
         along = float(jnp.sum(found.by[name] * direction))
         assert along == pytest.approx(float(difference), rel=1e-3, abs=1e-5), name
     assert np.any(np.abs(found.by[f"{binding}.centre"]) > 1e-2)
 
 
 @pytest.mark.slow
-def test_an_obstacle_that_is_far_away_does_not_matter(float64):
+def test_the_gradient_by_a_distant_obstacle_is_zero(float64):
     planner = pj.intercept.planner(meet="early", **SMALL)
-    smooth, case = at_rest(planner, crossing(jnp.float64, wall=2.0))
+    smooth, case = optimum_near_straight(planner, crossing(jnp.float64, wall=2.0))
     assert not np.any(differentiate(smooth, duration, BY, 1)(case).by["walls.centre"])
 
 
 @pytest.mark.slow
 def test_a_batch_has_gradients_of_its_plans():
-    """In float32, of drawn cases; a car that may be quicker is there earlier."""
+    """Drawn cases in float32: a greater acceleration makes the meeting earlier."""
     planner = pj.intercept.planner(meet="early", **SMALL)
     cases = pj.intercept.draw(8, "easy", 0)
     found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers.centre"])
@@ -130,9 +135,8 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
 
     slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
     assert pj.solved(plan)
-    smooth, begun = planner.settle(case)
-    begun = dataclasses.replace(begun, begun=settle(smooth)(begun))
-    found = differentiate(smooth, duration, BY, 1)(begun)
+    smooth, case = planner.settle(case)
+    found = differentiate(smooth, duration, BY, 1)(move_to_optimum(smooth, case))
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)
 
 

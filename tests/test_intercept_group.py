@@ -1,4 +1,4 @@
-"""Groups of targets for one car: how they are drawn, ordered, planned leg after leg, and judged."""
+"""Groups of targets for one car: suites, decisions, plans leg after leg, and the referee."""
 
 import dataclasses
 import itertools
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from closed_forms import positions_on
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError
@@ -38,16 +39,16 @@ def numpy(tree):
 
 
 def draw(num, seed, count):
-    """Drawn groups with so many targets each."""
+    """Draw groups with `count` targets each."""
     groups = numpy(pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(4) < count, (num, 4))
     return dataclasses.replace(groups, present=present)
 
 
 def line(*xs, present=True, **settings):
-    """Targets that stand on a line ahead of the car."""
-    places = jnp.array([[x, 4.0] for x in xs])
-    path = pj.TurningPath(places, jnp.zeros_like(places), jnp.zeros(len(xs)))
+    """Make a group of targets at rest on a line ahead of the car."""
+    pos = jnp.array([[x, 4.0] for x in xs])
+    path = pj.TurningPath(pos, jnp.zeros_like(pos), jnp.zeros(len(xs)))
     return pj.group.case(path, present=present, **settings)
 
 
@@ -56,9 +57,9 @@ def test_a_group_is_the_same_in_every_batch():
     for a, b in zip(*map(jax.tree.leaves, (whole, again)), strict=True):
         np.testing.assert_array_equal(a[2:5], b)
         assert a.dtype in (np.float32, np.int32, bool)
-    # A change here is a change of published cases.
-    place = pj.group.draw(1).shared.target.pos[0, 3]
-    np.testing.assert_allclose(place, [7.109591, 4.838748], rtol=1e-5)
+    # A published case.
+    pos = pj.group.draw(1).shared.target.pos[0, 3]
+    np.testing.assert_allclose(pos, [7.109591, 4.838748], rtol=1e-5)
 
 
 def test_groups_have_two_to_four_targets_that_stay_on_the_map():
@@ -67,39 +68,35 @@ def test_groups_have_two_to_four_targets_that_stay_on_the_map():
     assert not (groups.present[:, 1:] & ~groups.present[:, :-1]).any()
     np.testing.assert_array_equal(groups.shared.time, suite.time)
     assert groups.shared.walls.corners.shape[:3] == (40, *suite.wall_room)
-    at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
-    places = jax.jit(jax.vmap(jax.vmap(at, (0, None)), (0, None)))(
-        groups.shared.target, jnp.linspace(0.0, suite.time, 100)
-    )
-    assert places.min() >= -1e-3 and places.max() <= SIZE + 1e-3
+    positions = positions_on(groups.shared.target, np.linspace(0.0, suite.time, 100))
+    assert positions.min() >= -1e-3 and positions.max() <= SIZE + 1e-3
     turns = groups.shared.target.turn_rate != 0.0
     assert (turns.mean(axis=0) > 0.25).all() and (turns.mean(axis=0) < 0.75).all()
 
 
-def test_a_leg_has_targets_and_movers_moved_on():
+def test_a_leg_has_targets_and_movers_at_its_start_time():
     group = pj.take(draw(1, 2, 4), 0)
     car = CarState(jnp.array([1.0, 2.0, 0.3]), jnp.array(1.2), jnp.array(-0.5))
     leg = group.leg(2, 4.0, car)
     path = jax.tree.map(lambda leaf: leaf[2], group.shared.target)
     np.testing.assert_allclose(leg.target.at(1.5).pos, path.at(5.5).pos, rtol=1e-6)
     np.testing.assert_allclose(leg.time, 11.0)
-    np.testing.assert_allclose(
-        leg.movers.vertices(1.5), group.shared.movers.vertices(5.5), atol=1e-5
-    )
+    later = group.shared.movers.vertices(5.5)
+    np.testing.assert_allclose(leg.movers.vertices(1.5), later, atol=1e-5)
     np.testing.assert_array_equal(leg.start, car.pose)
     assert (leg.speed, leg.curvature) == (car.speed, car.curvature)
     assert group.leg(2, 20.0, car).time > 0.0
 
 
 @pytest.mark.parametrize("decision", [Best(6), Greedy()])
-def test_targets_on_a_line_are_met_as_they_come(decision):
+def test_targets_on_a_line_are_met_in_sequence(decision):
     group = line(6.0, 2.0, 3.0, 4.5)
     assert first_choice(decision, group).order.tolist() == [1, 2, 3, 0]
     without = dataclasses.replace(group, present=jnp.array([True, False, True, True]))
     assert first_choice(decision, without).order.tolist() == [2, 3, 0, 1]
 
 
-def test_the_best_of_all_orders_looks_at_each_once():
+def test_best_proposes_every_order_once():
     group = line(6.0, 2.0, 3.0, 4.5, present=[True, False, True, True])
     propose = jax.jit(Best(6).propose)
     three = {(*front, 1) for front in itertools.permutations([0, 2, 3])}
@@ -109,7 +106,7 @@ def test_the_best_of_all_orders_looks_at_each_once():
     assert set(map(tuple, propose(two).order.tolist())) == {(0, 3, 1, 2), (3, 0, 1, 2)}
 
 
-def test_a_given_order_is_kept_and_has_to_be_one():
+def test_a_given_order_is_kept_and_must_be_a_permutation():
     group = line(6.0, 2.0, 3.0, present=[True, False, True])
     given = dataclasses.replace(group, order=jnp.array([1, 2, 0], jnp.int32))
     Given().check(given)
@@ -120,15 +117,15 @@ def test_a_given_order_is_kept_and_has_to_be_one():
 
 @pytest.fixture(scope="module")
 def planned():
-    """Groups of two, the last one with too little time for both."""
+    """Plan groups of two targets; the last group has too little time for both."""
     groups = draw(6, 4, 2)
-    time = np.array([15.0, 15.0, 15.0, 15.0, 15.0, 1.0], np.float32)
+    time = np.array([15.0] * 5 + [1.0], np.float32)
     groups = dataclasses.replace(groups, shared=dataclasses.replace(groups.shared, time=time))
     return groups, {name: pj.plan(planner(name), groups) for name in ("best", "greedy")}
 
 
 @pytest.mark.parametrize("decide", ["best", "greedy"])
-def test_what_is_solved_the_referee_confirms(planned, decide):
+def test_the_referee_confirms_solved_groups(planned, decide):
     groups, plans = planned[0], planned[1][decide]
     verdict = pj.group.judge(groups, plans)
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(plans))
@@ -168,7 +165,7 @@ def test_one_group_is_planned_as_in_a_batch(planned, decide):
     assert pj.group.judge(pj.take(planned[0], k), one).success
 
 
-def test_legs_join(planned):
+def test_each_leg_starts_where_the_previous_leg_ends(planned):
     plans = planned[1]["best"]
     plan = pj.take(plans, int(np.argmax(pj.solved(plans))))
     first, second = (pj.take(plan.legs, k) for k in (0, 1))
@@ -194,12 +191,12 @@ def test_one_target_is_planned_as_an_interception(planned):
     assert pj.group.judge(groups, plans).success[solved].all()
 
 
-def cut(plans, **changes):
-    """The plans with other leaves in their legs."""
+def change_legs(plans, **changes):
+    """Replace leaves of the legs of plans."""
     return dataclasses.replace(plans, legs=dataclasses.replace(plans.legs, **changes))
 
 
-def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
+def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
     groups, plans = planned[0], planned[1]["best"]
     good = np.flatnonzero(pj.solved(plans))
     groups, plans = pj.take((groups, plans), good)
@@ -210,9 +207,13 @@ def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
     faster = legs.speed + 0.01 * (np.arange(4) == 1)[:, None]
     other = plans.order[:, [1, 0, 2, 3]]
     wrong = {
-        "a leg that is cut": (cut(plans, time=shorter * legs.time), 1, {"meeting", "acceleration"}),
-        "a leg that begins aside": (cut(plans, start=legs.start + aside), 1, {"start"}),
-        "a leg that begins faster": (cut(plans, speed=faster), 1, {"start"}),
+        "a leg that is cut": (
+            change_legs(plans, time=shorter * legs.time),
+            1,
+            {"meeting", "acceleration"},
+        ),
+        "a leg aside": (change_legs(plans, start=legs.start + aside), 1, {"start"}),
+        "a faster leg": (change_legs(plans, speed=faster), 1, {"start"}),
         "the other order": (dataclasses.replace(plans, order=other), 0, {"meeting"}),
         "a target twice": (dataclasses.replace(plans, order=plans.order * 0), 0, {"order"}),
     }
@@ -222,11 +223,11 @@ def test_the_referee_refuses_a_plan_with_a_wrong_leg(planned):
         assert set(verdict.failed_limit) <= limits, name
         if limits != {"order"}:
             np.testing.assert_array_equal(verdict.leg, leg)
-    one = pj.group.judge(*pj.take((groups, wrong["a leg that begins aside"][0]), 0))
+    one = pj.group.judge(*pj.take((groups, wrong["a leg aside"][0]), 0))
     assert one.sentence().startswith("start: leg 1: the plan starts 0.01 off")
 
 
-def test_groups_and_single_targets_are_told_apart():
+def test_groups_and_single_targets_are_distinguished():
     with pytest.raises(ValueError, match="decide must be one of best, greedy, given, got 'worst'"):
         pj.group.planner(decide="worst")
     with pytest.raises(TypeError, match="decide"):

@@ -1,4 +1,4 @@
-"""The oracle of interceptions: what it says agrees with closed forms, and with the referee."""
+"""The oracle of interceptions agrees with closed forms, and with the referee."""
 
 from dataclasses import replace
 
@@ -10,14 +10,7 @@ import pytest
 import planner_jax as pj
 from planner_jax.benchmarks.intercept_bound import earliest_bound
 from planner_jax.benchmarks.intercept_departure import departs
-from planner_jax.benchmarks.intercept_lattice import (
-    CELL,
-    HEADINGS,
-    LAYER,
-    MINIMAL,
-    STRICT,
-    Lattice,
-)
+from planner_jax.benchmarks.intercept_lattice import CELL, HEADINGS, LAYER, MINIMAL, STRICT, Lattice
 from planner_jax.benchmarks.intercept_oracle import scenes, search
 from planner_jax.referee.clearance import clearances
 
@@ -28,7 +21,7 @@ both = pytest.mark.parametrize("rules", [MINIMAL, STRICT], ids=["minimal", "stri
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Three cases of many movers."""
+    """Draw three cases with many movers."""
     return scenes(pj.intercept.draw(3, "storm", 4))
 
 
@@ -43,7 +36,7 @@ def box(left, low, right, high):
 
 
 def gate(closing, time=6.0):
-    """A wall with a gap straight ahead, and a mover that shuts it from the side."""
+    """Make a scene: a wall has a gap straight ahead, which a mover closes from the side."""
     return scene(
         (6.0, 4.0),
         time=time,
@@ -54,7 +47,7 @@ def gate(closing, time=6.0):
 
 
 def distance(scene, points, times):
-    """Of points (P, 2) from the nearest wall or mover at times (P,)."""
+    """Return distances of points (P, 2) from the nearest wall or mover at times (P,)."""
     polygons = np.array([*scene.walls, *scene.movers])
     centre = polygons.mean(axis=1)
     velocity = np.concatenate([np.zeros((len(scene.walls), 2)), scene.velocities])
@@ -69,8 +62,8 @@ def distance(scene, points, times):
 
 @both
 @pytest.mark.parametrize("away", [0.1, 0.45])
-def test_on_an_open_map_a_chase_takes_as_long_as_its_closed_form(rules, away):
-    """A target that flees straight ahead, and is caught up with at the difference of speeds."""
+def test_on_an_open_map_a_chase_takes_the_time_of_its_closed_form(rules, away):
+    """The target flees straight ahead, and the car approaches at the difference of speeds."""
     ahead, times = 1.0, np.linspace(0.0, 6.0, 60001)
     rising = np.minimum(times, (TOP - SPEED) / ACCELERATION)
     driven = SPEED * rising + 0.5 * ACCELERATION * rising**2 + TOP * (times - rising)
@@ -82,7 +75,7 @@ def test_on_an_open_map_a_chase_takes_as_long_as_its_closed_form(rules, away):
 
 
 @both
-def test_to_a_place_at_the_side_a_car_goes_no_shorter_than_an_arc_and_a_tangent(rules):
+def test_a_drive_to_the_side_is_no_shorter_than_an_arc_and_a_tangent(rules):
     """At top speed the lateral acceleration bounds the curvature; braking takes as long."""
     found = Lattice(scene((START[0] + MIDDLE, START[1] + 2.0)), rules).reach()
     straight = earliest_bound(scene((START[0] + MIDDLE, START[1] + 2.0)))[1]
@@ -91,7 +84,7 @@ def test_to_a_place_at_the_side_a_car_goes_no_shorter_than_an_arc_and_a_tangent(
 
 
 @both
-def test_through_a_wall_across_the_whole_map_there_is_no_way(rules):
+def test_no_path_leads_through_a_wall_across_the_map(rules):
     parted = scene((6.0, 4.0), walls=[box(3.0, -0.5, 3.1, 8.5)])
     found = Lattice(parted, rules).reach()
     assert not found.at_end and found.earliest == np.inf
@@ -107,7 +100,7 @@ def test_a_gate_is_passed_before_it_closes_and_not_after(rules):
 
 
 @pytest.mark.slow
-def test_a_gap_narrower_than_the_body_is_passed_by_no_one_and_a_tight_one_by_the_inner_disc():
+def test_no_body_passes_a_narrow_gap_and_only_the_inner_disc_passes_a_tight_gap():
     def gap(width):
         walls = [box(3.0, 0.0, 3.2, 4.0 - width / 2), box(3.0, 4.0 + width / 2, 3.2, 8.0)]
         return search(scene((6.0, 4.0), walls=walls))[0]
@@ -117,8 +110,8 @@ def test_a_gap_narrower_than_the_body_is_passed_by_no_one_and_a_tight_one_by_the
     assert gap(0.45) == [True, True, True]
 
 
-def test_a_target_that_comes_near_too_early_or_too_late_is_not_met_at_the_end():
-    """Met on its way, but out of reach when the case ends."""
+def test_a_target_that_is_near_too_early_is_not_met_at_the_end():
+    """The target can be met on its path, but is out of reach when the case ends."""
     passing = scene((1.8, 4.0), (1.6, 0.0), time=3.5)
     for rules in (MINIMAL, STRICT):
         assert not Lattice(passing, rules).reach().at_end
@@ -128,8 +121,8 @@ def test_a_target_that_comes_near_too_early_or_too_late_is_not_met_at_the_end():
 
 
 @both
-def test_what_is_free_is_free_by_the_referee(drawn, rules):
-    """Cells, headings and times at random: discs against exact distances."""
+def test_free_cells_are_free_by_the_referee(drawn, rules):
+    """Compare discs with exact distances for random cells, headings and times."""
     random, one = np.random.default_rng(0), drawn[0]
     lattice = Lattice(one, rules)
     half = random.integers(0, 2 * lattice.layers + 1, 300)
@@ -139,26 +132,26 @@ def test_what_is_free_is_free_by_the_referee(drawn, rules):
         lattice.free(h, k) >> int(row * lattice.stride + column) & 1
         for h, k, (column, row) in zip(half, heading, cells, strict=True)
     ]
-    rear, way = lattice.origin + CELL * cells, lattice.direction[heading]
+    rear, ahead = lattice.origin + CELL * cells, lattice.direction[heading]
     times = 0.5 * half * one.dt
-    room = np.min([distance(one, rear + a * way, times) for a in lattice.ahead], axis=0)
-    middle = rear + one.middle * way
+    gap = np.min([distance(one, rear + a * ahead, times) for a in lattice.ahead], axis=0)
+    middle = rear + one.middle * ahead
     on_map = np.minimum(middle - one.lower, one.upper - middle).min(axis=1)
-    margin = np.minimum(room - lattice.radius, on_map)
+    margin = np.minimum(gap - lattice.radius, on_map)
     clear = np.abs(margin) > CELL / 4
     assert (margin > 0.0)[clear].any() and (margin < 0.0)[clear].any() and clear.sum() > 250
     np.testing.assert_array_equal(np.array(free, bool)[clear], (margin > 0.0)[clear])
 
 
-def test_a_way_leads_from_the_start_to_the_target_within_the_limits_and_touches_nothing(drawn):
+def test_a_path_leads_from_start_to_target_within_the_limits_and_touches_nothing(drawn):
     for one in (*drawn[:2], gate(0.1)):
         found = Lattice(one, STRICT).reach(keep_way=True)
         assert found.way is not None
         time, x, y, heading, speed = found.way.T
         np.testing.assert_allclose([x[0], y[0], heading[0]], one.start, atol=1e-9)
         assert time[-1] == found.earliest
-        places = np.stack([x, y], axis=1)
-        middle = places + MIDDLE * np.stack([np.cos(heading), np.sin(heading)], axis=1)
+        pos = np.stack([x, y], axis=1)
+        middle = pos + MIDDLE * np.stack([np.cos(heading), np.sin(heading)], axis=1)
         layer = round(found.earliest / one.dt)
         assert np.linalg.norm(middle[-1] - one.target[layer]) <= TOLERANCE + CELL
         assert np.abs(np.diff(speed[::2])).max() <= ACCELERATION * one.dt + 1e-9
@@ -166,13 +159,13 @@ def test_a_way_leads_from_the_start_to_the_target_within_the_limits_and_touches_
         slack = 2.0 * np.pi / HEADINGS
         assert (turned <= 2.0 * speed[2::2] * one.dt + slack).all()
         assert (turned * speed[2::2] <= 0.8 * one.dt + slack * speed[2::2]).all()
-        steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+        steps = np.linalg.norm(np.diff(pos, axis=0), axis=1)
         assert (np.abs(steps - 0.5 * one.dt * speed[1:]) <= np.sqrt(2.0) * CELL).all()
         assert distance(one, middle, time).min() > 0.125 - CELL / 4
 
 
 @pytest.mark.slow
-def test_the_bound_is_no_later_than_the_inner_disc_and_that_no_later_than_the_whole_body(drawn):
+def test_bound_inner_disc_and_whole_body_are_in_order_of_time(drawn):
     at_end, earliest = search(drawn[2])
     assert earliest == sorted(earliest) and at_end == [True] * 3
 
@@ -183,8 +176,8 @@ def test_a_map_without_bounds_is_an_error():
 
 
 @pytest.mark.parametrize(("ahead", "gets_away"), [(0.1, False), (1.2, True)])
-def test_a_car_gets_away_from_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
-    # It neither reverses nor turns within less than half a metre.
+def test_a_car_escapes_a_wall_ahead_if_it_can_still_turn(ahead, gets_away):
+    # The car cannot reverse, and its least turning radius is half a metre.
     front = START[0] + MIDDLE + 0.2
     one = scene((6.0, 4.0), time=8.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(one, far=0.8, until=2.0) == gets_away
@@ -193,8 +186,8 @@ def test_a_car_gets_away_from_a_wall_ahead_if_it_can_still_turn(ahead, gets_away
 @pytest.mark.parametrize(
     ("ahead", "lives"), [(0.05, False), pytest.param(0.5, True, marks=pytest.mark.slow)]
 )
-def test_of_a_target_nearby_it_is_enough_to_touch_nothing(ahead, lives):
-    # The car sets out at a speed at which it takes 0.125 m to stand.
+def test_near_a_target_it_suffices_to_touch_nothing(ahead, lives):
+    # From its initial speed the car stops within 0.125 m.
     front = START[0] + MIDDLE + 0.2
     near = scene((1.5, 4.0), time=2.0, walls=[box(front + ahead, 2.0, front + ahead + 0.2, 6.0)])
     assert departs(replace(near, initial_speed=0.5)) == lives

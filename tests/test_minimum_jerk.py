@@ -1,4 +1,4 @@
-"""The minimum-jerk primitive: its ends, its cost, and that nothing does better."""
+"""The minimum-jerk primitive: its ends, its cost, and its optimality."""
 
 import jax
 import jax.numpy as jnp
@@ -23,25 +23,21 @@ def solve(head_state, tail_state, duration):
 
 
 def axes_of(coeffs):
-    """One NumPy polynomial an axis, of coefficients (D + 1, 3)."""
+    """Return one NumPy polynomial for each axis of coefficients (D + 1, 3)."""
     return [np.polynomial.Polynomial(c) for c in np.asarray(coeffs, np.float64).T]
 
 
 def jerk_cost(axes):
-    """(1/T) integral |jerk|^2 dt by Gauss's quadrature, exact up to degree 31."""
+    """Compute (1/T) integral |jerk|^2 dt by Gauss's quadrature, exact up to degree 31."""
     nodes, weights = np.polynomial.legendre.leggauss(16)
     times = 0.5 * DURATION * (1.0 + nodes)
     return sum(0.5 * weights @ axis.deriv(3)(times) ** 2 for axis in axes)
 
 
 def states(axes):
-    """Position, velocity and acceleration at both ends, (2, 3, 3)."""
-    return np.array(
-        [
-            [[axis.deriv(d)(time) if d else axis(time) for axis in axes] for d in range(3)]
-            for time in (0.0, DURATION)
-        ]
-    )
+    """Return position, velocity and acceleration at both ends, (2, 3, 3)."""
+    rows = [[axis.deriv(d) if d else axis for axis in axes] for d in range(3)]
+    return np.array([[[p(time) for p in row] for row in rows] for time in (0.0, DURATION)])
 
 
 @float64
@@ -57,12 +53,11 @@ def test_the_primitive_meets_both_states():
 @float64
 def test_from_hover_to_hover_it_is_the_classical_quintic():
     """p = (10 x^3 - 15 x^4 + 6 x^5) d with x = t / T, whose cost is 720 |d|^2 / T^6."""
-    way = np.array([2.0, -1.0, 0.5])
-    rest = np.zeros((3, 3))
-    primitive, cost = solve(rest, np.concatenate([way[None], rest[1:]]), DURATION)
+    move, rest = np.array([2.0, -1.0, 0.5]), np.zeros((3, 3))
+    primitive, cost = solve(rest, np.concatenate([move[None], rest[1:]]), DURATION)
     shape = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]) / DURATION ** np.arange(6)
-    np.testing.assert_allclose(primitive.coeffs[0], np.outer(shape, way), atol=1e-12)
-    np.testing.assert_allclose(cost, 720.0 * way @ way / DURATION**6, rtol=1e-12)
+    np.testing.assert_allclose(primitive.coeffs[0], np.outer(shape, move), atol=1e-12)
+    np.testing.assert_allclose(cost, 720.0 * move @ move / DURATION**6, rtol=1e-12)
 
 
 @float64
@@ -75,24 +70,18 @@ def test_coasting_costs_nothing():
 
 
 @float64
-def test_the_cost_is_the_mean_of_the_squared_jerk():
-    primitive, cost = solve(HEAD, TAIL, DURATION)
-    np.testing.assert_allclose(cost, jerk_cost(axes_of(primitive.coeffs[0])), rtol=1e-12)
-
-
-@float64
-def test_every_change_that_keeps_both_states_raises_the_cost_by_its_own():
-    """The sixth derivative vanishes (Pontryagin), so the first variation of the cost does."""
+def test_the_cost_is_the_mean_squared_jerk_and_every_change_raises_it():
+    """Changes keep both states; the first variation of the cost is zero (Pontryagin)."""
     primitive, cost = solve(HEAD, TAIL, DURATION)
     axes = axes_of(primitive.coeffs[0])
+    np.testing.assert_allclose(cost, jerk_cost(axes), rtol=1e-12)
     assert all(axis.degree() == 5 and not axis.deriv(6).coef.any() for axis in axes)
-    # t^3 (T - t)^3 and what is times it have no position, velocity or acceleration at the ends.
-    bump = (
-        np.polynomial.Polynomial([0.0, 1.0]) ** 3 * np.polynomial.Polynomial([DURATION, -1.0]) ** 3
-    )
+    # Multiples of t^3 (T - t)^3 have zero position, velocity and acceleration at both ends.
+    polynomial = np.polynomial.Polynomial
+    bump = polynomial([0.0, 1.0]) ** 3 * polynomial([DURATION, -1.0]) ** 3
     rng = np.random.default_rng(0)
     for _ in range(5):
-        changes = [bump * np.polynomial.Polynomial(c) for c in rng.normal(scale=9.0, size=(3, 4))]
+        changes = [bump * polynomial(c) for c in rng.normal(scale=9.0, size=(3, 4))]
         np.testing.assert_allclose(states(changes), 0.0, atol=1e-12)
         changed = [axis + change for axis, change in zip(axes, changes, strict=True)]
         np.testing.assert_allclose(jerk_cost(changed) - cost, jerk_cost(changes), rtol=1e-9)

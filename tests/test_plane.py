@@ -1,4 +1,4 @@
-"""What stands and moves in the plane, and what a car can reach among it."""
+"""Obstacles and targets in the plane, and the states that a car can reach among them."""
 
 import jax
 import jax.numpy as jnp
@@ -14,14 +14,14 @@ SQUARE = [[2.0, 2.0], [3.0, 2.0], [3.0, 3.0], [2.0, 3.0]]
 
 
 def brute_distance(polygon, point, num=4000):
-    """To the nearest of many points of a polygon's boundary."""
+    """Return the distance to the nearest of many points of a polygon's boundary."""
     share = np.linspace(0.0, 1.0, num)[:, None]
     ends = np.roll(polygon, -1, axis=0)
     along = [a + share * (b - a) for a, b in zip(polygon, ends, strict=True)]
     return np.linalg.norm(np.concatenate(along) - point, axis=1).min()
 
 
-def test_distance_to_a_polygon_is_that_to_the_nearest_point_of_its_boundary(float64):
+def test_the_distance_of_a_polygon_is_the_distance_to_its_boundary(float64):
     rng = np.random.default_rng(0)
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 5))
     polygon = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -29,27 +29,27 @@ def test_distance_to_a_polygon_is_that_to_the_nearest_point_of_its_boundary(floa
     points = rng.uniform(-3.0, 3.0, (200, 2))
 
     @jax.jit
-    def measured(points):
+    def measure(points):
         x, y = points.T
         return distances(one.vertices(0.0), one.present, x[None], y[None])
 
-    distance, away = measured(points)
+    distance, away = measure(points)
     outside = np.asarray(distance[0]) > 0.0
     expected = [brute_distance(polygon, point) for point in points[outside]]
     np.testing.assert_allclose(distance[0][outside], expected, atol=1e-5)
     assert outside.any() and not outside.all()
     np.testing.assert_allclose(np.hypot(*away)[0], 1.0, rtol=1e-6)
-    # What is not there is far, and the direction is the slope of the distance.
+    # An absent polygon is far away, and the direction is the gradient of the distance.
     assert (distance[1] > 100.0).all()
     step = 1e-6
     for axis in range(2):
-        ahead, _ = measured(points + step * np.eye(2)[axis])
+        ahead, _ = measure(points + step * np.eye(2)[axis])
         slope = (ahead[0] - distance[0]) / step
         close = np.isclose(slope, away[axis][0], atol=1e-4)
-        assert close.mean() > 0.99  # but where another edge becomes the nearest
+        assert close.mean() > 0.99  # except where the nearest edge changes
 
 
-def test_a_rectangle_is_apart_from_a_polygon_just_where_no_point_is_in_both(float64):
+def test_a_rectangle_is_separate_from_a_polygon_if_no_point_is_in_both(float64):
     rng = np.random.default_rng(1)
     one = pj.obstacles([SQUARE], dtype=jnp.float64)
     x, y = rng.uniform(1.0, 4.0, (2, 400))
@@ -66,36 +66,32 @@ def test_a_rectangle_is_apart_from_a_polygon_just_where_no_point_is_in_both(floa
 
 
 @pytest.mark.parametrize(
-    "polygons, message",
+    ("polygons", "message"),
     [
         ([[[0, 0], [1, 0]]], r"polygons must have corners .* at index 0$"),
-        (
-            [SQUARE, [[0, 0], [2, 0], [0.5, 0.5], [0, 2]]],
-            "be convex: cut it .* at index 1$",
-        ),
+        ([SQUARE, [[0, 0], [2, 0], [0.5, 0.5], [0, 2]]], "be convex: cut it .* at index 1$"),
         ([[[0, 0], [1, 1], [2, 2]]], "polygons must have an area, .* at index 0$"),
         ([[[0, 0], [1, np.nan], [2, 2]]], "polygons must be finite, .* at index 0$"),
         ([SQUARE] * 3, "polygons must be at most 2 of at most 4 corners, got 3"),
     ],
 )
-def test_what_is_no_convex_polygon_is_refused_in_one_line(polygons, message):
+def test_polygons_that_are_not_convex_are_rejected_in_one_line(polygons, message):
     with pytest.raises(ValueError, match=message) as caught:
         pj.obstacles(polygons, room=(2, 4))
     assert "\n" not in str(caught.value)
 
 
-def test_corners_may_be_given_in_either_sense():
+def test_corners_may_have_either_sense():
     ours, theirs = pj.obstacles([SQUARE]), pj.obstacles([SQUARE[::-1]])
-    assert {tuple(c) for c in np.asarray(ours.corners[0]).tolist()} == {
-        tuple(c) for c in np.asarray(theirs.corners[0]).tolist()
-    }
+    corners = [sorted(np.asarray(each.corners[0]).tolist()) for each in (ours, theirs)]
+    assert corners[0] == corners[1]
     inside = jnp.array([[2.5]])
     for one in (ours, theirs):
         distance, _ = distances(one.vertices(0.0), one.present, inside, inside)
         np.testing.assert_allclose(distance, -0.5, atol=1e-6)
 
 
-def test_a_path_that_turns_is_a_circle_and_straight_without_turning(float64):
+def test_a_turning_path_is_a_circle_and_a_line_without_turning(float64):
     pos, vel = jnp.array([1.0, 2.0]), jnp.array([0.3, 0.4])
     line = pj.TurningPath(pos, vel, jnp.array(0.0)).at(3.0)
     np.testing.assert_allclose(line.pos, [1.9, 3.2], rtol=1e-12)
@@ -112,20 +108,23 @@ def test_a_path_that_turns_is_a_circle_and_straight_without_turning(float64):
 # A reach set of a map of 8 m by 8 m.
 
 LATTICE = reach.Lattice(layers=20)
+STEP = 10.0 / 19.5  # [s], from layer to layer
 
 
-def reached(target, time=10.0, **scene):
-    """Layers in which a place of the map can be met by the rear axle, bool (layers + 1,)."""
+def find_layers(target, walls=(), movers=(), velocities=0.0):
+    """Return whether the rear axle can be at a position in each layer, bool (layers + 1,)."""
     case = pj.intercept.case(
         pj.TurningPath(jnp.asarray(target, jnp.float32), jnp.zeros(2), jnp.array(0.0)),
-        time,
-        **scene,
+        10.0,
+        start=(0.8, 4.0, 0.0),
+        walls=pj.obstacles(walls, room=(2, 4)),
+        movers=pj.obstacles(movers, velocities, room=(2, 4)),
     )
-    return np.asarray(_reached(case))
+    return np.asarray(_find_layers(case))
 
 
 @jax.jit
-def _reached(case):
+def _find_layers(case):
     grid = reach.grid_of(LATTICE, case.start, case.time, case.limits.speed, case.lower, case.upper)
     vehicle = reach.Vehicle(
         radius=jnp.array(0.16),
@@ -134,87 +133,67 @@ def _reached(case):
         turn_rates=jnp.array([0.0, 1.0, 0.8, 0.53]),
     )
     field = distance_field(case.walls, grid.corner, grid.cell, LATTICE.cells)
-    found = reach.reach_set(grid, field.values, case.movers, vehicle, case.speed, grid.num)
-    goal = case.target.pos
-
-    def is_there(bits):
-        every = jnp.ones(LATTICE.headings, bool)
-        return jnp.any(reach.goal_cells(grid, bits, goal, 0.0, every)[1])
-
-    n = jnp.arange(LATTICE.layers + 1)
-    return jax.vmap(is_there)(found.bits) & (n <= grid.num)
+    bits = reach.reach_set(grid, field.values, case.movers, vehicle, case.speed, grid.num).bits
+    every = jnp.ones(LATTICE.headings, bool)
+    goal_cells = jax.vmap(lambda b: reach.goal_cells(grid, b, case.target.pos, 0.0, every)[1])(bits)
+    return jnp.any(goal_cells, axis=(1, 2, 3)) & (jnp.arange(LATTICE.layers + 1) <= grid.num)
 
 
-WALL = [[3.9, -0.5], [4.1, -0.5], [4.1, 8.5], [3.9, 8.5]]
-ROOM = {"start": (0.8, 4.0, 0.0)}
+def upright(low, high):
+    return [[3.9, low], [4.1, low], [4.1, high], [3.9, high]]
 
 
-def scene(walls=(), movers=(), velocities=0.0):
-    return {
-        "walls": pj.obstacles(walls, room=(2, 4)),
-        "movers": pj.obstacles(movers, velocities, room=(2, 4)),
-        **ROOM,
-    }
-
-
-def test_a_reach_set_meets_what_lies_ahead_no_sooner_than_the_greatest_speed_allows():
-    there = reached((5.3, 4.0), **scene())
-    first = np.argmax(there)
-    step = 10.0 / 19.5
+def test_a_reach_set_meets_a_target_ahead_no_sooner_than_the_greatest_speed_allows():
+    is_met = find_layers((5.3, 4.0))
+    first = np.argmax(is_met)
     # 4.5 m at no more than 1.5 m/s, from 0.5 m/s.
-    assert there.any() and 3.0 <= (first + 0.5) * step <= 4.2
-    assert there[first:20].all()  # it may come later, too
+    assert is_met.any() and 3.0 <= (first + 0.5) * STEP <= 4.2
+    assert is_met[first:20].all()  # it may arrive later, too
 
 
-def test_a_wall_across_the_map_cannot_be_passed_but_one_with_a_gap_can():
-    assert not reached((6.0, 4.0), **scene([WALL])).any()
-    low = [[3.9, -0.5], [4.1, -0.5], [4.1, 5.0], [3.9, 5.0]]
-    high = [[3.9, 6.0], [4.1, 6.0], [4.1, 8.5], [3.9, 8.5]]
-    there = reached((6.0, 4.0), **scene([low, high]))
-    assert there.any()
-    assert np.argmax(there) > np.argmax(reached((6.0, 4.0), **scene()))
+def test_a_wall_across_the_map_cannot_be_passed_but_a_wall_with_a_gap_can():
+    assert not find_layers((6.0, 4.0), [upright(-0.5, 8.5)]).any()
+    is_met = find_layers((6.0, 4.0), [upright(-0.5, 5.0), upright(6.0, 8.5)])
+    assert is_met.any()
+    assert np.argmax(is_met) > np.argmax(find_layers((6.0, 4.0)))
 
 
-def test_something_that_moves_is_in_the_way_when_it_is_there():
+def test_a_mover_blocks_a_goal_while_it_covers_it():
     lid = [[3.0, 3.0], [5.0, 3.0], [5.0, 5.0], [3.0, 5.0]]
     goal = (4.0, 4.0)
-    assert not reached(goal, **scene(movers=[lid])).any()
-    leaving = reached(goal, **scene(movers=[lid], velocities=(0.0, 0.5)))
-    step = 10.0 / 19.5
+    assert not find_layers(goal, movers=[lid]).any()
+    leaving = find_layers(goal, movers=[lid], velocities=(0.0, 0.5))
     # Its edge, with the car's half width, is past the goal after (1 + 0.16) / 0.5 s.
-    assert leaving.any() and (np.argmax(leaving) + 0.5) * step >= 2.0
-    coming = reached(goal, **scene(movers=[np.array(lid) + [0.0, 3.0]], velocities=(0.0, -0.5)))
-    during = (np.arange(21) + 0.5) * step
-    during = (during > 4.0) & (during < 8.0)
-    assert coming[:8].any() and not coming[during].any() and coming[16:].any()
+    assert leaving.any() and (np.argmax(leaving) + 0.5) * STEP >= 2.0
+    coming = find_layers(goal, movers=[np.array(lid) + [0.0, 3.0]], velocities=(0.0, -0.5))
+    times = (np.arange(21) + 0.5) * STEP
+    covered = (times > 4.0) & (times < 8.0)
+    assert coming[:8].any() and not coming[covered].any() and coming[16:].any()
 
 
-def test_a_distance_field_is_the_distance_between_its_places_and_its_slopes_are_its_own(float64):
+def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives(float64):
     rng = np.random.default_rng(3)
     box = pj.obstacles([[[2.0, 2.0], [5.0, 2.0], [5.0, 4.0], [2.0, 4.0]]], dtype=jnp.float64)
     corner, spacing = jnp.zeros(2), jnp.array(0.0625)
     x, y = jnp.asarray(rng.uniform(0.1, 7.8, (2, 400)))
-    look = jax.jit(lambda x, y: distance_field(box, corner, spacing, 128).near(x, y))
-    far, by_x, by_y = look(x, y)
+    near = jax.jit(lambda x, y: distance_field(box, corner, spacing, 128).near(x, y))
+    far, *slopes = near(x, y)
     exact = distances(box.vertices(0.0), box.present, x[None], y[None])[0][0]
     outside = exact > 0.1
-    # Beside a corner the distance bends by 1 / distance.
+    # Near a corner the second derivative of the distance is 1 / distance.
     np.testing.assert_allclose(far[outside], exact[outside], atol=0.0625**2 / (4.0 * 0.1))
     assert np.all(far >= exact - 1e-3) and np.all(far[exact < -0.1] < 0.0)
     step = 1e-6
-    # Within a cell, so that both sides are of one bilinear piece.
+    # Inside a cell, so that both points are on one bilinear piece.
     inner = np.all(np.abs(np.mod([x / spacing, y / spacing], 1.0) - 0.5) < 0.49, axis=0)
-    slope = (look(x + step, y)[0] - look(x - step, y)[0]) / (2.0 * step)
-    np.testing.assert_allclose(by_x[inner], slope[inner], atol=1e-6)
-    slope = (look(x, y + step)[0] - look(x, y - step)[0]) / (2.0 * step)
-    np.testing.assert_allclose(by_y[inner], slope[inner], atol=1e-6)
+    for slope, (right, up) in zip(slopes, step * np.eye(2), strict=True):
+        change = near(x + right, y + up)[0] - near(x - right, y - up)[0]
+        np.testing.assert_allclose(slope[inner], change[inner] / (2.0 * step), atol=1e-6)
 
 
-def test_the_cell_size_follows_the_time_so_that_layers_end_at_it():
-    grid = reach.grid_of(
-        LATTICE, jnp.array([0.8, 4.0, 0.3]), jnp.array(4.37), jnp.array(1.5), jnp.zeros(2),
-        jnp.full(2, 8.0),
-    )  # fmt: skip
+def test_the_last_layer_is_at_the_horizon_and_a_cell_at_the_start():
+    start, time, speed = jnp.array([0.8, 4.0, 0.3]), jnp.array(4.37), jnp.array(1.5)
+    grid = reach.grid_of(LATTICE, start, time, speed, jnp.zeros(2), jnp.full(2, 8.0))
     np.testing.assert_allclose((grid.num + 0.5) * grid.step, 4.37, rtol=1e-6)
     offset = (np.array([0.8, 4.0]) - grid.corner) / grid.cell
     np.testing.assert_allclose(offset, np.round(offset), atol=1e-4)

@@ -1,4 +1,4 @@
-"""Predictions of targets in the plane: fits, their choice, how sure they are, and the bound."""
+"""Predictions of targets in the plane: fits, the choice among them, their covariance, the bound."""
 
 import functools
 
@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from closed_forms import positions_on
 from derivatives import assert_gradient_matches_differences
 from scipy.optimize import least_squares
 from scipy.special import ellipe
@@ -27,7 +28,7 @@ from planner_jax.sims.prediction.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0)
 NOISE, AHEAD = 0.1, 10.0
-NUM = 300  # targets of a batch; the first half goes straight
+NUM = 300  # targets of a batch; the first half moves straight
 ONES = np.ones(15)
 PRIOR = TurnPrior()
 
@@ -38,32 +39,23 @@ def path(pos, vel, rate):
     return TurningPath(*(np.asarray(leaf, float) for leaf in (pos, vel, rate)))
 
 
-def place(path, times):
-    """Where a path is at times (T,), or paths (B, ...) are, (..., T, 2), by complex numbers."""
-    pos, vel = path.pos @ [1.0, 1.0j], path.vel @ [1.0, 1.0j]
-    angle = np.multiply.outer(path.turn_rate, np.asarray(times, float))
-    safe = np.where(angle == 0.0, 1.0, angle)
-    arc = times * np.where(angle == 0.0, 1.0, np.expm1(1j * safe) / (1j * safe))
-    point = pos[..., None] + vel[..., None] * arc
-    return np.stack([point.real, point.imag], -1)
-
-
 TURN, LINE = (path([3.0, 4.0], [0.3, -0.2], rate) for rate in (0.06, 0.0))
 
 
 def noisy(path, times=TIMES):
-    return place(path, times) + np.random.default_rng(0).normal(0.0, NOISE, (len(times), 2))
+    return positions_on(path, times) + np.random.default_rng(0).normal(0.0, NOISE, (len(times), 2))
 
 
-def drawn():
-    """Targets: where each will be (NUM, 2), and what is seen of it (NUM, 15, 2)."""
+def draw_targets():
+    """Draw targets: their positions ahead (NUM, 2) and observations of them (NUM, 15, 2)."""
     rng = np.random.default_rng(1)
     heading = rng.uniform(-np.pi, np.pi, NUM)
     vel = rng.uniform(0.2, 0.5, (NUM, 1)) * np.stack([np.cos(heading), np.sin(heading)], 1)
     rate = rng.uniform(0.03, 0.1, NUM) * rng.choice([-1.0, 1.0], NUM)
     rate[: NUM // 2] = 0.0
-    places = place(path(rng.uniform(0.0, 8.0, (NUM, 2)), vel, rate), np.append(TIMES, AHEAD))
-    return places[:, -1], places[:, :-1] + rng.normal(0.0, NOISE, (NUM, 15, 2))
+    true = path(rng.uniform(0.0, 8.0, (NUM, 2)), vel, rate)
+    positions = positions_on(true, np.append(TIMES, AHEAD))
+    return positions[:, -1], positions[:, :-1] + rng.normal(0.0, NOISE, (NUM, 15, 2))
 
 
 # Compiled once for all tests of equal shapes and dtype.
@@ -74,7 +66,7 @@ def fits(times, seen, weights):
 
 @jax.jit
 def predict(times, seen, weights, noise, prior, truth):
-    """A prediction, and at one time its covariance, chances, mean, and error."""
+    """Return a prediction, and at one time its covariance, chances, mean, and error."""
     chosen = select(times, seen, noise, weights, prior=prior)
     error = jnp.linalg.norm(chosen.path.at(AHEAD).pos - truth)
     radii = jnp.stack([jnp.full_like(error, 0.3), error])
@@ -82,7 +74,7 @@ def predict(times, seen, weights, noise, prior, truth):
     return chosen, covariance(chosen, AHEAD), chances, mean_position(chosen, AHEAD), error
 
 
-def alone(times, seen, weights=ONES, noise=NOISE, prior=PRIOR, truth=(0.0, 0.0)):
+def predict_one(times, seen, weights=ONES, noise=NOISE, prior=PRIOR, truth=(0.0, 0.0)):
     return predict(times, seen, weights, noise, prior, np.asarray(truth))
 
 
@@ -92,13 +84,13 @@ bound_of = jax.jit(cramer_rao, static_argnames="turning")
 
 
 @jax.jit
-def told(prediction, radius):
-    among = (chance_within(prediction, 3.0, radius), covariance(prediction, 3.0))
-    return *among, mean_position(prediction, 3.0)
+def moments(prediction, radius):
+    chance, square = chance_within(prediction, 3.0, radius), covariance(prediction, 3.0)
+    return chance, square, mean_position(prediction, 3.0)
 
 
 def at(polynomial, times):
-    """Where a polynomial path is at times (T,), (T, 2)."""
+    """Return the positions (T, 2) on a polynomial path at times (T,)."""
     coeffs = np.asarray(polynomial.coeffs, float)[::-1]
     passed = np.asarray(times) - float(polynomial.origin)
     return np.stack([np.polyval(column, passed) for column in coeffs.T], -1)
@@ -110,16 +102,16 @@ def assert_same(found, expected, rtol, atol=0.0):
 
 
 @float64
-def test_a_polynomial_is_the_one_of_weighted_least_squares():
+def test_a_polynomial_minimises_the_weighted_squares():
     seen, weights = noisy(TURN), np.linspace(0.5, 2.0, 15)
     for degree, found in enumerate(fits(TIMES, seen, weights), start=1):
         expected = np.polyfit(TIMES, seen, degree, w=np.sqrt(weights))
         for time in (0.0, AHEAD):
-            places = [np.polyval(column, time) for column in expected.T]
-            np.testing.assert_allclose(at(found, time), places, rtol=1e-9)
+            position = [np.polyval(column, time) for column in expected.T]
+            np.testing.assert_allclose(at(found, time), position, rtol=1e-9)
 
 
-def test_cubics_are_found_in_single_precision_far_from_the_origin_of_time():
+def test_cubics_are_fitted_in_single_precision_far_from_the_origin_of_time():
     coeffs = np.array([[3.0, 4.0], [0.3, -0.2], [0.01, 0.02], [1e-3, -2e-3]])
     cubic = PolynomialPath(coeffs, np.array(2000.0))
     times = TIMES + 2000.0
@@ -129,58 +121,57 @@ def test_cubics_are_found_in_single_precision_far_from_the_origin_of_time():
 
 
 @float64
-def test_absent_observations_leave_no_trace():
+def test_absent_observations_have_no_effect():
     seen, weights, times = noisy(TURN), ONES.copy(), TIMES.copy()
     seen[2], weights[5], times[9] = np.nan, 0.0, np.inf
-    kept = np.delete(np.arange(15), [2, 5, 9])
+    present = np.delete(np.arange(15), [2, 5, 9])
     cubic = fits(times, seen, weights)[2]
-    expected = np.polyfit(TIMES[kept], seen[kept], 3)
+    expected = np.polyfit(TIMES[present], seen[present], 3)
     np.testing.assert_allclose(at(cubic, AHEAD), expected.T @ AHEAD ** np.arange(3, -1, -1.0))
-    # As if the others had come in another order, and these been something else, of no weight.
-    other, order = (
-        np.isin(TIMES, TIMES[kept]).astype(float),
-        np.random.default_rng(3).permutation(15),
-    )
-    wild = np.where(other[:, None] > 0.0, noisy(TURN), 9.0)
-    again = alone(TIMES[order], wild[order], other[order])
-    assert_same(alone(times, seen, weights), again, rtol=1e-7, atol=1e-9)
+    # Neither the order of the others nor the values of these observations matter.
+    other = np.isin(TIMES, TIMES[present]).astype(float)
+    wild, order = noisy(TURN), np.random.default_rng(3).permutation(15)
+    wild[other == 0.0] = 9.0
+    again = predict_one(TIMES[order], wild[order], other[order])
+    assert_same(predict_one(times, seen, weights), again, rtol=1e-7, atol=1e-9)
 
 
 @float64
-def test_a_weight_is_that_many_observations():
+def test_a_weight_of_two_equals_two_observations():
     times, seen, weights = TIMES.copy(), noisy(TURN), ONES.copy()
     times[4], seen[4] = times[3], seen[3]
-    twice = alone(times, seen)
+    twice = predict_one(times, seen)
     weights[3], weights[4] = 2.0, 0.0
-    assert_same(alone(times, seen, weights), twice, rtol=1e-7, atol=1e-9)
+    assert_same(predict_one(times, seen, weights), twice, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("precision", ["single", "double"])
-def test_a_turn_without_noise_is_found_at_any_rate(precision):
+def test_a_turn_without_noise_is_fitted_at_any_rate(precision):
     tolerance = 1e-9 if precision == "double" else 3e-4
     with jax.enable_x64(precision == "double"):
         for rate in (-0.93, -0.07, 0.0, 0.004, 0.31):
             true = path([3.0, 4.0], [0.3, -0.2], rate)
-            found = jax.tree.map(np.asarray, turn(TIMES, place(true, TIMES)))
+            found = jax.tree.map(np.asarray, turn(TIMES, positions_on(true, TIMES)))
             np.testing.assert_allclose(found.turn_rate, rate, atol=tolerance)
-            ahead = place(found, [AHEAD])
-            np.testing.assert_allclose(ahead, place(true, [AHEAD]), atol=9 * tolerance)
+            ahead = positions_on(found, [AHEAD])
+            np.testing.assert_allclose(ahead, positions_on(true, [AHEAD]), atol=9 * tolerance)
 
 
 @float64
-def test_a_turn_with_noise_is_that_of_least_squares():
+def test_a_turn_with_noise_minimises_the_squares():
     seen = noisy(TURN)
 
     def residuals(x):
-        return np.ravel(place(path(x[:2], x[2:4], x[4]), TIMES) - seen)
+        return np.ravel(positions_on(path(x[:2], x[2:4], x[4]), TIMES) - seen)
 
     best = least_squares(residuals, [3.0, 4.0, 0.3, -0.2, 0.06], xtol=1e-12, ftol=1e-12).x
     assert_same(turn(TIMES, seen), path(best[:2], best[2:4], best[4]), rtol=1e-5)
 
 
 @float64
-def test_half_and_nine_tenths_of_the_targets_are_where_the_prediction_says():
-    found = [alone(TIMES, seen, truth=truth) for truth, seen in zip(*drawn(), strict=True)]
+def test_half_and_nine_tenths_of_the_targets_are_within_the_predicted_radii():
+    targets = zip(*draw_targets(), strict=True)
+    found = [predict_one(TIMES, seen, truth=truth) for truth, seen in targets]
     nearer = np.array([chances[1] for _, _, chances, _, _ in found])
     for half in np.split(nearer, 2):
         # Three standard errors of a share of 150.
@@ -189,25 +180,25 @@ def test_half_and_nine_tenths_of_the_targets_are_where_the_prediction_says():
     straight, turning = np.split(np.array([chosen.is_turning for chosen, *_ in found]), 2)
     assert straight.mean() < 0.05 and turning.mean() > 0.9
     # The mean over all turn rates errs by less in the square than the path of the median.
-    off = np.linalg.norm(np.array([mean for *_, mean, _ in found]) - drawn()[0], axis=1)
+    off = np.linalg.norm(np.array([mean for *_, mean, _ in found]) - draw_targets()[0], axis=1)
     assert np.mean(off**2) < np.mean(np.square([error for *_, error in found]))
 
 
-def test_a_batch_in_single_precision_is_its_targets_one_by_one_in_double():
-    truth, seen = (each[:: NUM // 4] for each in drawn())
+def test_a_batch_in_single_precision_equals_its_targets_one_by_one_in_double():
+    truth, seen = (each[:: NUM // 4] for each in draw_targets())
     many = jax.jit(jax.vmap(predict, in_axes=(None, 0, None, None, None, 0)))
     found = many(TIMES, seen, ONES, NOISE, PRIOR, truth)
     assert found[1].dtype == jnp.float32
     with jax.enable_x64(True):
         for k in range(len(truth)):
-            one = alone(TIMES, seen[k], truth=truth[k])
+            one = predict_one(TIMES, seen[k], truth=truth[k])
             for a, b in zip(found[1:], one[1:], strict=True):
                 assert_same(jax.tree.map(lambda leaf, k=k: leaf[k], a), b, rtol=2e-3, atol=1e-3)
 
 
 @float64
-def test_one_who_knows_that_targets_go_straight_reaches_the_bound():
-    found, square, (share, _), _, _ = alone(TIMES, noisy(LINE), prior=TurnPrior(chance=0.0))
+def test_a_prior_of_straight_targets_reaches_the_bound():
+    found, square, (share, _), _, _ = predict_one(TIMES, noisy(LINE), prior=TurnPrior(chance=0.0))
     bound = bound_of(LINE, TIMES, NOISE, AHEAD, turning=False)
     assert (found.chance_turning, found.path.turn_rate) == (0.0, 0.0)
     np.testing.assert_allclose(square, bound, rtol=1e-9, atol=1e-15)
@@ -218,9 +209,9 @@ def test_one_who_knows_that_targets_go_straight_reaches_the_bound():
 
 
 @float64
-def test_of_a_target_that_surely_turns_the_error_is_that_of_the_bound():
+def test_a_prior_of_turning_targets_reaches_the_bound():
     sharp, always = 0.01, TurnPrior(chance=1.0, spread=3.0)
-    found, square, *_ = alone(TIMES, place(TURN, TIMES), noise=sharp, prior=always)
+    found, square, *_ = predict_one(TIMES, positions_on(TURN, TIMES), noise=sharp, prior=always)
     np.testing.assert_allclose(found.chance_turning, 1.0)
     np.testing.assert_allclose(square, bound_of(TURN, TIMES, sharp, AHEAD), rtol=0.02)
 
@@ -229,17 +220,18 @@ def test_of_a_target_that_surely_turns_the_error_is_that_of_the_bound():
 def test_the_bound_inverts_the_information_of_all_five_numbers():
     centre, step = np.array([3.0, 4.0, 0.3, -0.2, 0.06]), 1e-6 * np.eye(5)
 
-    def places(x):
-        return np.ravel(place(path(x[:2], x[2:4], x[4]), np.append(TIMES, AHEAD)))
+    def positions(x):
+        return np.ravel(positions_on(path(x[:2], x[2:4], x[4]), np.append(TIMES, AHEAD)))
 
-    slopes = np.stack([(places(centre + h) - places(centre - h)) / 2e-6 for h in step], axis=1)
+    ends = [(positions(centre + h), positions(centre - h)) for h in step]
+    slopes = np.stack([(after - before) / 2e-6 for after, before in ends], axis=1)
     seen, ahead = slopes[:-2], slopes[-2:]
     expected = ahead @ np.linalg.inv(seen.T @ seen / NOISE**2) @ ahead.T
     np.testing.assert_allclose(bound_of(TURN, TIMES, NOISE, AHEAD), expected, rtol=1e-6)
 
 
 @float64
-def test_mean_and_share_of_a_gaussian_error_are_those_of_closed_forms():
+def test_mean_and_share_of_a_gaussian_error_have_closed_forms():
     large, small = 0.5, 0.2
     round_error = large**2 * np.eye(2)
     np.testing.assert_allclose(mean_distance(round_error), large * np.sqrt(0.5 * np.pi))
@@ -251,7 +243,7 @@ def test_mean_and_share_of_a_gaussian_error_are_those_of_closed_forms():
 
 
 @float64
-def test_the_chance_within_a_radius_is_that_of_shifted_gaussians():
+def test_the_chance_within_a_radius_follows_from_shifted_gaussians():
     offsets, chances = np.array([[0.0, 0.0], [0.3, 0.4], [0.0, -0.05]]), np.array([0.5, 0.3, 0.2])
     distance, none = np.linalg.norm(offsets, axis=1), np.zeros(())
     for std in (1e-3, 0.2, 30.0):
@@ -268,7 +260,7 @@ def test_the_chance_within_a_radius_is_that_of_shifted_gaussians():
         rest = path([0.0, 0.0], [0.0, 0.0], 0.0)
         prediction = Prediction(rest, none > 0.0, none, none, none, none, among)
         for radius in (0.0, 0.1, 0.499, 0.7):
-            share, square, mean = told(prediction, radius)
+            share, square, mean = moments(prediction, radius)
             each = ncx2.cdf((radius / std) ** 2, 2, np.maximum((distance / std) ** 2, 1e-12))
             np.testing.assert_allclose(share, chances @ each, rtol=1e-6, atol=1e-12)
         expected = np.einsum("k,ki,kj->ij", chances, offsets, offsets) + std**2 * np.eye(2)
@@ -278,27 +270,27 @@ def test_the_chance_within_a_radius_is_that_of_shifted_gaussians():
 
 @float64
 @pytest.mark.parametrize("num", [0, 1, 2])
-def test_too_few_observations_say_that_they_know_nothing(num):
+def test_too_few_observations_have_an_infinite_covariance(num):
     seen, weights = noisy(TURN), np.where(np.arange(15) < num, 1.0, 0.0)
-    found, square, chances, *_ = alone(TIMES, seen, weights)
+    found, square, chances, *_ = predict_one(TIMES, seen, weights)
     assert np.all(np.isinf(np.diag(square))) and not np.any(chances)
     assert not any(np.any(np.isnan(leaf)) for leaf in jax.tree.leaves((found, square)))
     assert (found.is_turning, found.path.turn_rate) == (False, 0.0)
-    last = place(jax.tree.map(np.asarray, found.path), TIMES[[num - 1]])[0]
+    last = positions_on(jax.tree.map(np.asarray, found.path), TIMES[[num - 1]])[0]
     np.testing.assert_allclose(last, seen[num - 1] if num else [0.0, 0.0], atol=1e-9)
 
 
 @float64
-def test_noise_that_is_not_given_is_estimated_and_a_test_chooses_by_the_gain():
+def test_unknown_noise_is_estimated_and_a_threshold_on_the_gain_selects_the_turn():
     found, best = predict_by_gain(TIMES, noisy(TURN)), turn(TIMES, noisy(TURN))
     assert found.noise == pytest.approx(NOISE, rel=0.3)
     assert found.is_turning and found.gain > 6.6
     np.testing.assert_allclose(found.path.turn_rate, best.turn_rate, rtol=1e-9)
-    residual = place(jax.tree.map(np.asarray, best), TIMES) - noisy(TURN)
+    residual = positions_on(jax.tree.map(np.asarray, best), TIMES) - noisy(TURN)
     np.testing.assert_allclose(found.residual, np.sqrt(np.mean(residual**2)), rtol=1e-9)
     straight = predict_by_gain(TIMES, noisy(LINE))
     assert not straight.is_turning and straight.gain < 6.6 and straight.path.turn_rate == 0.0
-    exact = predict_by_gain(TIMES, place(LINE, TIMES))
+    exact = predict_by_gain(TIMES, positions_on(LINE, TIMES))
     assert 0.0 < exact.noise < 1e-12 and not exact.is_turning
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(exact))
 
@@ -314,42 +306,35 @@ def test_the_density_of_turn_rates_integrates_to_one_and_has_its_variance():
 
 
 @float64
-def test_a_turn_can_be_differentiated_by_what_was_seen():
-    times = TIMES.copy()  # lest a constant in double precision stay in a cache of JAX
+@pytest.mark.parametrize("fits_turn", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_turns_and_predictions_can_be_differentiated_by_the_observations(fits_turn):
+    times = TIMES.copy()  # JAX may cache the constant itself in double precision
 
-    def summed(seen):
-        return jnp.sum(fit_turn(times, seen).at(AHEAD).pos)
-
-    assert_gradient_matches_differences(summed, noisy(TURN), step=1e-6, rtol=1e-5)
-
-
-@float64
-@pytest.mark.slow
-def test_predictions_can_be_differentiated_by_what_was_seen():
-    times = TIMES.copy()  # lest a constant in double precision stay in a cache of JAX
-
-    def summed(seen):
+    def total(seen):
+        if fits_turn:
+            return jnp.sum(fit_turn(times, seen).at(AHEAD).pos)
         found = select(times, seen, NOISE)
         return jnp.sum(found.path.at(AHEAD).pos) + chance_within(found, AHEAD, 0.3)
 
-    assert_gradient_matches_differences(summed, noisy(TURN), step=1e-6, rtol=1e-5)
+    assert_gradient_matches_differences(total, noisy(TURN), step=1e-6, rtol=1e-5)
 
 
-def test_what_cannot_be_fitted_is_refused_in_one_line():
-    two, seen = TIMES[:2], np.zeros((2, 2))
-    with pytest.raises(ValueError, match="times must be of at least 3 observations, got 2"):
-        fit_turn(two, seen)
-    with pytest.raises(ValueError, match="times must be of at least 4 observations, got 3"):
-        select(TIMES[:3], np.zeros((3, 2)))
-    with pytest.raises(ValueError, match="times must be of at least 3 observations, got 2"):
-        fit_polynomial(two, seen, 2)
-    with pytest.raises(ValueError, match="degree must be 1, 2 or 3, got 4"):
-        fit_polynomial(TIMES, np.zeros((15, 2)), 4)
-    with pytest.raises(ValueError, match="degree must be 1, 2 or 3, got 0"):
-        fit_polynomial(TIMES, np.zeros((15, 2)), 0)
-    with pytest.raises(ValueError, match=r"positions \(L, 2\), got \(15,\) and \(15, 3\)"):
-        select(TIMES, np.zeros((15, 3)), NOISE)
-    with pytest.raises(ValueError, match=r"weights must be \(L,\) as times \(15,\), got \(3,\)"):
-        select(TIMES, np.zeros((15, 2)), NOISE, np.ones(3))
-    with pytest.raises(ValueError, match="noise must be > 0, got 0"):
-        select(TIMES, np.zeros((15, 2)), 0.0)
+FEW, MANY = (TIMES[:2], np.zeros((2, 2))), (TIMES, np.zeros((15, 2)))
+
+
+@pytest.mark.parametrize(
+    ("function", "arguments", "message"),
+    [
+        (fit_turn, FEW, "times must be of at least 3 observations, got 2"),
+        (select, (TIMES[:3], np.zeros((3, 2))), "times must be of at least 4 observations, got 3"),
+        (fit_polynomial, (*FEW, 2), "times must be of at least 3 observations, got 2"),
+        (fit_polynomial, (*MANY, 4), "degree must be 1, 2 or 3, got 4"),
+        (fit_polynomial, (*MANY, 0), "degree must be 1, 2 or 3, got 0"),
+        (select, (TIMES, np.zeros((15, 3)), NOISE), r"\(L, 2\), got \(15,\) and \(15, 3\)"),
+        (select, (*MANY, NOISE, np.ones(3)), r"must be \(L,\) as times \(15,\), got \(3,\)"),
+        (select, (*MANY, 0.0), "noise must be > 0, got 0"),
+    ],
+)
+def test_arguments_without_a_fit_are_rejected_in_one_line(function, arguments, message):
+    with pytest.raises(ValueError, match=message):
+        function(*arguments)

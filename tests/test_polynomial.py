@@ -22,9 +22,6 @@ DEGREE = 5
 float64 = pytest.mark.usefixtures("float64")
 
 
-# Of all orders at once, compiled once for all tests of equal dtype.
-
-
 @jax.jit
 def values_at(trajectory, time):
     return tuple(evaluate(trajectory, time, order) for order in range(DEGREE + 2))
@@ -36,7 +33,7 @@ def energies_of(trajectory):
 
 
 def trajectory(dtype=np.float64, seed=0):
-    """Three pieces that do not join."""
+    """Draw three pieces that do not join."""
     coeffs = np.random.default_rng(seed).normal(size=(3, DEGREE + 1, 3))
     return PiecewisePolynomial(coeffs=coeffs.astype(dtype), durations=np.array(DURATIONS, dtype))
 
@@ -61,21 +58,20 @@ def test_every_piece_is_evaluated_in_its_own_time(order):
 
 
 @float64
-def test_a_piece_begins_where_the_one_before_it_ends():
+def test_a_piece_starts_when_the_previous_piece_ends():
     for time, piece in ((0.0, 0), (0.4, 1), (1.5, 2)):
-        np.testing.assert_array_equal(
-            values_at(trajectory(), time)[0], trajectory().coeffs[piece, 0]
-        )
+        found = values_at(trajectory(), time)[0]
+        np.testing.assert_array_equal(found, trajectory().coeffs[piece, 0])
 
 
 @float64
-def test_before_the_start_and_past_the_end_the_nearest_piece_goes_on():
+def test_the_nearest_piece_continues_before_the_start_and_past_the_end():
     np.testing.assert_allclose(values_at(trajectory(), -0.5)[0], exact(0, -0.5), rtol=1e-12)
     np.testing.assert_allclose(values_at(trajectory(), 3.0)[0], exact(2, 1.5), rtol=1e-12)
 
 
 @float64
-def test_more_derivatives_than_the_degree_leave_nothing():
+def test_derivatives_above_the_degree_are_zero():
     assert not np.any(values_at(trajectory(), 0.3)[DEGREE + 1])
     assert energies_of(trajectory())[DEGREE + 1] == 0.0
 
@@ -84,9 +80,8 @@ def test_more_derivatives_than_the_degree_leave_nothing():
 def test_the_slope_in_time_is_the_next_derivative():
     rate_of = jax.jit(jax.jacfwd(lambda time, path: evaluate(path, time, 1)))
     for time in (-0.1, 0.2, 1.2, 2.5):
-        np.testing.assert_allclose(
-            rate_of(time, trajectory()), values_at(trajectory(), time)[2], rtol=1e-12
-        )
+        expected = values_at(trajectory(), time)[2]
+        np.testing.assert_allclose(rate_of(time, trajectory()), expected, rtol=1e-12)
 
 
 @float64
@@ -99,7 +94,7 @@ def test_the_durations_add_up_in_one_trajectory_and_in_many():
 @float64
 @pytest.mark.parametrize("order", range(5))
 def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
-    """Six nodes integrate the squares, of degree ten, exactly."""
+    """Six nodes integrate the squares exactly: their degree is ten."""
     nodes, weights = np.polynomial.legendre.leggauss(6)
     energy = 0.0
     for piece, duration in enumerate(DURATIONS):
@@ -110,13 +105,13 @@ def test_the_energy_is_the_quadrature_of_the_squared_derivative(order):
 
 @float64
 def test_the_gradients_match_finite_differences():
-    """Of the energy and of a value, with respect to coefficients and durations."""
+    """Differentiate an energy plus a value by coefficients and durations."""
 
-    def everything(trajectory):
+    def total(trajectory):
         value = evaluate(trajectory, 1.8, 1)
         return snap_energy(trajectory, 3) + jnp.sum(value * jnp.arange(1.0, 4.0))
 
-    assert_gradient_matches_differences(everything, trajectory())
+    assert_gradient_matches_differences(total, trajectory())
 
 
 def test_batch_equals_loop_in_float32():

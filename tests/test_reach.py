@@ -1,4 +1,4 @@
-"""What limits rule out: a bound that no plan may beat, and cases that are given up at once."""
+"""What limits rule out: a bound that no plan can beat, and cases that are given up at once."""
 
 import dataclasses
 
@@ -23,9 +23,9 @@ hits_too_far = jax.jit(jax.vmap(lambda case: is_hit_too_far(prepare_hit(case, 36
 catches_too_far = jax.jit(jax.vmap(lambda case: is_catch_too_far(order_targets(case))))
 
 
-def limits(**given):
-    own = {"speed": 6.0, "body_rate": 5.0, "min_height": 0.2, **given}
-    return QuadrotorLimits(**{name: np.float32(value) for name, value in own.items()})
+def limits(**bounds):
+    bounds = {"speed": 6.0, "body_rate": 5.0, "min_height": 0.2, **bounds}
+    return QuadrotorLimits(**{name: np.float32(value) for name, value in bounds.items()})
 
 
 def head(vel=(0.0, 0.0, 0.0)):
@@ -34,12 +34,12 @@ def head(vel=(0.0, 0.0, 0.0)):
     return state
 
 
-def beyond(place, time, state, **given):
-    at = np.asarray([place], np.float32), np.asarray([time], np.float32)
-    return float(beyond_reach(*at, state, limits(**given), np.float32(9.8))[0])
+def beyond(position, time, state, **bounds):
+    at = np.asarray([position], np.float32), np.asarray([time], np.float32)
+    return float(beyond_reach(*at, state, limits(**bounds), np.float32(9.8))[0])
 
 
-def test_a_quadrotor_at_rest_hurries_and_then_flies_at_its_greatest_speed():
+def test_a_quadrotor_at_rest_accelerates_and_then_flies_at_its_greatest_speed():
     speed, most = 6.0 * ALLOWED, 8.0 * ALLOWED
     far = (101.0, 2.0, 3.0)
     early = beyond(far, 0.5, head(), acceleration=8.0)
@@ -49,13 +49,13 @@ def test_a_quadrotor_at_rest_hurries_and_then_flies_at_its_greatest_speed():
     assert beyond(far, 3.0, head()) == pytest.approx(100.0 - 3.0 * speed, rel=1e-5)
 
 
-def test_a_first_velocity_carries_the_quadrotor_away_from_what_is_behind():
+def test_an_initial_velocity_moves_the_quadrotor_away_from_a_point_behind():
     flying = head((4.0, 0.0, 0.0))
     behind = beyond((-1.0, 2.0, 3.0), 0.5, flying, acceleration=8.0)
     assert behind == pytest.approx(4.0 - 0.5 * 8.0 * ALLOWED * 0.25, rel=1e-5)
 
 
-def test_thrust_lifts_less_than_it_pushes_to_the_side():
+def test_thrust_accelerates_less_upwards_than_sideways():
     bounds = {"min_thrust": 2.0, "max_thrust": 20.0}
     up = beyond((1.0, 2.0, 13.0), 0.4, head(), **bounds)
     aside = beyond((11.0, 2.0, 3.0), 0.4, head(), **bounds)
@@ -64,22 +64,21 @@ def test_thrust_lifts_less_than_it_pushes_to_the_side():
 
 
 def test_an_infinite_thrust_is_no_limit():
-    bounds = {"min_thrust": 0.0, "max_thrust": np.inf}
-    assert beyond((101.0, 2.0, 3.0), 3.0, head(), **bounds) == pytest.approx(
-        beyond((101.0, 2.0, 3.0), 3.0, head()), rel=1e-6
-    )
+    far = (101.0, 2.0, 3.0), 3.0, head()
+    unlimited = beyond(*far, min_thrust=0.0, max_thrust=np.inf)
+    assert unlimited == pytest.approx(beyond(*far), rel=1e-6)
 
 
 @pytest.fixture(scope="module")
 def serves():
-    """Two drawn serves; between them a ball that flies away, and one that is down too soon."""
+    """Draw serves and replace two: one ball flies away, the other lands too soon."""
     drawn = jax.tree.map(np.array, pj.hit.draw(4, seed=1))
     drawn.ball.pos[1], drawn.ball.vel[1] = (-2.0, 0.0, 2.0), (-14.0, 0.0, 6.0)
     drawn.ball.pos[2], drawn.ball.vel[2] = (-6.5, 0.0, 0.6), (0.0, 0.0, -2.0)
     return drawn
 
 
-def test_hits_that_cannot_be_are_given_up_after_the_first_round(serves):
+def test_impossible_hits_are_given_up_after_the_first_round(serves):
     assert hits_too_far(serves).tolist() == [False, True, True, False]
     plans = pj.plan(HIT, serves)
     assert plans.status[1] == plans.status[2] == Status.TOO_FAR
@@ -89,13 +88,13 @@ def test_hits_that_cannot_be_are_given_up_after_the_first_round(serves):
     assert Status.TOO_FAR.message.startswith("no plan exists")
 
 
-def test_a_ball_above_the_greatest_apex_until_it_is_down_far_away_is_too_far(serves):
+def test_a_ball_above_the_greatest_apex_until_it_lands_far_away_is_too_far(serves):
     high = serves.ball.pos.copy(), serves.ball.vel.copy()
     high[0][0], high[1][0] = (-3.0, 0.0, 6.5), (20.0, 0.0, 8.0)
     assert hits_too_far(dataclasses.replace(serves, ball=BallState(*high)))[0]
 
 
-def test_a_number_that_is_not_finite_rules_nothing_out(serves):
+def test_a_number_that_is_not_finite_rules_out_nothing(serves):
     pos = serves.ball.pos.copy()
     pos[1, 0] = np.nan
     broken = dataclasses.replace(serves, ball=BallState(pos, serves.ball.vel))
@@ -103,7 +102,7 @@ def test_a_number_that_is_not_finite_rules_nothing_out(serves):
 
 
 def throw(*balls, horizon=1.2, **options):
-    """One case with these balls (position, velocity), drag-free."""
+    """Make one case with balls (position, velocity) without drag."""
     pos, vel = (np.asarray(part, np.float32)[None] for part in zip(*balls, strict=True))
     shape = pos.shape[:2]
     path = BallPath(BallState(pos, vel), 0.0 * pos, np.full(shape, 9.81, np.float32))
@@ -117,7 +116,7 @@ AWAY = ((3.0, 0.0, 2.0), (9.0, 0.0, 4.0))
 LOW = ((1.0, 0.0, -1.5), (0.0, 0.0, 0.0))
 
 
-def test_catches_that_cannot_be_are_given_up_after_the_first_round():
+def test_impossible_catches_are_given_up_after_the_first_round():
     cases = [throw(ball) for ball in (NEAR, AWAY, LOW)]
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *cases)
     assert catches_too_far(cases).tolist() == [False, True, True]
@@ -126,7 +125,7 @@ def test_catches_that_cannot_be_are_given_up_after_the_first_round():
     assert (plans.status[1:] == Status.TOO_FAR).all()
 
 
-def test_one_target_of_two_is_enough_unless_it_may_be_left_or_is_not_there():
+def test_one_target_out_of_reach_is_enough_unless_it_is_optional_or_absent():
     assert catches_too_far(throw(NEAR, AWAY))[0]
     assert not catches_too_far(throw(NEAR, AWAY, optional=True))[0]
     assert not catches_too_far(throw(NEAR, AWAY, present=np.array([[True, False]])))[0]
@@ -141,7 +140,7 @@ def test_one_target_of_two_is_enough_unless_it_may_be_left_or_is_not_there():
     ids=["hits", "catches"],
 )
 @pytest.mark.slow
-def test_no_solved_case_is_called_too_far_where_limits_are_tight(draw, too_far, planner):
+def test_no_solved_case_is_too_far_with_tight_limits(draw, too_far, planner):
     cases = draw()
     plans = pj.plan(planner, jax.tree.map(np.asarray, cases))
     ruled_out = np.asarray(too_far(cases))

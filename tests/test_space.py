@@ -20,8 +20,7 @@ from planner_jax.space.distances import (
     segment_to_vertical_line,
 )
 
-# Enough lanes of every kind below that rare arrangements of bends come up.
-NUM = 60
+NUM = 60  # pairs of every kind, so that rare arrangements occur
 DISTANCES = {
     "segments": segment_to_segment,
     "rectangle": segment_to_rectangle,
@@ -33,7 +32,7 @@ every_distance = pytest.mark.parametrize("name", DISTANCES)
 
 
 def gap_of(name, bodies):
-    """The gap of two bodies as first + columns @ shares, over shares from 0 to 1."""
+    """Return the gap of two bodies as first + columns @ shares, for shares from 0 to 1."""
     if name == "segments":
         (a, a_end), (b, b_end) = bodies
         return a - b, [a_end - a, b - b_end]
@@ -51,7 +50,7 @@ def gap_of(name, bodies):
 
 
 def least_distances(name, bodies):
-    """Distances (N,) as bounded least squares over all points of both bodies."""
+    """Compute distances (N,) by bounded least squares over all points of both bodies."""
     results = []
     for pair in zip(*(np.asarray(body, float) for body in bodies), strict=True):
         first, columns = gap_of(name, pair)
@@ -62,19 +61,19 @@ def least_distances(name, bodies):
 
 
 def segments(rng, kind):
-    """Segments (NUM, 2, 3) [m] of one kind."""
+    """Draw segments (NUM, 2, 3) [m] of one kind."""
     ends = rng.uniform(-1.0, 1.0, (NUM, 2, 3))
     if kind == "points":
         ends[:, 1] = ends[:, 0]
-    if kind == "along":  # nearly along an axis, in float32 down to a last bit
+    if kind == "along":  # nearly along an axis, down to the last bit in float32
         ends[:, 1, :2] = ends[:, 0, :2] + 10.0 ** rng.uniform(-8.0, -2.0, (NUM, 2))
-    if kind == "grid":  # along axes, through corners, in faces, of no length
+    if kind == "grid":  # along axes, through corners, in faces, of zero length
         ends = rng.integers(-2, 3, (NUM, 2, 3)) / 4.0
     return ends
 
 
 def pairs(name, kind, seed=0):
-    """Bodies of NUM pairs, segments among them of one kind, as float32."""
+    """Draw NUM pairs of bodies, with segments of one kind, as float32."""
     rng = np.random.default_rng(seed)
     ends = segments(rng, kind)
     place, middle = rng.uniform(-0.7, 0.7, (NUM, 2)), rng.uniform(-0.3, 0.3, (NUM, 3))
@@ -97,31 +96,31 @@ def pairs(name, kind, seed=0):
 
 
 @functools.cache
-def measured(name):
-    """Distances of many pairs, and their slopes by everything."""
+def measure(name):
+    """Return a compiled function for distances of pairs and their gradients."""
     distance = DISTANCES[name]
     count = len(pairs(name, "any"))
     return jax.jit(jax.vmap(jax.value_and_grad(distance, argnums=tuple(range(count)))))
 
 
 def distances(name, bodies):
-    return np.asarray(measured(name)(*bodies)[0])
+    return np.asarray(measure(name)(*bodies)[0])
 
 
 @every_distance
 @pytest.mark.parametrize("kind", ["any", "points", "along", "grid"])
-def test_a_distance_is_the_least_over_all_points_of_both_bodies_to_float32(name, kind):
+def test_a_distance_is_the_least_over_all_points_in_float32(name, kind):
     bodies = pairs(name, kind)
-    value, slopes = measured(name)(*bodies)
+    value, slopes = measure(name)(*bodies)
     np.testing.assert_allclose(value, least_distances(name, bodies), atol=2e-6)
-    # As a distance changes by no more than the bodies move, also where they touch or are parallel.
+    # A distance changes by no more than the bodies move, also if they touch or are parallel.
     for slope in slopes:
         assert np.isfinite(slope).all()
         assert (np.linalg.norm(slope.reshape(NUM, -1), axis=1) <= np.sqrt(2.0) + 1e-5).all()
 
 
 def smooth_pairs(name):
-    """Bodies in float64 whose distance is smooth: neither touching nor parallel."""
+    """Return bodies in float64 that neither touch nor are parallel: their distance is smooth."""
     bodies = pairs(name, "any")
     smooth = distances(name, bodies) > 0.05
     if name == "segments":
@@ -131,7 +130,7 @@ def smooth_pairs(name):
 
 
 @every_distance
-def test_a_slope_is_that_of_finite_differences(name, float64):
+def test_a_gradient_matches_finite_differences(name, float64):
     many = jax.vmap(DISTANCES[name])
     assert_gradient_matches_differences(
         lambda bodies: jnp.sum(many(*bodies)), smooth_pairs(name), step=1e-7, rtol=1e-6
@@ -139,7 +138,7 @@ def test_a_slope_is_that_of_finite_differences(name, float64):
 
 
 @pytest.mark.parametrize("name", ["segments", "rectangle", "box", "line"])
-def test_a_slope_has_the_slope_that_comes_from_nearest_points_moving_along(name, float64):
+def test_a_second_derivative_includes_the_motion_of_the_nearest_points(name, float64):
     ends, *others = smooth_pairs(name)
     direction = np.random.default_rng(1).normal(size=ends.shape)
     many = jax.vmap(DISTANCES[name])
@@ -151,26 +150,25 @@ def test_a_slope_has_the_slope_that_comes_from_nearest_points_moving_along(name,
 
 
 @pytest.mark.parametrize("name", [*DISTANCES, "low segment", "low rectangle"])
-def test_an_approach_has_the_slope_by_a_turn_and_a_move_of_the_first_body(name, float64):
-    """The body turns about an axis through the origin and moves; what stands does not."""
-    of = {**DISTANCES, "low segment": lowest_of_segment, "low rectangle": lowest_of_rectangle}
-    distance = of[name]
-    if name.startswith("low"):
-        first, others = smooth_pairs("rectangle" if name == "low rectangle" else "segments"), ()
-        first = first[1:] if name == "low rectangle" else first[:1]
+def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, float64):
+    """The first body turns about an axis through the origin and moves; the second body rests."""
+    if name == "low segment":
+        distance, first, others = lowest_of_segment, smooth_pairs("segments")[:1], ()
+    elif name == "low rectangle":
+        distance, first, others = lowest_of_rectangle, smooth_pairs("rectangle")[1:], ()
     else:
-        first, others = smooth_pairs(name), ()
-        num = 2 if name == "rectangle to line" else 1
-        first, others = first[:num], first[num:]
-    is_place = [True, False] if len(first) == 2 else [True]  # edges only turn
+        distance, bodies, num = (
+            DISTANCES[name],
+            smooth_pairs(name),
+            1 + (name == "rectangle to line"),
+        )
+        first, others = bodies[:num], bodies[num:]
 
     def slopes(first, others):
         def at(twist):
             turn, move = twist[:3], twist[3:]
-            moved = [
-                body + jnp.cross(turn, body) + move * place
-                for body, place in zip(first, is_place, strict=True)
-            ]
+            body, *edges = first  # edges only turn
+            moved = [body + jnp.cross(turn, body) + move, *(e + jnp.cross(turn, e) for e in edges)]
             return distance(*moved, *others)
 
         line = approach(distance, *first, *others)
@@ -182,7 +180,7 @@ def test_an_approach_has_the_slope_by_a_turn_and_a_move_of_the_first_body(name, 
     assert np.abs(found[:, :3]).max() > 0.1
 
 
-def test_segments_that_are_swapped_or_turned_round_are_as_far(float64):
+def test_swapping_or_reversing_segments_does_not_change_their_distance(float64):
     a, b = (np.asarray(ends, float) for ends in pairs("segments", "any"))
     expected = distances("segments", (a, b))
     np.testing.assert_allclose(distances("segments", (b, a)), expected, atol=1e-12)
@@ -190,7 +188,7 @@ def test_segments_that_are_swapped_or_turned_round_are_as_far(float64):
 
 
 @pytest.mark.parametrize("name", ["rectangle", "rectangle to line"])
-def test_it_does_not_matter_which_way_a_rectangles_edges_point_or_which_is_first(name, float64):
+def test_order_and_sign_of_a_rectangles_edges_do_not_matter(name, float64):
     bodies = [np.asarray(body, float) for body in pairs(name, "any")]
     k = 2 if name == "rectangle" else 1
     expected = distances(name, bodies)
@@ -200,18 +198,18 @@ def test_it_does_not_matter_which_way_a_rectangles_edges_point_or_which_is_first
 
 
 @pytest.mark.parametrize("name", ["rectangle", "box", "rectangle to line"])
-def test_bodies_that_cross_have_exactly_no_distance_and_no_slope(name):
+def test_crossing_bodies_have_exactly_zero_distance_and_gradient(name):
     bodies = pairs(name, "any")
     crosses = least_distances(name, bodies) < 1e-7
     assert 3 < crosses.sum() < NUM - 3
-    value, slopes = measured(name)(*bodies)
+    value, slopes = measure(name)(*bodies)
     assert (value[crosses] == 0.0).all() and (value[~crosses] > 0.0).all()
     for slope in slopes:
         assert (slope[crosses] == 0.0).all()
 
 
 def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
-    """A bend of the slope that is missed by a rounding would shift the zero by a tenth of all."""
+    """A kink that rounding misses would shift the nearest point by a tenth of the segment."""
     rng = np.random.default_rng(0)
     ends = rng.uniform(-1.0, 1.0, (1000, 2, 3)) * [0.9, 4e-4, 4e-4] + [0.0, 0.3, 0.1]
     upper = np.broadcast_to(np.asarray([0.6, 0.3, 0.1], np.float32), (1000, 3))
@@ -220,7 +218,7 @@ def test_a_segment_nearly_along_an_edge_of_a_box_is_exact_in_float32_too():
 
 
 def test_an_upright_rectangle_does_not_reach_a_line_beyond_its_end():
-    """Its projection has no area, by which the line could be told to be outside of it."""
+    """The projection has no area, so that areas cannot decide whether the line is outside."""
     rng = np.random.default_rng(0)
     angle, roll = rng.uniform(0.0, 6.0, 1000), rng.uniform(0.0, 1.5, (1000, 1))
     along = np.stack([np.cos(angle), np.sin(angle), np.zeros(1000)], axis=1)
@@ -234,7 +232,7 @@ def test_an_upright_rectangle_does_not_reach_a_line_beyond_its_end():
     np.testing.assert_allclose(found, np.maximum(beyond, 0.0), atol=1e-6)
 
 
-def test_the_lowest_points_are_those_of_the_corners():
+def test_the_lowest_points_are_corners():
     rng = np.random.default_rng(0)
     ends, edges = rng.normal(size=(2, NUM, 2, 3))
     middle = rng.normal(size=(NUM, 3))

@@ -1,4 +1,4 @@
-"""Speed along a way: plans are clear of every polygon, keep the limits, and nothing is cheaper."""
+"""Speed along a path: plans avoid every polygon, meet the limits, and have the least cost."""
 
 import dataclasses
 
@@ -26,7 +26,7 @@ many = jax.jit(jax.vmap(plan_speed))
 
 
 def with_slow_parts(problems):
-    """The same problems, the middle third of every second one with a lower speed limit."""
+    """Lower the speed limit in the middle third of every second problem."""
     limit = np.repeat(problems.speed_limit, 3, axis=1)
     limit[::2, 1] = 0.9
     return dataclasses.replace(problems, speed_limit=limit)
@@ -41,11 +41,11 @@ def plans():
 
 
 def dense(points, horizon, order, times):
-    """A derivative of curves (B, K, n + 1) at times (M,) in double precision, (B, M)."""
+    """Return a derivative (B, M) of curves (B, K, n + 1) at times (M,) in double precision."""
     pieces, degree = points.shape[1], points.shape[2] - 1
-    place = times / horizon * pieces
-    piece = np.minimum(place.astype(int), pieces - 1)
-    rows = bernstein(degree - order, place - piece) @ hodograph(degree, order, pieces)
+    position = times / horizon * pieces
+    piece = np.minimum(position.astype(int), pieces - 1)
+    rows = bernstein(degree - order, position - piece) @ hodograph(degree, order, pieces)
     value = np.einsum("mi,bmi->bm", rows, points.astype(float)[:, piece])
     return value / horizon**order
 
@@ -54,7 +54,7 @@ TIMES = np.linspace(0.0, 10.0, 10001)
 
 
 def clearance(problems, station):
-    """How far stations (B, M) at TIMES stay from the polygons at least, (B,)."""
+    """Return the least distance (B,) of stations (B, M) at TIMES from the polygons."""
     blocked = problems.blocked
     time = TIMES[:, None, None]
     share = (time - blocked.start) / (blocked.end - blocked.start)
@@ -67,7 +67,7 @@ def clearance(problems, station):
     return np.where(is_met, away, np.inf).min(axis=(0, 2))
 
 
-def test_plans_are_clear_of_polygons_at_every_millisecond_and_keep_every_limit(plans):
+def test_plans_avoid_polygons_at_every_millisecond_and_meet_every_limit(plans):
     solved = plans.status == Status.CONVERGED
     assert solved.mean() > 0.9 and (plans.violation[solved] < 1e-5).all()
     station, speed, acceleration = (
@@ -93,7 +93,7 @@ def test_pieces_join_up_to_the_acceleration_whose_squared_integral_is_the_cost(p
     np.testing.assert_allclose(plans.cost, np.trapezoid(squared, TIMES), rtol=1e-3, atol=1e-6)
 
 
-def test_without_a_line_or_with_broken_numbers_a_plan_says_so_and_others_stay_the_same(plans):
+def test_problems_without_a_solution_have_a_status_and_do_not_change_others(plans):
     problems = jax.tree.map(np.array, PROBLEMS)
     problems.blocked.lower[3], problems.blocked.upper[3] = -1.0, 7.0
     problems.initial_speed[4] = np.nan
@@ -105,23 +105,22 @@ def test_without_a_line_or_with_broken_numbers_a_plan_says_so_and_others_stay_th
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("float64")
-def test_the_gradient_of_the_cost_is_that_of_differences():
-    """By everything but what dynamic programming decides, which is the side of each polygon."""
-    problems = speed_problems(4, dtype=np.float64)
-    case = jax.tree.map(lambda leaf: leaf[1], problems)
-    place = jax.tree.map(np.asarray, jax.jit(plan_speed)(case))
-    assert place.status == Status.CONVERGED and place.iterations >= 1
+def test_the_gradient_of_the_cost_matches_finite_differences():
+    """Dynamic programming decides the side of each polygon, which has no derivative."""
+    case = jax.tree.map(lambda leaf: leaf[1], speed_problems(4, dtype=np.float64))
+    plan = jax.tree.map(np.asarray, jax.jit(plan_speed)(case))
+    assert plan.status == Status.CONVERGED and plan.iterations >= 1
 
     def cost(leaves):
         blocked = dataclasses.replace(case.blocked, lower=leaves[0], upper=leaves[1])
         problem = dataclasses.replace(case, initial_speed=leaves[2], blocked=blocked)
         return plan_speed(problem).cost
 
-    given = case.blocked.lower, case.blocked.upper, case.initial_speed
-    assert_gradient_matches_differences(cost, given, step=1e-7, rtol=1e-5)
+    leaves = case.blocked.lower, case.blocked.upper, case.initial_speed
+    assert_gradient_matches_differences(cost, leaves, step=1e-7, rtol=1e-5)
 
 
-def test_the_first_problems_are_the_same_whatever_their_number_and_others_by_another_seed():
+def test_problems_depend_on_their_seed_and_not_on_their_number():
     few, others = speed_problems(5), speed_problems(5, seed=1)
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a, b[:5]), few, speed_problems(300))
     assert not np.array_equal(few.blocked.start, others.blocked.start)
@@ -132,7 +131,7 @@ def test_the_first_problems_are_the_same_whatever_their_number_and_others_by_ano
 def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
     pytest.importorskip("clarabel", reason="the extra `peers` is not installed")
     solve = clarabel_solver(speed_matrices(TRAPEZOID))
-    bounds = jax.jit(jax.vmap(lambda *given: speed_bounds(*given, TRAPEZOID)))
+    bounds = jax.jit(jax.vmap(lambda *args: speed_bounds(*args, TRAPEZOID)))
     programs = map(np.asarray, bounds(PROBLEMS, plans.reference))
     peers = [solve(*program) for program in zip(*programs, strict=True)]
     solved = np.array([peer.solved for peer in peers])
@@ -142,8 +141,8 @@ def test_no_other_solver_finds_a_cheaper_curve_in_the_same_corridor(plans):
 
 
 @pytest.mark.slow
-def test_every_planner_of_the_table_keeps_its_promise():
-    """Bounds on points are clear everywhere; tilted lines cost least."""
+def test_the_planners_of_the_table_differ_in_cost():
+    """Bounds on control points hold everywhere; tilted lines have the least cost."""
     problems = speed_problems(64)
     planned = {}
     for name, planner in SPEED_PLANNERS.items():

@@ -161,8 +161,8 @@ def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> A
 
 def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
     """Return the bitmaps (M, _STENCIL) uint32 of the M moving obstacles, around their centres."""
-    place = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
-    x, y = jnp.meshgrid(place, place)
+    offsets = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
+    x, y = jnp.meshgrid(offsets, offsets)
     far, _ = distances(movers.corners, movers.present, x.reshape(1, -1), y.reshape(1, -1))
     return _pack((far < radius).reshape(-1, _STENCIL, _STENCIL))[0]
 
@@ -235,9 +235,9 @@ def reach_set(
     stencils = _stencils(grid, movers, vehicle.radius)
     discs = jnp.round(-vehicle.ahead[:, None, None] * direction / grid.cell).astype(jnp.int32)
     middle = jnp.mean(vehicle.ahead) * direction  # of the body from the rear axle
-    place = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)
-    on_map = (place + middle[:, :, None] > grid.lower[:, None]) & (
-        place + middle[:, :, None] < grid.upper[:, None]
+    position = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)
+    on_map = (position + middle[:, :, None] > grid.lower[:, None]) & (
+        position + middle[:, :, None] < grid.upper[:, None]
     )
     columns = _pack(on_map[:, 0])[..., None]
     allowed = jnp.where(on_map[:, 1], columns, jnp.uint32(0))
@@ -302,10 +302,10 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels) - level) < 1.0
-    place = jnp.arange(lattice.cells)
-    at = (place[:, None] == cell[1]) & (place == cell[0])
-    here = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]
-    return jnp.where(here, _pack(at)[:, None, None], jnp.uint32(0))
+    indices = jnp.arange(lattice.cells)
+    at = (indices[:, None] == cell[1]) & (indices == cell[0])
+    bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]
+    return jnp.where(bits, _pack(at)[:, None, None], jnp.uint32(0))
 
 
 def _change_speed(bits: Array) -> Array:

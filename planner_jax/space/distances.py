@@ -8,7 +8,7 @@ the ground is the plane of x and y. The bodies are:
 * a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
   middle, at right angles and longer than zero;
 * a box along the axes: its corners `lower` and `upper` (3,) [m], `lower` <= `upper`;
-* a vertical line of infinite length, such as the axis of a pole: its `place` (2,) [m] on the
+* a vertical line of infinite length, such as the axis of a pole: its `position` (2,) [m] on the
   ground.
 
 A distance is the least length |gap| of a vector between points of both bodies. Moving the nearest
@@ -51,17 +51,17 @@ def segment_to_box(ends: Array, lower: Array, upper: Array) -> Array:
     return _shortest(_nearest_of_box, _gap_to_box, (ends, lower, upper))
 
 
-def segment_to_vertical_line(ends: Array, place: Array) -> Array:
+def segment_to_vertical_line(ends: Array, position: Array) -> Array:
     """Return the horizontal distance () [m] of a segment and a vertical line."""
-    return _shortest(_nearest_to_line, _gap_to_line, (ends, place))
+    return _shortest(_nearest_to_line, _gap_to_line, (ends, position))
 
 
-def rectangle_to_vertical_line(middle: Array, edges: Array, place: Array) -> Array:
+def rectangle_to_vertical_line(middle: Array, edges: Array, position: Array) -> Array:
     """Return the horizontal distance () [m] of a rectangle and a vertical line, 0 if they cross.
 
     The edges need not be at right angles: any parallelogram is valid, also an upright one.
     """
-    return _shortest(_nearest_of_projection, _gap_of_projection, (middle, edges, place))
+    return _shortest(_nearest_of_projection, _gap_of_projection, (middle, edges, position))
 
 
 def lowest_of_segment(ends: Array) -> Array:
@@ -170,22 +170,22 @@ def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
     (start, end), (e, f) = _rows(ends), _rows(edges)
     step, away = _minus(end, start), _minus(start, tuple(middle))
     squares = dot(e, e), dot(f, f)
-    places = [(dot(away, axis), dot(step, axis)) for axis in (e, f)]
+    dots = [(dot(away, axis), dot(step, axis)) for axis in (e, f)]
     normal = cross(e, f)
     height, climb = dot(away, normal), dot(step, normal)
     plane = _slab(-height, -height, climb, climb * climb)
     slabs = [
-        _slab(-square - place, square - place, speed, speed * speed * other)
-        for (place, speed), square, other in zip(places, squares, squares[::-1], strict=True)
+        _slab(-square - offset, square - offset, speed, speed * speed * other)
+        for (offset, speed), square, other in zip(dots, squares, squares[::-1], strict=True)
     ]
     share = _share_nearest_to_slabs([*slabs, plane])
     through = plane.enters
     crosses = (plane.weight > 0.0) & (through >= 0.0) & (through <= 1.0)
-    for (place, speed), square in zip(places, squares, strict=True):
-        crosses = crosses & (jnp.abs(place + through * speed) <= square)
+    for (offset, speed), square in zip(dots, squares, strict=True):
+        crosses = crosses & (jnp.abs(offset + through * speed) <= square)
     of_edges = [
-        jnp.clip(_ratio(place + share * speed, square), -1.0, 1.0)
-        for (place, speed), square in zip(places, squares, strict=True)
+        jnp.clip(_ratio(offset + share * speed, square), -1.0, 1.0)
+        for (offset, speed), square in zip(dots, squares, strict=True)
     ]
     return share, of_edges, ~crosses
 
@@ -261,23 +261,23 @@ def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
     return between / jnp.where(rises, rise - fall, 1.0)
 
 
-def _nearest_to_line(ends: Array, place: Array) -> tuple[Array]:
+def _nearest_to_line(ends: Array, position: Array) -> tuple[Array]:
     start, end = _ground(ends)
     step = _minus(end, start)
-    return (_unit(_ratio(dot(_minus(tuple(place), start), step), dot(step, step))),)
+    return (_unit(_ratio(dot(_minus(tuple(position), start), step), dot(step, step))),)
 
 
-def _gap_to_line(shares: tuple[Array], ends: Array, place: Array) -> Vector:
-    return _minus(_point(ends, shares[0])[:2], tuple(place))
+def _gap_to_line(shares: tuple[Array], ends: Array, position: Array) -> Vector:
+    return _minus(_point(ends, shares[0])[:2], tuple(position))
 
 
-def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
+def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
     """Return the shares of both half-edges, from -1 to 1, and whether the line is outside.
 
     They belong to the nearest point on the four edges of the rectangle's projection.
     """
     e, f = _ground(edges)
-    to_x, to_y = to = tuple(x - m for x, m in zip(place, middle[:2], strict=True))
+    to_x, to_y = to = tuple(x - m for x, m in zip(position, middle[:2], strict=True))
     squares, product = (dot(e, e), dot(f, f)), dot(e, f)
     ahead = (dot(to, e), dot(to, f))
     nearest = jnp.full_like(product, jnp.inf)
@@ -299,12 +299,12 @@ def _nearest_of_projection(middle: Array, edges: Array, place: Array) -> Any:
     return p, q, ~inside
 
 
-def _gap_of_projection(nearest: Any, middle: Array, edges: Array, place: Array) -> Vector:
+def _gap_of_projection(nearest: Any, middle: Array, edges: Array, position: Array) -> Vector:
     p, q, apart = nearest
     e, f = _ground(edges)
     return tuple(
         jnp.where(apart, m + p * a + q * b - x, 0.0)
-        for m, a, b, x in zip(middle[:2], e, f, place, strict=True)
+        for m, a, b, x in zip(middle[:2], e, f, position, strict=True)
     )
 
 

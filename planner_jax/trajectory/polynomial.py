@@ -160,6 +160,6 @@ def shift_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
 
     Coefficient j contributes C(j, i) t^(j - i) to the new coefficient i: the Taylor series at t.
     """
-    places = np.arange(size)
-    factors = np.array([[math.comb(j, i) for j in places] for i in places])
-    return factors, np.maximum(places - places[:, None], 0)
+    indices = np.arange(size)
+    factors = np.array([[math.comb(j, i) for j in indices] for i in indices])
+    return factors, np.maximum(indices - indices[:, None], 0)

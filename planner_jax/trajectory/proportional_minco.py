@@ -163,11 +163,11 @@ def proportional_minco(
         # it take their best values for both.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
-        rest = _least_energy(energy, end)
-        whitening = np.linalg.inv(np.linalg.cholesky(rest[own, own])).T
+        reduced = _least_energy(energy, end)
+        whitening = np.linalg.inv(np.linalg.cholesky(reduced[own, own])).T
         if k == 0:
             norm = np.linalg.norm(whitening, 2)
-        smooth = -np.linalg.solve(rest[own, own], rest[own, before])
+        smooth = -np.linalg.solve(reduced[own, own], reduced[own, before])
         from_offsets[own, before] = smooth @ from_offsets[before, before]
         from_offsets[own, own] = whitening / norm
     to_offsets = np.linalg.inv(from_offsets)
@@ -217,19 +217,12 @@ def by_pieces(
 ) -> PyTree:
     """Apply a function to the motion of each piece, one piece after another to save memory.
 
-    Args:
-        function: of the motion at `nodes` + 1 samples of a piece, and of the piece's duration [s].
-        maps: as for `sample_motion`.
-        nodes: intervals of each piece.
-        columns: (C, 3).
-        piece_duration: () [s].
-
-    Returns:
-        The results of the function, with a leading axis of M.
+    The function takes the motion at `nodes` + 1 samples of a piece, and the piece's duration [s].
+    Its results get a leading axis of M. The other arguments are as for `sample_motion`.
     """
     each = np.stack([maps.sample_matrix(nodes, d) for d in range(4)])
-    places = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
-    matrices = jnp.asarray(each[:, places].swapaxes(0, 1), columns.dtype)  # (M, 4, nodes + 1, C)
+    indices = np.arange(maps.num_pieces)[:, None] * nodes + np.arange(nodes + 1)
+    matrices = jnp.asarray(each[:, indices].swapaxes(0, 1), columns.dtype)  # (M, 4, nodes + 1, C)
     shares = jnp.asarray(maps.proportions, columns.dtype)
 
     def of_piece(piece: tuple[Array, Array]) -> PyTree:
@@ -258,11 +251,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
     """Return the integral () of |p^(s)|^2 over the trajectory.
 
-    Args:
-        maps: constant maps of M pieces.
-        rows: (2s, 3) boundary rows.
-        offsets: (O, 3) whitened offsets y.
-        piece_duration: () h = T / M [s].
+    The trajectory has boundary rows (2s, 3), whitened offsets y (O, 3) and h = `piece_duration`.
     """
     boundary = boundary_energy(maps, rows, piece_duration)
     return boundary + offset_energy(maps, offsets, piece_duration)
@@ -339,13 +328,7 @@ def chain_rows(
     tail_states: Float[Array, "N 4 3"],
     piece_durations: Float[Array, " N"],
 ) -> Float[Array, "N 8 3"]:
-    """Return the boundary rows of every segment.
-
-    Args:
-        head_state: state at the start of the whole trajectory.
-        tail_states: state at the end of each segment.
-        piece_durations: [s], mean duration of the pieces of each segment.
-    """
+    """Return the boundary rows of every segment of a chain, by the states at their ends."""
     heads = jnp.concatenate([head_state[None], tail_states[:-1]])
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 

@@ -47,33 +47,33 @@ def draw(
     suite = suite_named(suite, "group")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
-    drawn, _, _ = draw_accepted(own, randoms)
-    fewest, most = own.num_targets
+    spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
+    draws, _, _ = draw_accepted(spec, randoms)
+    fewest, most = spec.num_targets
     count = np.array([random.integers(fewest, most + 1) for random in randoms])
-    targets = [{name: drawn[name] for name in _TARGET}]
-    targets += [_draw_target(suite, randoms, drawn) for _ in range(most - 1)]
+    targets = [{name: draws[name] for name in _TARGET}]
+    targets += [_draw_target(suite, randoms, draws) for _ in range(most - 1)]
     stacked = {name: np.stack([each[name] for each in targets], axis=1) for name in _TARGET}
     return InterceptGroup(
-        shared=dataclasses.replace(cases_of(drawn, dtype), target=path_of(stacked, dtype)),
+        shared=dataclasses.replace(cases_of(draws, dtype), target=path_of(stacked, dtype)),
         present=jnp.asarray(np.arange(most) < count[:, None]),
         order=jnp.asarray(np.broadcast_to(np.arange(most), (num, most)), jnp.int32),
     )
 
 
 def _draw_target(
-    suite: str, randoms: list[np.random.Generator], drawn: dict[str, np.ndarray]
+    suite: str, randoms: list[np.random.Generator], draws: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
     """Draw one more target for each of B draws, to which no cause of rejection applies."""
-    own, pending = SUITES[suite], np.arange(len(randoms))
+    spec, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
-    targets = {name: np.zeros_like(drawn[name]) for name in _TARGET}
+    targets = {name: np.zeros_like(draws[name]) for name in _TARGET}
     while len(pending):
         uniform = np.stack([randoms[k].random(6) for k in pending])
         meeting = anywhere(uniform[:, :2])
-        target = target_to(meeting, own.time, turning[pending], uniform[:, 2:])
-        around = {name: leaf[pending] for name, leaf in drawn.items()}
-        is_good = first_cause(own, {**around, **target, "meeting": meeting}) == len(CAUSES)
+        target = target_to(meeting, spec.time, turning[pending], uniform[:, 2:])
+        around = {name: leaf[pending] for name, leaf in draws.items()}
+        is_good = first_cause(spec, {**around, **target, "meeting": meeting}) == len(CAUSES)
         for name in _TARGET:
             targets[name][pending[is_good]] = target[name][is_good]
         pending = pending[~is_good]

@@ -170,9 +170,9 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     flat = drive.slope.reshape(num, samples * 4, 8)
     pushed = jnp.matmul(cost.stiffness, drive.slope, precision=_HIGHEST).reshape(flat.shape)
     pushed = jnp.concatenate([pushed, cost.push.reshape(num, -1, 1)], axis=2)
-    seen = jnp.matmul(flat.swapaxes(1, 2), pushed, precision=_HIGHEST)  # (K, 8, 9)
-    own = seen[:, :5, :5] + cost.piece_stiffness
-    pull = seen[:, :5, 8] + cost.piece_push
+    forms = jnp.matmul(flat.swapaxes(1, 2), pushed, precision=_HIGHEST)  # (K, 8, 9)
+    own = forms[:, :5, :5] + cost.piece_stiffness
+    pull = forms[:, :5, 8] + cost.piece_push
 
     def shift(values: Array, by: int) -> Array:
         """Return for each piece the value of the piece `by` later, zero past the end."""
@@ -181,12 +181,12 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
     # Sums over all pieces from the second one after each knot.
-    rest = shift(jnp.cumsum(seen[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
+    later = shift(jnp.cumsum(forms[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
     lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
     twist = drive.right + shift(drive.left, 1)  # (K, 2, 3)
-    rigid = jnp.sum(rest[:, None, :, 5:8] * twist[:, :, None], axis=-1)  # (K, 2, 3)
-    next_left = shift(seen[:, 5:, lefts], 1).swapaxes(1, 2)  # (K, 2, 3)
-    own_right = seen[:, 5:, rights].swapaxes(1, 2)
+    rigid = jnp.sum(later[:, None, :, 5:8] * twist[:, :, None], axis=-1)  # (K, 2, 3)
+    next_left = shift(forms[:, 5:, lefts], 1).swapaxes(1, 2)  # (K, 2, 3)
+    own_right = forms[:, 5:, rights].swapaxes(1, 2)
     beside = own[:, rights][:, :, lefts]  # (K, 2, 2), of a knot with the knot before
     same = own[:, rights][:, :, rights] + shift(own[:, lefts][:, :, lefts], 1)
 
@@ -217,11 +217,11 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     )
     curvature = jnp.where(gap >= 0, lower, lower.T)
     gradient = pull[:, rights] + shift(pull[:, lefts], 1)
-    gradient = flatten(gradient + jnp.sum(twist * rest[:, None, :, 8], axis=-1))
+    gradient = flatten(gradient + jnp.sum(twist * later[:, None, :, 8], axis=-1))
     if not is_time_free:
         return gradient, curvature
     with_time = own[:, rights, TIME] + shift(own[:, lefts, TIME], 1)
-    with_time = flatten(with_time + jnp.sum(twist * rest[:, None, :, TIME], axis=-1))
+    with_time = flatten(with_time + jnp.sum(twist * later[:, None, :, TIME], axis=-1))
     last = jnp.sum(own[:, TIME, TIME])
     return (
         jnp.append(gradient, jnp.sum(pull[:, TIME])),

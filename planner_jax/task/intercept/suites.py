@@ -88,13 +88,13 @@ def drawn(
     Arguments and errors are as for `pj.hit.draw`; `suite` is a key of `SUITES`.
     """
     require_name(SUITES, "suite", suite)
-    own, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
-    accepted, counts, rejected = draw_accepted(own, randoms)
+    spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
+    accepted, counts, rejected = draw_accepted(spec, randoms)
     return Drawn(cases=cases_of(accepted, dtype), draws=counts, rejected=rejected)
 
 
 def draw_accepted(
-    own: Suite, randoms: list[np.random.Generator]
+    spec: Suite, randoms: list[np.random.Generator]
 ) -> tuple[Draws, np.ndarray, dict[str, np.ndarray]]:
     """Draw from every generator until no cause of rejection applies.
 
@@ -109,12 +109,12 @@ def draw_accepted(
     rejected = np.zeros((len(CAUSES), num), int)
     accepted: Draws = {}
     while len(pending):
-        uniform = np.stack([randoms[k].random(_count_numbers(own)) for k in pending])
-        candidates = _candidates(own, kinds[pending], uniform)
-        cause = first_cause(own, candidates)
-        if own.spare is not None and (good := np.flatnonzero(cause == len(CAUSES))).size:
-            some = _shorten_time(own, {name: leaf[good] for name, leaf in candidates.items()})
-            cause[good] = first_cause(own, some)
+        uniform = np.stack([randoms[k].random(_count_numbers(spec)) for k in pending])
+        candidates = _candidates(spec, kinds[pending], uniform)
+        cause = first_cause(spec, candidates)
+        if spec.spare is not None and (good := np.flatnonzero(cause == len(CAUSES))).size:
+            some = _shorten_time(spec, {name: leaf[good] for name, leaf in candidates.items()})
+            cause[good] = first_cause(spec, some)
             for name, leaf in some.items():
                 candidates[name][good] = leaf
         counts[pending] += 1
@@ -207,16 +207,16 @@ def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np
     return {"pos": pos, "angle": angle, "speed": speed, "rate": rate}
 
 
-def _shorten_time(suite: Suite, drawn: Draws) -> Draws:
+def _shorten_time(suite: Suite, draws: Draws) -> Draws:
     """Return draws with an earlier meeting, and whether the target can be "reached" by then."""
     with jax.enable_x64(True):
-        cases = jax.tree.map(np.asarray, cases_of(drawn, jnp.float64))
-        num = len(drawn["time"])
+        cases = jax.tree.map(np.asarray, cases_of(draws, jnp.float64))
+        num = len(draws["time"])
         arrivals = np.array([float(_earliest(take(cases, k))) for k in range(num)])
     reached = np.isfinite(arrivals)
-    time = np.where(reached, arrivals + suite.spare, drawn["time"])
-    moved = _displace(drawn["angle"], drawn["speed"], drawn["rate"], time)
-    return {**drawn, "time": time, "reached": reached, "meeting": drawn["pos"] + moved}
+    time = np.where(reached, arrivals + suite.spare, draws["time"])
+    moved = _displace(draws["angle"], draws["speed"], draws["rate"], time)
+    return {**draws, "time": time, "reached": reached, "meeting": draws["pos"] + moved}
 
 
 # One case at a time, so that the result does not depend on the batch.
@@ -283,21 +283,21 @@ def _boxes(left, low, right, high) -> np.ndarray:
     return np.stack([x, y], axis=-1)
 
 
-def path_of(drawn: Draws, dtype: DTypeLike) -> TurningPath:
+def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
     """Return the paths of the targets of draws."""
     return TurningPath(
-        pos=jnp.asarray(drawn["pos"], dtype),
-        vel=jnp.asarray(drawn["speed"][..., None] * _unit(drawn["angle"]), dtype),
-        turn_rate=jnp.asarray(drawn["rate"], dtype),
+        pos=jnp.asarray(draws["pos"], dtype),
+        vel=jnp.asarray(draws["speed"][..., None] * _unit(draws["angle"]), dtype),
+        turn_rate=jnp.asarray(draws["rate"], dtype),
     )
 
 
-def cases_of(drawn: Draws, dtype: DTypeLike) -> InterceptCase:
+def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
     """Return the cases of accepted draws."""
 
     def group(kind: str, velocity: np.ndarray) -> Obstacles:
-        present = drawn[f"{kind} present"]
-        corners = np.where(present[..., None, None], drawn[kind], 0.0)
+        present = draws[f"{kind} present"]
+        corners = np.where(present[..., None, None], draws[kind], 0.0)
         centre = corners.mean(axis=2)
         return Obstacles(
             centre=jnp.asarray(centre, dtype),
@@ -306,14 +306,14 @@ def cases_of(drawn: Draws, dtype: DTypeLike) -> InterceptCase:
             present=jnp.asarray(present),
         )
 
-    start = np.concatenate([drawn["start"], np.zeros((len(drawn["start"]), 1))], axis=1)
+    start = np.concatenate([draws["start"], np.zeros((len(draws["start"]), 1))], axis=1)
     return case(
-        path_of(drawn, dtype),
-        drawn["time"],
+        path_of(draws, dtype),
+        draws["time"],
         start=start,
         initial_speed=START_SPEED,
         walls=group("walls", np.zeros(2)),
-        movers=group("movers", drawn["velocity"]),
+        movers=group("movers", draws["velocity"]),
         upper=(SIZE, SIZE),
         speed=TOP_SPEED,
         dtype=dtype,
@@ -327,41 +327,41 @@ def _displace(angle, speed, rate, time) -> np.ndarray:
     return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
 
 
-def _path(suite: Suite, drawn: Draws) -> np.ndarray:
+def _path(suite: Suite, draws: Draws) -> np.ndarray:
     """Return positions (B, M, 2) [m] of the targets from time 0 to the meeting."""
-    times = np.linspace(0.0, drawn["time"], round(suite.time / _STEP) + 1, axis=1)
-    angle, speed, rate = (drawn[name][:, None] for name in ("angle", "speed", "rate"))
-    return drawn["pos"][:, None] + _displace(angle, speed, rate, times)
+    times = np.linspace(0.0, draws["time"], round(suite.time / _STEP) + 1, axis=1)
+    angle, speed, rate = (draws[name][:, None] for name in ("angle", "speed", "rate"))
+    return draws["pos"][:, None] + _displace(angle, speed, rate, times)
 
 
-def _is_off_map(suite: Suite, drawn: Draws) -> np.ndarray:
+def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
     """Return whether the targets leave the map, (B,)."""
-    from_middle = np.abs(_path(suite, drawn) - 0.5 * SIZE)
+    from_middle = np.abs(_path(suite, draws) - 0.5 * SIZE)
     return from_middle.max(axis=(1, 2)) > 0.5 * SIZE
 
 
-def _middle(drawn: Draws) -> np.ndarray:
+def _middle(draws: Draws) -> np.ndarray:
     """Return the middle (B, 2) [m] of the car's body at the start."""
-    return drawn["start"] + [BODY_MIDDLE, 0.0]
+    return draws["start"] + [BODY_MIDDLE, 0.0]
 
 
-def _is_too_far(_: Suite, drawn: Draws) -> np.ndarray:
+def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
     """Return whether a straight drive at the greatest speed takes too long, (B,)."""
-    distance = drawn["meeting"] - _middle(drawn)
-    return np.linalg.norm(distance, axis=1) > TOP_SPEED * drawn["time"]
+    distance = draws["meeting"] - _middle(draws)
+    return np.linalg.norm(distance, axis=1) > TOP_SPEED * draws["time"]
 
 
-def _room(
-    drawn: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
+def _gap(
+    draws: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
 ) -> np.ndarray:
     """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,) [s]."""
-    corners, points = drawn[kind], points if points.ndim == 3 else points[:, None]
+    corners, points = draws[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
         times = np.broadcast_to(times, len(points))[:, None, None, None]
-        corners = corners + times * drawn["velocity"][:, :, None]
+        corners = corners + times * draws["velocity"][:, :, None]
     least = np.full(len(points), np.inf)
     for k in range(corners.shape[1]):
-        present = drawn[f"{kind} present"][:, k]
+        present = draws[f"{kind} present"][:, k]
         far = _distance(points[present], corners[present, None, k])
         least[present] = np.minimum(least[present], far.min(axis=1))
     return least
@@ -381,14 +381,14 @@ def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     return np.where(left_of.all(axis=-1), 0.0, np.sqrt(gap))
 
 
-def _is_separated(_: Suite, drawn: Draws) -> np.ndarray:
+def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
     """Return whether walls separate the start from the meeting point for a disc, (B,)."""
     count = round(SIZE / _CELL)
     middles = (np.arange(count) + 0.5) * _CELL
-    separated = np.zeros(len(drawn["start"]), bool)
-    for k, ends in enumerate(np.stack([_middle(drawn), drawn["meeting"]], axis=1)):
+    separated = np.zeros(len(draws["start"]), bool)
+    for k, ends in enumerate(np.stack([_middle(draws), draws["meeting"]], axis=1)):
         free = np.ones((count, count), bool)
-        for corners in drawn["walls"][k][drawn["walls present"][k]]:
+        for corners in draws["walls"][k][draws["walls present"][k]]:
             lowest = (corners.min(axis=0) - BODY_ROOM) / _CELL - 0.5
             highest = (corners.max(axis=0) + BODY_ROOM) / _CELL - 0.5
             first = np.clip(np.ceil(lowest), 0, count).astype(int)
@@ -406,28 +406,28 @@ def _is_separated(_: Suite, drawn: Draws) -> np.ndarray:
 # Cause of rejection -> whether it applies, (B,), in the order of the tests.
 _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "target off the map": _is_off_map,
-    "start near a wall": lambda _, drawn: _room(drawn, "walls", _middle(drawn)) < START_ROOM,
-    "meeting near a wall": lambda _, drawn: _room(drawn, "walls", drawn["meeting"]) < MEETING_ROOM,
-    "target through a wall": lambda suite, drawn: (
-        _room(drawn, "walls", _path(suite, drawn)) < TARGET_ROOM
+    "start near a wall": lambda _, draws: _gap(draws, "walls", _middle(draws)) < START_ROOM,
+    "meeting near a wall": lambda _, draws: _gap(draws, "walls", draws["meeting"]) < MEETING_ROOM,
+    "target through a wall": lambda suite, draws: (
+        _gap(draws, "walls", _path(suite, draws)) < TARGET_ROOM
     ),
-    "mover at the start": lambda _, drawn: _room(drawn, "movers", _middle(drawn)) < START_ROOM,
-    "mover at the meeting": lambda _, drawn: (
-        _room(drawn, "movers", drawn["meeting"], drawn["time"]) < MEETING_ROOM
+    "mover at the start": lambda _, draws: _gap(draws, "movers", _middle(draws)) < START_ROOM,
+    "mover at the meeting": lambda _, draws: (
+        _gap(draws, "movers", draws["meeting"], draws["time"]) < MEETING_ROOM
     ),
     "too far": _is_too_far,  # at the greatest speed
     "no way": _is_separated,  # for a disc of the car's width
-    "out of reach": lambda _, drawn: ~drawn["reached"],  # by a layer of the reach set
+    "out of reach": lambda _, draws: ~draws["reached"],  # by a layer of the reach set
 }
 CAUSES = tuple(_APPLIES)
 
 
-def first_cause(suite: Suite, drawn: Draws) -> np.ndarray:
+def first_cause(suite: Suite, draws: Draws) -> np.ndarray:
     """Return the index (B,) in `CAUSES` of the first cause that applies; len(CAUSES) if none."""
-    cause = np.full(len(drawn["start"]), len(CAUSES))
+    cause = np.full(len(draws["start"]), len(CAUSES))
     alive = np.arange(len(cause))
     for index, applies in enumerate(_APPLIES.values()):
-        rejected = applies(suite, {name: leaf[alive] for name, leaf in drawn.items()})
+        rejected = applies(suite, {name: leaf[alive] for name, leaf in draws.items()})
         cause[alive[rejected]] = index
         alive = alive[~rejected]
     return cause
