@@ -17,7 +17,7 @@ from planner_jax.benchmarks.block_rows import STRAIGHT
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.core.registry import task_named
-from planner_jax.runs.timing import timed_warm
+from planner_jax.runs.timing import measure_warm
 from planner_jax.sweep.block.settings import REGIMES
 
 
@@ -34,7 +34,7 @@ def main() -> None:
             bench.say("A straight motion blocks every throw.")
             return
         some = jax.tree.map(np.asarray, pj.take(cases, hard))
-        calls = [timed_warm(lambda: pj.plan(planner, some)) for _ in range(options.repeat)]
+        calls = [measure_warm(lambda: pj.plan(planner, some)) for _ in range(options.repeat)]
         (plans, _), seconds = calls[0], [each for _, each in calls]
         success = pj.block.judge(some, plans).success
         refused = int((pj.solved(plans) & ~success).sum())

@@ -34,7 +34,7 @@ import planner_jax as pj
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm import Arm
-from planner_jax.runs.timing import timed_plans
+from planner_jax.runs.timing import measure_plans
 from planner_jax.sims.robots.arm.dynamics import inverse_dynamics
 from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.task.block.plan import BlockPlan
@@ -141,14 +141,14 @@ def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     # Once each: RRT-Connect draws on where it left off, so that further calls change its ways.
     for k in range(WARM):
         pj.plan(planner, pj.take(warm, k))
-    plans, query = timed_plans(planner, cases)
+    plans, query = measure_plans(planner, cases)
     verdict = pj.block.judge(cases, plans)
     motion = moving(plans.motion)
     execution = np.asarray(motion.durations).sum(axis=1)
     if lasts:
         reserve = np.float32(np.percentile(query, RESERVE))
         later = dataclasses.replace(cases, delay=cases.delay + reserve)
-        again, seconds = timed_plans(planner, later)
+        again, seconds = measure_plans(planner, later)
         counted = pj.block.judge(later, again).success & (seconds <= reserve)
     else:
         counted = verdict.success & (cases.delay + query + execution <= plans.contact_time)

@@ -43,7 +43,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
-from planner_jax.runs.timing import timed_warm
+from planner_jax.runs.timing import measure_warm
 from planner_jax.sims.segment import ball_look, noisy_depth, sighting
 from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.contact_check import end_at_contact
@@ -360,7 +360,7 @@ def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
         plan: Any = None
         for each in aimed:
             entry = pj.take(each, k)
-            plan, spent = timed_warm(lambda entry=entry: pj.plan(planner, entry))
+            plan, spent = measure_warm(lambda entry=entry: pj.plan(planner, entry))
             seconds[k] += spent
             if pj.solved(plan):
                 break

@@ -78,7 +78,7 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
 def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
     """Plan once, and carry the plans out in every row."""
     from planner_jax.core.protocol import is_solved
-    from planner_jax.runs.timing import timed_plans
+    from planner_jax.runs.timing import measure_plans
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
     from planner_jax.sims.tasks.block_flights import BLOCK_WORLD, fly_blocks, throws
     from planner_jax.task.block.api import judge, planner
@@ -92,7 +92,7 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
         wide=options.wide,
         delay=observe + budget,
     )
-    plan, seconds = timed_plans(planner(options.planner), cases.cases)
+    plan, seconds = measure_plans(planner(options.planner), cases.cases)
     accepted = judge(cases.cases, plan).success & is_solved(plan.status)
     quick, slow = (1e3 * np.quantile(seconds, share) for share in (0.5, 0.99))
     bench.say(

@@ -22,7 +22,7 @@ from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.core.registry import all_tasks, task_named
 from planner_jax.plane.target import LaterPath
-from planner_jax.runs.timing import timed_plans
+from planner_jax.runs.timing import measure_plans
 
 
 def planned_again(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
@@ -61,7 +61,7 @@ def main() -> None:
         began = time.perf_counter()
         pj.plan(planner, pj.take(batch, 0))
         first = time.perf_counter() - began
-        plans, seconds = timed_plans(planner, batch)
+        plans, seconds = measure_plans(planner, batch)
         success = np.asarray(card.judge(judged, plans).success)
         p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
         of_good = seconds[success] if success.any() else np.nan

@@ -83,7 +83,7 @@ class Bench:
     def __enter__(self) -> Self:
         self._manifest |= environment()
         self._owning = contextlib.ExitStack()
-        self._owning.enter_context(self._folder.created(self._manifest))
+        self._owning.enter_context(self._folder.create(self._manifest))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: Any) -> None:

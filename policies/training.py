@@ -48,7 +48,7 @@ from planner_jax.policies.settings import (
     TrainSettings,
     usual_iterations,
 )
-from planner_jax.runs.environment import code_digest, installed_version
+from planner_jax.runs.environment import code_digest, find_version
 from planner_jax.runs.manifest import to_write
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.task.catch.decide import optimal_time_ratio
@@ -107,7 +107,7 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
     folder = Path(out)
     network = NETWORKS[training.network]()
     params = _first_params(training, network)  # before anything is written
-    with RunFolder(folder).owned():
+    with RunFolder(folder).lock():
         _record_settings(folder, training)
         return _train_parts(training, folder, network, params, progress)
 
@@ -194,7 +194,7 @@ def _sentence(suites: Mapping[str, Any]) -> str:
 def _record_settings(folder: Path, training: Training) -> None:
     """Write settings and digest of the code; raise `ArgumentError` if the folder has others."""
     asked = json.loads(json.dumps(dataclasses.asdict(training)))
-    maker = {"version": str(installed_version("planner-jax")), "code": code_digest()}
+    maker = {"version": str(find_version("planner-jax")), "code": code_digest()}
     wanted = {**maker, **asked}
     if (folder / SETTINGS).exists():
         found = read_settings(folder)

@@ -31,7 +31,7 @@ from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import settings_of_manifest
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.summary import percent, wilson_interval
-from planner_jax.runs.table import RateTable, own_cells, to_html, to_markdown
+from planner_jax.runs.table import RateTable, rate_cells, to_html, to_markdown
 from planner_jax.runs.timing import CompileClock, Stopwatch
 from planner_jax.sims.film import draw_flight, film_flights, require_film
 from planner_jax.sims.recording import FLIGHTS, Recording, read_recording, to_rows
@@ -96,7 +96,7 @@ def start_flights(
         "video": video,
     }
     rest: dict[str, Any] = {"rest": lambda: _dropped(folder), "patient": False, "bar": False}
-    with folder.created(manifest), stopping.under_way(**rest):
+    with folder.create(manifest), stopping.under_way(**rest):
         try:
             return _fly_into(folder, manifest, flight, cases, min(record, settings.num))
         except (KeyboardInterrupt, OSError):
@@ -258,7 +258,7 @@ def write_flight_report(folder: RunFolder) -> None:
     figures = ["flight.png", *flight.draw(folder.figures, rows)]
     more = flight.tables(rows)
     summary, video = manifest["summary"], manifest["video"]
-    cells = own_cells(summary["successes"], summary["num"])
+    cells = rate_cells(summary["successes"], summary["num"])
     table = RateTable(
         "Success",
         ["flights of", "flights", "success %", "95 % interval", "published"],

@@ -14,7 +14,7 @@ from planner_jax.runs.settings import option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
 from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
-from planner_jax.sweep.quadrotor_settings import checked_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.catch.spec import TASK as CATCH
@@ -158,7 +158,7 @@ class CatchFly(BallFly):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, "net"))
         require_count("balls", self.balls, 1)
         require(self.balls <= _MOST_BALLS, "balls", f"<= {_MOST_BALLS}", self.balls)
         split_name(_FLOWN_DECISIONS, "decide", self.decide, TRAINED)
@@ -206,7 +206,7 @@ class HitFly(BallFly):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, "racket"))
         require_one_of(HIT.suites, "suite", self.suite)
 
 

@@ -10,7 +10,7 @@ from scipy.stats import binomtest
 from planner_jax.cli.main import main
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import wilson_interval
-from planner_jax.sweep.compare import described, difference_of, differing, other_cases, read_run
+from planner_jax.sweep.compare import describe, difference_of, differing, other_cases, read_run
 
 FAILED = {0: "", 1: "speed", 2: "landing"}
 
@@ -39,7 +39,7 @@ def written_run(folder, outcomes, *, kind="sweep hit", **settings):
         "sessions": [],
     }
     run = RunFolder(folder, name="RUN")
-    with run.created(manifest):
+    with run.create(manifest):
         summary = {"num": num, "successes": successes, "success_rate": successes / num}
         summary |= {"wilson_95": [0.0, 1.0], "plans_per_second_warm": 500.0}
         summary |= {"status_counts": {}, "failed_limits": {}}
@@ -78,7 +78,7 @@ def test_runs_that_end_alike_differ_by_nothing(pair):
     assert (found.first_only, found.this_only, found.mcnemar_p) == (0, 0, 1.0)
     low, high = found[1:3]
     assert low == -high and (1.0 - high) ** 60 == pytest.approx(0.025)
-    assert "ends alike" in described([first, first])[-1]
+    assert "ends alike" in describe([first, first])[-1]
 
 
 def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_path):
@@ -91,7 +91,7 @@ def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_pat
     p1, p2 = 49 / 60, 41 / 50
     assert found.difference_low == pytest.approx(p2 - p1 - np.hypot(p2 - l2, u1 - p1))
     assert found.difference_high == pytest.approx(p2 - p1 + np.hypot(u2 - p2, p1 - l1))
-    text = "\n".join(described([first, other]))
+    text = "\n".join(describe([first, other]))
     assert "the cases differ in num 60 and 50, limit_scale 1.0 and 0.5." in text
     assert "McNemar" not in text and "tell them apart" not in text
 

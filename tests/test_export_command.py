@@ -23,7 +23,7 @@ from planner_jax.sweep.block.columns import COLUMNS as BLOCK
 from planner_jax.sweep.catch.columns import COLUMNS as CATCH
 from planner_jax.sweep.hit.columns import COLUMNS as HIT
 from planner_jax.sweep.intercept.columns import COLUMNS as INTERCEPT
-from planner_jax.sweep.rows import planned_row
+from planner_jax.sweep.rows import read_plan
 from planner_jax.task.hit.plan import HitPlan
 
 NUM = 3
@@ -63,7 +63,7 @@ def written_run(folder, task="hit", *, finished=True):
     manifest |= {"run": "", "settings": "", "versions": {}, "device": {}}
     manifest["setting"] = {"gravity": 9.81}
     run = RunFolder(folder, name="RUN")
-    with run.created(manifest):
+    with run.create(manifest):
         if finished:
             summary = {"num": NUM, "successes": 1, "success_rate": 1 / 3, "wilson_95": [0.0, 1.0]}
             summary |= {"plans_per_second_warm": 0.0, "status_counts": {}, "failed_limits": {}}
@@ -84,7 +84,7 @@ def assert_same(one, other):
 def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, task):
     run, plans = written_run(tmp_path / "run", task), batch(TASKS[task][0])
     for row in range(NUM):
-        plan, sentence = planned_row(run, row)
+        plan, sentence = read_plan(run, row)
         assert_same(plan, pj.take(plans, row))
         assert sentence == ("" if row == 0 else f"plan {row} is too fast")
 
@@ -94,22 +94,22 @@ def test_a_row_that_is_not_there_and_a_run_that_is_not_finished_or_damaged_or_of
     for row in (-1, 3, None):
         shown = "nothing" if row is None else row
         with pytest.raises(ArgumentError, match=f"^row must be from 0 to 2, got {shown}$"):
-            planned_row(run, row)
+            read_plan(run, row)
     with pytest.raises(ArgumentError, match="^RUN must be finished, got .*; resume it first$"):
-        planned_row(written_run(tmp_path / "half", finished=False), 0)
+        read_plan(written_run(tmp_path / "half", finished=False), 0)
     run = written_run(tmp_path / "damaged")
     (part,) = run.plans.files()
     content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 0xFF
     part.write_bytes(content)
     with pytest.raises(ArgumentError, match="^RUN must be a run whose plans/part-000000-"):
-        planned_row(run, 0)
+        read_plan(run, 0)
     flown = RunFolder(tmp_path / "flown", name="RUN")
     manifest = {"kind": "fly hit", "state": "running", "parameters": {}}
-    with flown.created({**manifest, "seed": 0, "device": {}, "loop": {}}):
+    with flown.create({**manifest, "seed": 0, "device": {}, "loop": {}}):
         pass
     with pytest.raises(ArgumentError, match="^RUN must be the folder of a sweep, got a fly hit$"):
-        planned_row(flown, 0)
+        read_plan(flown, 0)
 
 
 @pytest.mark.parametrize("robot", PLANS)

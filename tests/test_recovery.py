@@ -10,7 +10,7 @@ from flown_plans import SOLVED, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.cli.plan.answer import sampled
+from planner_jax.cli.plan.answer import sample_plan
 from planner_jax.core.errors import ArgumentError, NoRecovery
 from planner_jax.plane.target import TurningPath
 from planner_jax.recovery.after_plan import append_recovery, is_rested
@@ -27,7 +27,7 @@ from planner_jax.sweep.catch.settings import CatchSettings
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.quadrotor import recovery_remark
-from planner_jax.sweep.rows import planned_row
+from planner_jax.sweep.rows import read_plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 NUM = 8
@@ -166,7 +166,7 @@ def test_rows_of_a_sweep_have_the_way_to_rest_that_was_judged(swept, braked):
     assert manifest["parameters"]["recovery"] == "brake"
     assert manifest["summary"]["successes"] == NUM
     for row in range(NUM):
-        found, sentence = planned_row(RunFolder(out), row)
+        found, sentence = read_plan(RunFolder(out), row)
         whole = pj.take(braked, row).whole
         np.testing.assert_allclose(total_duration(found.whole), total_duration(whole), rtol=1e-3)
         np.testing.assert_allclose(states(found.recovery)[1:], 0.0, atol=2e-2)
@@ -185,7 +185,7 @@ def test_a_sweep_is_resumed_with_its_recovery_alone(swept):
 
 def test_the_limits_of_one_case_are_looked_at_behind_the_contact_too(braked):
     plan = pj.take(braked, 0)
-    assert sampled(plan).time[-1] > plan.stroke.time + 0.2
+    assert sample_plan(plan).time[-1] > plan.stroke.time + 0.2
 
 
 @pytest.mark.parametrize("settings", [HitSettings, CatchSettings])

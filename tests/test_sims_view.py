@@ -192,7 +192,7 @@ def run_folder(tmp_path):
             **{"tracking_rms_median": 0.0, "tracking_worst": 0.0},
         },
     }
-    with folder.owned():
+    with folder.lock():
         Dataset(folder.path / FLIGHTS).write_rows(to_rows(recording()))
         folder.plans.write_rows(pa.table({"index": [0]}))
         folder.write_manifest(manifest)

@@ -36,7 +36,7 @@ def catch():
 
 def test_a_hit_is_told_with_its_time_and_place(hit):
     single, answer = hit
-    first, planner, referee = single.described(answer)[:3]
+    first, planner, referee = single.describe(answer)[:3]
     stroke = answer.plan.stroke
     assert first.startswith(f"Hit at {float(stroke.time):.3f} s at ({stroke.ball_pos[0]:.3f}, ")
     assert planner.startswith("Planner exact: ") and "every limit holds" in planner
@@ -48,8 +48,8 @@ def test_a_catch_is_told_with_its_time_and_place(catch):
     ball = answer.case.targets.ball
     time = float(answer.plan.times[0])
     fallen = ball.pos[0] + time * ball.vel[0] - np.array([0.0, 0.0, 0.5 * 9.81 * time**2])
-    assert f"Caught at {time:.3f} s at ({fallen[0]:.3f}, " in single.described(answer)[0]
-    assert f", {fallen[2]:.3f}) m, " in single.described(answer)[0]
+    assert f"Caught at {time:.3f} s at ({fallen[0]:.3f}, " in single.describe(answer)[0]
+    assert f", {fallen[2]:.3f}) m, " in single.describe(answer)[0]
 
 
 @pytest.mark.parametrize("which", ["hit", "catch"])

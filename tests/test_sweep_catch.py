@@ -125,7 +125,7 @@ def test_a_run_is_resumed_as_what_it_is(finished, name, given, message):
 
 def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_path, monkeypatch):
     out = tmp_path / "run"
-    with RunFolder(out).owned():
+    with RunFolder(out).lock():
         RunFolder(out).write_manifest({**finished[1], "state": "interrupted"})
     real = pj.catch.draw
     monkeypatch.setattr(

@@ -23,7 +23,7 @@ from planner_jax.runs.columns import RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.source import Chunk
 from planner_jax.sweep.intercept.columns import COLUMNS, WAY_POINTS
-from planner_jax.sweep.intercept.figures import instants, sampled_drive
+from planner_jax.sweep.intercept.figures import instants, sample_drive
 from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.intercept.sweep import InterceptSweep
 from planner_jax.task.intercept.case import InterceptCase
@@ -148,7 +148,7 @@ def test_the_rows_alone_lead_the_referee_to_the_same_verdict(finished, rows):
 def test_a_row_s_drive_ends_where_the_referee_sees_it(finished, rows):
     setting = finished[1]["setting"]
     for row in rows:
-        drive = sampled_drive(row, setting, 41)
+        drive = sample_drive(row, setting, 41)
         away = np.linalg.norm(drive.middle[-1] - drive.target[-1])
         assert away == pytest.approx(row["miss"], abs=1e-4)
         assert drive.time[-1] == pytest.approx(row["meeting_time"])

@@ -16,7 +16,7 @@ from planner_jax.core.errors import PlannerJaxError
 from planner_jax.core.registry import all_tasks, task_named
 from planner_jax.host import signals as stopping
 from planner_jax.live.settings import SERVED
-from planner_jax.runs.environment import installed_version
+from planner_jax.runs.environment import find_version
 
 _INTERRUPTED = 130  # exit code
 
@@ -65,7 +65,7 @@ def _make_parser() -> Parser:
         epilog="examples:\n  planner-jax sweep hit --num 9000 --out runs/first\n"
         "  planner-jax sweep catch --suite triangle3 --num 1000",
     )
-    version = f"planner-jax {installed_version('planner-jax') or 'of a source tree'}"
+    version = f"planner-jax {find_version('planner-jax') or 'of a source tree'}"
     parser.add_argument("--version", action="version", version=version)
     commands = parser.add_subparsers(title="commands", required=True, metavar="command")
 

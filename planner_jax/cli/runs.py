@@ -128,7 +128,7 @@ def _train(given: Options) -> None:
     except ModuleNotFoundError as error:
         raise MissingExtra("train", error.name, "policies") from None
     rest = functools.partial(
-        _how_to_continue, Path(out), f"go on with: {_own_command()}", "training.json"
+        _how_to_continue, Path(out), f"continue with: {_quote_command()}", "training.json"
     )
     with stopping.under_way(rest), _tell_how_to_continue(rest):
         train_from_settings(settings, out)
@@ -141,7 +141,7 @@ def report(options: Options) -> None:
 
     folder = RunFolder(options["run"], "RUN")
     manifest = folder.read_manifest()
-    with folder.owned():
+    with folder.lock():
         if str(manifest["kind"]).startswith("fly "):
             from planner_jax.sims.run import require_sound, write_flight_report
 
@@ -158,7 +158,7 @@ def report(options: Options) -> None:
 
 def compare(options: Options) -> None:
     """Print a comparison of runs, and write it as a table if asked."""
-    from planner_jax.sweep.compare import as_csv, described, read_run, require_comparable
+    from planner_jax.sweep.compare import as_csv, describe, read_run, require_comparable
 
     out = pop_out(options, "file")
     if out is not None:
@@ -168,7 +168,7 @@ def compare(options: Options) -> None:
             raise ArgumentError("out", problem, out)
     runs = [read_run(path) for path in options["runs"]]
     require_comparable(runs)
-    print("\n".join(described(runs, None if options["all"] else 10)))
+    print("\n".join(describe(runs, None if options["all"] else 10)))
     if out is not None:
         with replacing(out) as scratch:
             scratch.write_text(as_csv(runs), encoding="utf-8")
@@ -209,7 +209,7 @@ def _name_run_folder(name: str) -> str:
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
-def _own_command() -> str:
+def _quote_command() -> str:
     """Return the command of this process, as a shell takes it."""
     return shlex.join(["planner-jax", *sys.argv[1:]])
 
@@ -268,7 +268,9 @@ def _library(name: str, given: Options) -> None:
     keep_compiled_programs()
     run = pkgutil.resolve_name(f"planner_jax.baselines.block.library.command:{name}_library")
     parts = Path(f"{given['path']}.parts")
-    rest = functools.partial(_how_to_continue, parts, f"go on with: {_own_command()}", "what.json")
+    rest = functools.partial(
+        _how_to_continue, parts, f"continue with: {_quote_command()}", "what.json"
+    )
     rule = "FILE must be one that can be written"
     with stopping.under_way(rest, patient=False), _tell_how_to_continue(rest, rule):
         run(**given)

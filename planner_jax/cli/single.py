@@ -53,7 +53,7 @@ def _plan(task: Task, given: Options) -> int:
         from planner_jax.export.setpoints import setpoints_of
 
         setpoints_of(answer.plan, rate)  # raises for a rate that the plan cannot have
-    print("\n".join(single.described(answer)))
+    print("\n".join(single.describe(answer)))
     if out is not None:
         _write_answer(task, settings.planner, answer, Path(out), rate)
     return 0 if answer.success else FAILED
@@ -133,9 +133,9 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
     """Return the plan of a row of a sweep or a file, and the referee's objection, if known."""
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
-        from planner_jax.sweep.rows import planned_row
+        from planner_jax.sweep.rows import read_plan
 
-        return planned_row(RunFolder(source, name="RUN"), row)
+        return read_plan(RunFolder(source, name="RUN"), row)
     from planner_jax.export.setpoints import load_plan
 
     if not os.path.exists(source):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import option, require_count
-from planner_jax.sweep.quadrotor_settings import checked_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.hit.spec import DRAG
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class HitServe(ServeSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, "racket"))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, "racket"))
         require(len(self.target) == 3, "target", "3 numbers", len(self.target))
         for value in self.target:
             require(abs(value) <= 100.0, "target", "within 100 m", value)
@@ -79,7 +79,7 @@ class CatchServe(ServeSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "robot", checked_robot(self.robot, "net"))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, "net"))
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
     def stroke(self) -> "CatchStroke":

@@ -16,7 +16,7 @@ _PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # that decide ro
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
-def installed_version(name: str) -> str | None:
+def find_version(name: str) -> str | None:
     """Return the version of a package; None where it is used without being installed."""
     try:
         return metadata.version(name)
@@ -45,7 +45,7 @@ def environment() -> Entries:
     return {
         "versions": {
             "python": platform.python_version(),
-            **{name: installed_version(name) for name in (*_PACKAGES, "pyarrow")},
+            **{name: find_version(name) for name in (*_PACKAGES, "pyarrow")},
         },
         "code": code_digest(),
         "git_commit": _git_commit(),

@@ -50,7 +50,7 @@ class RunFolder:
         """Raise `ArgumentError` unless a run may be written here; writes no run."""
         try:
             if (self.path / LOCK).exists():
-                with self._locked():
+                with self._hold_lock():
                     pass
             if self.path.is_dir():
                 self._require_empty()
@@ -61,14 +61,14 @@ class RunFolder:
             raise self._unwritable()
 
     @contextlib.contextmanager
-    def created(self, manifest: Entries) -> Iterator[None]:
+    def create(self, manifest: Entries) -> Iterator[None]:
         """Make the folder with its first manifest, and own it for the length of the block.
 
         Raises:
             ArgumentError: the folder cannot be made, or is not new any more.
         """
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
-        with self.owned():
+        with self.lock():
             self._require_empty()  # another process may have been quicker
             try:
                 self.write_manifest(manifest)
@@ -78,7 +78,7 @@ class RunFolder:
             yield
 
     @contextlib.contextmanager
-    def owned(self) -> Iterator[None]:
+    def lock(self) -> Iterator[None]:
         """Make the folder if it is not there, and own it for the length of the block.
 
         Raises:
@@ -89,18 +89,18 @@ class RunFolder:
         except OSError as error:
             self._remove_made()
             raise self._unwritable(error) from None
-        with self._locked():
+        with self._hold_lock():
             self._remove_scratch()
             yield
 
     @contextlib.contextmanager
-    def _locked(self) -> Iterator[None]:
+    def _hold_lock(self) -> Iterator[None]:
         """Hold the lock, whose file says who holds it."""
         with contextlib.ExitStack() as opened:
             try:
                 handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
                 opened.callback(os.close, handle)
-                self._lock(handle)
+                self._acquire(handle)
                 since = datetime.datetime.now().astimezone().isoformat(timespec="seconds")
                 owner = f"{os.getpid()} on {socket.gethostname()}, since {since}"
                 os.ftruncate(handle, 0)
@@ -109,7 +109,7 @@ class RunFolder:
                 raise self._unwritable(error) from None
             yield
 
-    def _lock(self, handle: int) -> None:
+    def _acquire(self, handle: int) -> None:
         """Lock an open file; a process that only looks whether a folder is free is waited for."""
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
@@ -134,7 +134,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, str(self.path))
 
     def discard(self) -> None:
-        """Remove all that was written since `created`, and the folders made for it."""
+        """Remove all that was written since `create`, and the folders made for it."""
         for path in self.path.iterdir() if self.path.is_dir() else ():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)

@@ -92,7 +92,7 @@ class DrawnSource(Source):
         return {"suite": {"name": self.settings.suite, "sha256": digest.hexdigest()}}
 
 
-def filled_in(settings: SweepSettings, num: int, batch: int) -> Entries:
+def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
     """Return fields of a `Source`; `num` and `batch` are used where the settings name none.
 
     Raises:

@@ -17,7 +17,7 @@ class RateTable(NamedTuple):
     strong: int | None = None  # the row that stands out
 
 
-def own_cells(successes: int, num: int) -> list[str]:
+def rate_cells(successes: int, num: int) -> list[str]:
     """Return cases, success in percent and its interval, the run's own cells of a row."""
     low, high = wilson_interval(successes, num)
     return [

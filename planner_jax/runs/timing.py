@@ -70,7 +70,7 @@ class Stopwatch:
         return self._last - last
 
 
-def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
+def measure(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
     """Return a call's result, its seconds, and whether nothing was compiled meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
@@ -78,21 +78,21 @@ def timed(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
     return found, watch.lap(), not clock.compiled
 
 
-def timed_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
+def measure_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
     """Return what a call gives, and the seconds that it takes once nothing is compiled.
 
     One that compiles something in every call is timed with that.
     """
     for _ in range(_WARM_CALLS - 1):
-        found, seconds, warm = timed(call)
+        found, seconds, warm = measure(call)
         if warm:
             return found, seconds
-    return timed(call)[:2]
+    return measure(call)[:2]
 
 
-def timed_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
+def measure_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
     """Return plans of cases (B,), made one after another, and their warm seconds (B,)."""
     num = jax.tree.leaves(cases)[0].shape[0]
-    timed_each = [timed_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
+    timed_each = [measure_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *plans), np.array(seconds)

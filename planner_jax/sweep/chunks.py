@@ -26,7 +26,7 @@ from planner_jax.runs.manifest import Entries, digest_of
 from planner_jax.runs.settings import SweepSettings
 from planner_jax.runs.source import Chunk, Source
 from planner_jax.runs.summary import percent
-from planner_jax.runs.timing import CompileClock, Stopwatch, timed, timed_warm
+from planner_jax.runs.timing import CompileClock, Stopwatch, measure, measure_warm
 from planner_jax.sweep.sweep import Sweep
 
 _UNDER_WAY = 2  # chunks that are judged or written while the next is planned
@@ -88,7 +88,7 @@ class Maker:
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
         """Plan a chunk; what the clock has counted since its last lap is its compilation."""
-        plans, seconds, warm = timed(lambda: self.sweep.plan(self.planner, chunk.cases))
+        plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,
             "number": int(chunk.index[0]) // self.source.batch,
@@ -190,7 +190,7 @@ def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))
     if 2 * num < min(maker.source.batch, maker.source.num):
         chunk = maker.source.chunk(0)
-        _, seconds = timed_warm(lambda: maker.sweep.plan(maker.planner, chunk.cases))
+        _, seconds = measure_warm(lambda: maker.sweep.plan(maker.planner, chunk.cases))
         num = len(chunk)
     found = {
         "compile_seconds": sum(part["compile_seconds"] for part in parts),

@@ -16,7 +16,7 @@ from planner_jax.runs.manifest import Entries
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.table import align
-from planner_jax.sweep.report import finished_sweep
+from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 
 # Columns of the rows that are read, which all sweeps have.
@@ -72,7 +72,7 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
         ArgumentError: the folder is not that of a whole, finished sweep.
     """
     folder = RunFolder(path, name="RUN")
-    manifest, sweep = finished_sweep(folder)
+    manifest, sweep = read_finished(folder)
     with folder.reading_rows():
         rows = folder.plans.read(_READ)
     kinds = {"index": int, "success": bool, "failed_limit": str, "cost": float, "iterations": float}
@@ -179,7 +179,7 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
     return [(int(index[k]), [str(run.failed_limit[k]) for run in runs]) for k in places]
 
 
-def described(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
+def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
     """Return the comparison as lines of text; list at most `most` cases that differ."""
     first, *others = runs
     own, rows = first.settings, table_of(runs)

@@ -29,7 +29,7 @@ def robot_option(usual: str) -> Any:
     return option(None, "NAME", words)
 
 
-def checked_robot(given: object, tool: str) -> "QuadrotorModel | None":
+def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
     """Return the `QuadrotorModel` that a setting names, or None without one.
 
     Raises:
@@ -78,7 +78,7 @@ class QuadrotorSettings(SweepSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_scale(self.limit_scale)
-        object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL))
         require_one_of(EFFORTS, "effort", self.effort)
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT

@@ -26,7 +26,7 @@ def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
     return tally
 
 
-def finished_sweep(folder: RunFolder) -> tuple[Entries, Sweep]:
+def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
     """Return manifest and sweep of a folder after a check of the manifest and all parts.
 
     Raises:
@@ -46,7 +46,7 @@ def finished_sweep(folder: RunFolder) -> tuple[Entries, Sweep]:
 
 def require_sound(folder: RunFolder) -> None:
     """Raise `ArgumentError` unless a sweep's rows are whole, and its summary counts them."""
-    manifest, sweep = finished_sweep(folder)
+    manifest, sweep = read_finished(folder)
     parameters = manifest["parameters"]
     settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
     with folder.reading_rows():
@@ -81,7 +81,7 @@ def write_report(folder: RunFolder) -> None:
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     folder.figures.mkdir(exist_ok=True)
-    failed = _failed_rows(folder.plans)
+    failed = _pick_failures(folder.plans)
     rows = RunRows(folder, manifest, failed)
     for figure in sweep.figures:
         draw(folder.figures / figure.name, figure.draw, figure.size, rows)
@@ -91,7 +91,7 @@ def write_report(folder: RunFolder) -> None:
     folder.write_text("index.html", _page(sweep, manifest, lines, failed))
 
 
-def _failed_rows(plans: Dataset) -> list[Row]:
+def _pick_failures(plans: Dataset) -> list[Row]:
     """Return the first failures, a few."""
     failed, first = [], 0
     for rows in plans.parts(["success"]):

@@ -15,7 +15,7 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.runs.settings import settings_of_manifest
-from planner_jax.sweep.report import finished_sweep
+from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
@@ -34,7 +34,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
         ArgumentError: the folder is not that of a whole, finished sweep, or the case that is read
             or drawn now is another one.
     """
-    manifest, sweep = finished_sweep(folder)
+    manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
     if sweep.setting(cases) != manifest["setting"]:
@@ -43,13 +43,13 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     return take(cases, 0)
 
 
-def planned_row(folder: RunFolder, row: int | None) -> PlannedRow:
+def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
     """Return the plan of a row of a run, and what the referee says against it.
 
     Raises:
         ArgumentError: the folder is not that of a whole, finished sweep, or there is no such row.
     """
-    manifest, sweep = finished_sweep(folder)
+    manifest, sweep = read_finished(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row

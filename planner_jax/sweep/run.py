@@ -82,7 +82,7 @@ def start_sweep(
             "planner": {"name": source.settings.planner, **_fields_of(maker.planner)},
             "sessions": [session],
         }
-        with folder.created(manifest):
+        with folder.create(manifest):
             return _finish(folder, manifest, maker, {}, others, progress)
 
 
@@ -116,7 +116,7 @@ def resume_sweep(
     """
     folder, sweep = RunFolder(out), sweep_of(task)
     _settings_of_run(folder, sweep, given)
-    with workers_of(workers) as others, folder.owned():
+    with workers_of(workers) as others, folder.lock():
         manifest, settings = _settings_of_run(folder, sweep, given)
         there = _sound_parts(folder, manifest)
         num, batch = settings.num or 1, settings.batch or 1

@@ -20,9 +20,9 @@ from planner_jax.runs.columns import Column, RefereedBatch, leaf_columns
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.run_folder import RunRows
 from planner_jax.runs.settings import AnySettings, SweepSettings
-from planner_jax.runs.source import DrawnSource, Source, filled_in
+from planner_jax.runs.source import DrawnSource, Source, fill_in
 from planner_jax.runs.summary import Tally
-from planner_jax.runs.table import RateTable, own_cells
+from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.sweep.figures import outcomes_figure
 
 
@@ -104,7 +104,7 @@ class Sweep(Generic[AnySettings]):
         Raises:
             ArgumentError: the settings ask for what is not there.
         """
-        return DrawnSource(**filled_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
+        return DrawnSource(**fill_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
     def plan(self, planner: Planner, cases: PyTree) -> PyTree:
         """Return the plans of a batch."""
@@ -136,7 +136,7 @@ class Sweep(Generic[AnySettings]):
         """Return success rates."""
         summary, settings = manifest["summary"], manifest["parameters"]
         header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
-        cells = own_cells(summary["successes"], summary["num"])
+        cells = rate_cells(summary["successes"], summary["num"])
         return RateTable("Success", header, [[settings["suite"], *cells]])
 
     def findings(self, manifest: Entries) -> list[str]:

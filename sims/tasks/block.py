@@ -12,7 +12,7 @@ from planner_jax.runs.columns import BOOL, LIST, NUMBER, TEXT, Column, leaves_of
 from planner_jax.runs.style import draw
 from planner_jax.runs.summary import percent
 from planner_jax.runs.table import RateTable
-from planner_jax.runs.timing import timed
+from planner_jax.runs.timing import measure
 from planner_jax.sims.execution import FRAME
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Recording
@@ -136,7 +136,7 @@ class BlockFlight(FlightTask):
                 frame_rate=settings.frame_rate,
                 seed=settings.seed,
             )
-            decided, seconds, _ = timed(lambda: arms.decided(cases.cases))
+            decided, seconds, _ = measure(lambda: arms.decided(cases.cases))
         flights = fly_blocks(
             BLOCK_WORLD,
             cases,

@@ -21,7 +21,7 @@ from planner_jax.core.protocol import is_solved
 from planner_jax.referee.arm_clearance import clearances, links_of, shield_middle
 from planner_jax.referee.block import times_inside
 from planner_jax.referee.solids import from_segment, rotate, rotate_back
-from planner_jax.runs.timing import timed_plans
+from planner_jax.runs.timing import measure_plans
 from planner_jax.sims.execution import FRAME, TIMESTEP, Executed, execute
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
@@ -174,7 +174,7 @@ def fly_blocks(
     if decided is not None:
         plan = decided.plans
     if plan is None:
-        made: tuple[BlockPlan, np.ndarray] = timed_plans(planner or block_planner(), case)
+        made: tuple[BlockPlan, np.ndarray] = measure_plans(planner or block_planner(), case)
         plan, seconds = made
     seconds = np.zeros(len(cases)) if seconds is None or planning_budget is None else seconds
     budget = planning_budget or 0.0

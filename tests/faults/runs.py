@@ -64,7 +64,7 @@ def make_flights(out: Path) -> None:
         },
     }
     folder = RunFolder(out)
-    with folder.owned():
+    with folder.lock():
         Dataset(out / FLIGHTS).write_rows(to_rows(recording()))
         folder.plans.write_rows(pa.table({"index": [0]}))
         folder.write_manifest(manifest)

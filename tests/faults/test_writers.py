@@ -107,7 +107,7 @@ def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path):
 
 def test_the_second_writer_is_refused_and_told_of_the_first(runs, tmp_path):
     out = tmp_path / "run"
-    with RunFolder(out).owned():
+    with RunFolder(out).lock():
         shutil.copytree(runs / "whole" / "plans", out / "plans")
         for arguments in (COMMAND, ("sweep", "hit", "--resume", "--out")):
             (out / "manifest.json").write_bytes((runs / "whole" / "manifest.json").read_bytes())
@@ -126,7 +126,7 @@ def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
 
     def hold(number):
         barrier.wait()
-        with contextlib.suppress(ArgumentError), RunFolder(tmp_path).owned():
+        with contextlib.suppress(ArgumentError), RunFolder(tmp_path).lock():
             won.append(number)
             barrier.wait()
             return

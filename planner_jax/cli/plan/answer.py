@@ -94,7 +94,7 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return when and where the contact is, a sentence each."""
 
     @abc.abstractmethod
-    def own_margins(self, answer: Answer) -> list[Margin]:
+    def task_margins(self, answer: Answer) -> list[Margin]:
         """Return margins of the limits that quadrotors of other tasks do not have."""
 
     def answer(self) -> Answer:
@@ -115,7 +115,7 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return a field of the case and the setting that decides it."""
         return field, self.NAMES.get(field, field.rpartition(".")[2])
 
-    def described(self, answer: Answer) -> list[str]:
+    def describe(self, answer: Answer) -> list[str]:
         """Return the answer as lines of text."""
         status = Status(int(answer.plan.status))
         sentence = answer.verdict.sentence()
@@ -129,11 +129,11 @@ class Single(abc.ABC, Generic[SingleT]):
 
     def margins(self, answer: Answer) -> list[Margin]:
         """Return how close the plan comes to each limit that the case has."""
-        of_flight = _of_flight(answer, sampled(answer.plan))
-        return [*of_flight, *_of_rotors(answer), *self.own_margins(answer)]
+        of_flight = _of_flight(answer, sample_plan(answer.plan))
+        return [*of_flight, *_of_rotors(answer), *self.task_margins(answer)]
 
 
-def sampled(found: QuadrotorPlan) -> SampledMotion:
+def sample_plan(found: QuadrotorPlan) -> SampledMotion:
     """One plan of a quadrotor with its way to rest, if it has one, at even times."""
     coeffs, durations = _pieces(found)
     return sample_motion(coeffs.ravel(), durations, _SAMPLES)

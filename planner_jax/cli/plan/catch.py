@@ -53,7 +53,7 @@ class SingleCatch(Single[SingleCatchSettings]):
             )
         return lines
 
-    def own_margins(self, answer: Answer) -> list[Margin]:
+    def task_margins(self, answer: Answer) -> list[Margin]:
         """Return the margins of net, angle and horizon, each at the closest catch."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)

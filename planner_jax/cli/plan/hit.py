@@ -33,7 +33,7 @@ class SingleHit(Single[SingleHitSettings]):
             f"at {before:.2f} m/s, leaves at {after:.2f} m/s, and lands at {lands:.3f} s."
         ]
 
-    def own_margins(self, answer: Answer) -> list[Margin]:
+    def task_margins(self, answer: Answer) -> list[Margin]:
         """Return margins of the racket, of the speed at the impact and of the apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))

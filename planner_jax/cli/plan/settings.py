@@ -11,7 +11,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option, recovery_option, recovery_options, require_recovery
-from planner_jax.sweep.quadrotor_settings import checked_robot, robot_option
+from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
@@ -46,7 +46,7 @@ class SingleSettings:
     TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "robot", checked_robot(self.robot, self.TOOL))
+        object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL))
         require_recovery(self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]

@@ -20,7 +20,7 @@ from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.timing import timed_plans
+from planner_jax.runs.timing import measure_plans
 from planner_jax.studies.block.contact_check import delay_motion
 from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
@@ -52,7 +52,7 @@ class CountedPlanner(Planner[BlockCase, TimedPlan]):
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
         """Return the plans of a batch, up to where they meet the balls."""
-        plans, spent = timed_plans(self.planner, cases)
+        plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)
         return jax.tree.map(np.asarray, TimedPlan(**vars(met), planning_time=host_leaf(spent)))

@@ -54,7 +54,7 @@ class SampledCatch(NamedTuple):
     catches: np.ndarray  # (n,) places of the n catches among the times
 
 
-def sampled_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
+def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
     """Return a row whose plan has been sampled, with the physics of the manifest's `setting`."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
@@ -87,7 +87,7 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
     """Draw the example from the side and from above, with a close-up of every catch."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
-    plan = sampled_catch(row, motion, setting)
+    plan = sample_catch(row, motion, setting)
     ((left, right),) = figure.subfigures(1, 2, squeeze=False, width_ratios=[3.0, 1.6])
     low, high = _window(plan)
     views = left.subplots(2, 1, sharex=True, height_ratios=(high - low)[[2, 1]])
@@ -174,7 +174,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
 def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
     """Draw distance of the net to the target that it catches next."""
     for plan in plans:
-        away = due_distance(sampled_catch(plan.row, plan.motion, setting))
+        away = due_distance(sample_catch(plan.row, plan.motion, setting))
         axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)
         caught = np.maximum(np.array(plan.row["net_distance"], float), _LEAST_DISTANCE)
         axes.plot(plan.row["catch_times"], caught, "o", color=plan.look["color"], markersize=5)

@@ -7,7 +7,7 @@ from jaxtyping import PyTree
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.table import RateTable, own_cells
+from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures import flight_figure, motion_figure
 from planner_jax.sweep.catch.settings import CatchSettings
@@ -109,7 +109,7 @@ class CatchSweep(Sweep[CatchSettings]):
             own = ["", "", "", ""]
             if place == strong:
                 ratio = _number(summary["optimal_time_ratio"], 3)
-                own = [*own_cells(summary["successes"], summary["num"]), ratio]
+                own = [*rate_cells(summary["successes"], summary["num"]), ratio]
             suite = SUITES.get(name)
             paper = [None if suite is None else vars(suite)[word] for word in words]
             rows.append([name, *own, *map(_number, paper, (1, 3, 1))])

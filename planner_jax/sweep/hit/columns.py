@@ -16,12 +16,12 @@ _POINT = list_of(pa.float64(), 3)
 _names = lambda b: np.array(court.SCENARIOS)[b.chunk.origin.scenario]  # noqa: E731
 
 
-def published_column(planner: str) -> str:
+def name_outcome_column(planner: str) -> str:
     """Name of the column with the published outcomes of a planner."""
     return f"published_{planner.replace('-', '_')}"
 
 
-def _published(place: int, planner: str) -> Column:
+def _outcome_column(place: int, planner: str) -> Column:
     def values(batch: known.RefereedBatch) -> pa.Array | None:
         if (found := cast(Serves, batch.chunk.origin).published) is None:
             return None
@@ -29,7 +29,7 @@ def _published(place: int, planner: str) -> Column:
         return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
 
     meaning = "published outcome, null where there is none"
-    return Column(published_column(planner), "", meaning, BOOL, values)
+    return Column(name_outcome_column(planner), "", meaning, BOOL, values)
 
 
 COLUMNS = [
@@ -68,7 +68,7 @@ COLUMNS = [
     ),
     *MOTION,
     *TRAJECTORY,
-    *(_published(*place) for place in enumerate(court.PLANNERS)),
+    *(_outcome_column(*place) for place in enumerate(court.PLANNERS)),
 ]
 
 _ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")

@@ -48,7 +48,7 @@ class HitSettings(QuadrotorSettings):
         require(0.0 <= self.delay < math.inf, "delay", "finite and >= 0", self.delay)
         truer = not self.drag_after_impact or self.planner in (None, "exact")
         require(truer, "drag_after_impact", "left out unless the planner is exact", self.planner)
-        object.__setattr__(self, "start", _checked_start(self.start))
+        object.__setattr__(self, "start", _check_start(self.start))
         if self.serves is not None:
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 
@@ -58,7 +58,7 @@ class HitSettings(QuadrotorSettings):
         return super().planner_options() | truer
 
 
-def _checked_start(start: str | Iterable[float]) -> tuple[float, ...] | str:
+def _check_start(start: str | Iterable[float]) -> tuple[float, ...] | str:
     rule = f"three finite numbers with z > 0, none beyond {_FARTHEST:g}, or 'uniform'"
     if start in ("uniform", ["uniform"]):
         return "uniform"

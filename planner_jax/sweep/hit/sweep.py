@@ -14,11 +14,11 @@ from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.source import Chunk, Source, filled_in
+from planner_jax.runs.source import Chunk, Source, fill_in
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.table import RateTable, own_cells
+from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.sweep.figures import CAPTION as MOTION
-from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, published_column
+from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, name_outcome_column
 from planner_jax.sweep.hit.figures import court_figure, motion_figure, path_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.quadrotor import recovery_remark
@@ -72,7 +72,7 @@ class ServeSource(Source):
         return {"serves": known}
 
 
-def compared_with(planner: str) -> str:
+def choose_reference(planner: str) -> str:
     """Return the published planner that a planner's rates stand beside: itself, or else bat."""
     return planner if planner in court.PLANNERS else "bat"
 
@@ -80,7 +80,7 @@ def compared_with(planner: str) -> str:
 class HitTally(Tally):
     """Counts by scenario too; the example is from the left to the far target (002, Fig. 7)."""
 
-    READS = (*COUNTED, "scenario", *map(published_column, court.PLANNERS))
+    READS = (*COUNTED, "scenario", *map(name_outcome_column, court.PLANNERS))
 
     def __init__(self) -> None:
         super().__init__()
@@ -96,7 +96,7 @@ class HitTally(Tally):
         self._num.update(scenario)
         self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
         for planner in court.PLANNERS:
-            outcome = rows[published_column(planner)]
+            outcome = rows[name_outcome_column(planner)]
             known = outcome.is_valid().to_numpy().astype(bool)
             solved = outcome.fill_null(False).to_numpy().astype(bool)
             self._num_published.update((planner, name) for name in scenario[known])
@@ -163,7 +163,7 @@ class HitSweep(Sweep[HitSettings]):
             rule = f"<= {len(folder)}, the serves that the folder holds"
             raise ArgumentError("num", rule, settings.num)
         num = settings.DEFAULT_NUM if folder is None else len(folder)
-        return ServeSource(**filled_in(settings, num, batch), folder=folder)
+        return ServeSource(**fill_in(settings, num, batch), folder=folder)
 
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases have in common, for the manifest."""
@@ -176,9 +176,9 @@ class HitSweep(Sweep[HitSettings]):
         return quadrotor_plan(row, setting)
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success per scenario in percent, beside the published rates of `compared_with`."""
+        """Return success per scenario in percent, beside the rates of a published planner."""
         planner, summary = manifest["parameters"]["planner"], manifest["summary"]
-        other = compared_with(planner)
+        other = choose_reference(planner)
         published, column = read_published_rates(), court.PLANNERS.index(other)
         beside = [rates[:, column] for rates in (published.paper, published.trials)]
         header = ["scenario", "cases", f"{planner} %", "95 % interval"]
@@ -188,7 +188,7 @@ class HitSweep(Sweep[HitSettings]):
         rows, known, solved = [], 0, 0.0
         for place, name in enumerate(court.SCENARIOS):
             counts = summary["per_scenario"].get(name)
-            own = own_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
+            own = rate_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
             row = [name, *own, *(f"{rates[place]:.1f}" for rates in beside)]
             if same:
                 rate = counts["published_on_these_serves"].get(other) if counts else None
@@ -196,7 +196,7 @@ class HitSweep(Sweep[HitSettings]):
                 if rate is not None:
                     known, solved = known + counts["num"], solved + counts["num"] * rate
             rows.append(row)
-        total = ["all", *own_cells(summary["successes"], summary["num"])]
+        total = ["all", *rate_cells(summary["successes"], summary["num"])]
         total += [f"{rates.mean():.2f}" for rates in beside]
         total += [f"{100.0 * solved / known:.2f}"] if same else []
         return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
@@ -204,7 +204,7 @@ class HitSweep(Sweep[HitSettings]):
     def remarks(self, manifest: Entries) -> list[str]:
         """Return where the numbers come from, a sentence each."""
         summary, settings = manifest["summary"], manifest["parameters"]
-        other, start = compared_with(settings["planner"]), settings["start"]
+        other, start = choose_reference(settings["planner"]), settings["start"]
         law = f"drawn from the published law, suite {settings['suite']}, seed {settings['seed']}"
         origin = "cases of published trial files" if settings["serves"] else law
         start = "uniform over the half court" if start == "uniform" else f"{tuple(start)} m"

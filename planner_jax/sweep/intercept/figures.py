@@ -61,14 +61,14 @@ class SampledDrive:
         return pose[:2] + corners @ np.array([[cos, sin], [-sin, cos]])
 
 
-def sampled_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
+def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
     """Return a row at so many even times, with the manifest's `setting`."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
     end = jnp.asarray(row["meeting_time"], jnp.float32)
     shares = jnp.linspace(0.0, 1.0, num)
-    found = _sampled(start, end, speed, curvature, shares)
+    found = _sample(start, end, speed, curvature, shares)
     sampled = {name: np.array(leaf) for name, leaf in found.items()}
     direction = np.stack([np.cos(sampled["pose"][:, 2]), np.sin(sampled["pose"][:, 2])], axis=1)
     ahead = 0.5 * setting["body_length"] - setting["body_rear_overhang"]
@@ -94,7 +94,7 @@ def _polygons(row: Row, kind: str) -> list[np.ndarray]:
 
 
 @jax.jit
-def _sampled(
+def _sample(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
     """Return fields of `SampledDrive` of one plan at shares (K,) of its time, by name."""
@@ -117,7 +117,7 @@ _STOPS = ("#440154", "#443983", "#31688E", "#21918C", "#35B779", "#90D743")
 def plane_figure(figure: Figure, run: RunRows) -> None:
     """Draw the run's example and cases beside it."""
     setting = run.manifest["setting"]
-    drives = [sampled_drive(row, setting, _SAMPLES) for row in chosen(run)]
+    drives = [sample_drive(row, setting, _SAMPLES) for row in chosen(run)]
     latest = max(drive.row["due_time"] for drive in drives)
     colours = ScalarMappable(Normalize(0.0, latest), colours_of_time())
     num_rows = -(-len(drives) // _COLUMNS)
@@ -258,7 +258,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
     plans, setting = run.same_case(), run.manifest["setting"]
     panels = figure.subplots(2, 3, sharex=True)
     drives = [
-        (sampled_drive(row, setting, _CURVE_SAMPLES), look_of(place, name, row))
+        (sample_drive(row, setting, _CURVE_SAMPLES), look_of(place, name, row))
         for place, (name, row) in enumerate(plans)
     ][::-1]
     axes = panels[0, 0]
