@@ -1,4 +1,4 @@
-"""The process of the command `planner-jax`: hears signals before anything large is imported."""
+"""Entry point of the command `planner-jax`: handles signals before anything large is imported."""
 
 import importlib.util
 import os
@@ -8,31 +8,31 @@ from planner_jax.host import signals as stopping
 
 
 def run() -> None:
-    """Carry out the command of the process's arguments, and end the process."""
+    """Run the command in the process's arguments, and end the process."""
     stopping.listen()
     if sys.argv[1:2] == ["sweep"] and _is_on_cpu():
-        # Chunks keep the cores busy. Rows would depend on the number of cores, which is that of
-        # the threads of each computation if nothing else is said.
+        # Chunks keep the cores busy. By default a computation has one thread for each core, so
+        # that rows would depend on the number of cores.
         os.environ.setdefault("PJRT_NPROC", os.environ.get("NPROC", "1"))
     try:
         from planner_jax.cli.main import main
 
         code = main()
     except Exception:
-        if stopping.is_told():  # whatever a stop may break is no news
+        if stopping.is_stopped():  # errors that a stop causes are not reported
             stopping.leave()
         raise
-    if stopping.is_told():
+    if stopping.is_stopped():
         stopping.leave()
     sys.exit(code)
 
 
 def _is_on_cpu() -> bool:
-    """Whether JAX will compute on a CPU; False where it depends on the machine's devices.
+    """Return whether JAX will certainly compute on a CPU.
 
-    With one thread, programs of a GPU would be compiled one after another.
+    On a GPU one thread would compile programs one after another.
     """
-    plugins = importlib.util.find_spec("jax_plugins")  # where JAX, too, looks for other devices
+    plugins = importlib.util.find_spec("jax_plugins")  # JAX finds other devices in this package
     return plugins is None or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 

@@ -95,7 +95,7 @@ def start_flights(
         "loop": flight.parameters(),
         "video": video,
     }
-    rest: dict[str, Any] = {"rest": lambda: _dropped(folder), "patient": False, "bar": False}
+    rest: dict[str, Any] = {"remainder": lambda: _dropped(folder), "patient": False, "bar": False}
     with folder.create(manifest), stopping.under_way(**rest):
         try:
             return _fly_into(folder, manifest, flight, cases, min(record, settings.num))

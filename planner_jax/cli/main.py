@@ -42,7 +42,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         flags = options.pop("flags")
         return options.pop("command")(options) or 0
     except KeyboardInterrupt as stop:
-        if stopping.is_told():
+        if stopping.is_stopped():
             stopping.leave()
         print(f"planner-jax: {str(stop) or 'interrupted'}", file=sys.stderr)
         return _INTERRUPTED

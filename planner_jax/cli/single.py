@@ -182,7 +182,7 @@ def _serve(settings: ServeSettings) -> None:
     with stopping.under_way(rest, bar=False), contextlib.closing(server):
         print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
         ends = time.monotonic() + (settings.seconds or math.inf)
-        server.run(lambda: not stopping.is_told() and time.monotonic() < ends)
+        server.run(lambda: not stopping.is_stopped() and time.monotonic() < ends)
         print("\n".join(report.lines() if settings.report else [report.headline()]), flush=True)
         stopping.check()
 

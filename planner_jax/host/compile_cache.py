@@ -1,4 +1,4 @@
-"""Compiled programs kept from run to run, so that only the first run waits for the compiler."""
+"""Keep compiled programs on the disk, so that only the first run waits for the compiler."""
 
 import os
 import warnings
@@ -6,20 +6,20 @@ from pathlib import Path
 
 
 def cache_folder() -> Path:
-    """Where compiled programs are kept: JAX_COMPILATION_CACHE_DIR, or the user's cache."""
+    """Return the folder of compiled programs: JAX_COMPILATION_CACHE_DIR, or the user's cache."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.join("~", ".cache")
     default = os.path.join(os.path.expanduser(home), "planner-jax", "jax")
     return Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or default)
 
 
 def keep_compiled_programs() -> Path | None:
-    """Let JAX keep what it compiles in `cache_folder`, and find it there again.
+    """Let JAX write compiled programs to `cache_folder` and read them from there.
 
-    The command line and the benchmarks do so. In a program of your own call it once, before
-    the first plan.
+    The command line and the benchmarks call this function. In a program of your own call it once,
+    before the first plan.
 
     Returns:
-        The folder, or None where it cannot be made.
+        The folder, or None if it cannot be created.
     """
     import jax
 

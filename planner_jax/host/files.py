@@ -10,12 +10,12 @@ from typing import BinaryIO
 
 
 def open_plain(path: str | os.PathLike) -> BinaryIO:
-    """A file, open to read bytes.
+    """Open a file to read bytes.
 
     Raises:
-        OSError: it cannot be opened, or it is a folder, a pipe or a device.
+        OSError: the file cannot be opened, or it is a folder, a pipe or a device.
     """
-    # Opening a pipe waits for a writer, if it is not told not to.
+    # Without O_NONBLOCK, opening a pipe waits for a writer.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):
         os.close(handle)
@@ -25,16 +25,17 @@ def open_plain(path: str | os.PathLike) -> BinaryIO:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """A scratch file that takes the place of a file once the block has ended well.
+    """Provide a scratch file that replaces a file when the block ends without an error.
 
-    It is on the disk before it does so, and its new name before the block is left. Its own name
-    holds the number of the process and ends in that of the file, by which some tell its format.
+    The scratch file is flushed to the disk before it is renamed, and the folder afterwards. Its
+    name holds the number of the process, and ends with the name of the file, because some writers
+    derive the format from the suffix.
 
     Args:
-        path: of the file.
+        path: file to replace.
 
     Raises:
-        OSError: the file cannot be written; its `filename` is the path.
+        OSError: the file cannot be written; its `filename` is `path`.
     """
     place = Path(path)
     scratch = place.with_name(f".{os.getpid()}.tmp.{place.name}")
@@ -45,7 +46,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
         to_disk(place.parent)
     except OSError as error:
         if error.filename not in (None, scratch, os.fspath(scratch)):
-            raise  # of another file that the block reads or writes
+            raise  # the error is of another file that the block reads or writes
         raise OSError(error.errno, error.strerror or str(error), os.fspath(place)) from error
     finally:
         with contextlib.suppress(OSError):
@@ -53,7 +54,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def new_file_problem(path: str | os.PathLike) -> str:
-    """What a path must be, in words, if no new file can be made there; "" if one can."""
+    """Return what a path must be for a new file to be created there; "" if one can be."""
     place = Path(path)
     if os.path.lexists(place):
         return "a new file"
@@ -63,7 +64,7 @@ def new_file_problem(path: str | os.PathLike) -> str:
 
 
 def to_disk(path: Path) -> None:
-    """Wait until a file, or the names in a folder, would outlast a loss of power."""
+    """Flush a file, or the names in a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -72,6 +73,6 @@ def to_disk(path: Path) -> None:
 
 
 def is_scratch(path: Path) -> bool:
-    """Whether a file is what `replacing` leaves where its process is killed."""
+    """Return whether `replacing` left a file because its process was killed."""
     first, _, rest = path.name.removeprefix(".").partition(".")
     return path.name.startswith(".") and first.isdigit() and rest.startswith("tmp.")

@@ -19,7 +19,7 @@ _CGROUP = Path("/sys/fs/cgroup")  # of a container, version 2
 
 
 def available_memory() -> int | None:
-    """Return the bytes that a process may still allocate; None if unknown."""
+    """Return the number of bytes that a process can still allocate; None if unknown."""
     found = [each for each in (_of_system(), _of_container()) if each is not None]
     return min(found, default=None)
 
@@ -53,12 +53,15 @@ def _of_container() -> int | None:
 
 
 def free_disk(folder: str | os.PathLike) -> int | None:
-    """Return the free bytes on the disk of a folder, which may not exist yet; None if unknown."""
+    """Return the free bytes on the disk of a folder; None if unknown.
+
+    The folder need not exist.
+    """
     path = Path(folder).absolute()
-    # A name that is too long for the disk does not exist; the disk of a parent is measured.
+    # A name that is too long for the disk does not exist; the disk of its parent is measured.
     existing = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())
     disk = shutil.disk_usage(existing)
-    return disk.free if disk.total else None  # some of the system's own folders have no disk
+    return disk.free if disk.total else None  # some folders of the system have no disk
 
 
 def format_size(size: float) -> str:
@@ -92,11 +95,11 @@ def usable_cores() -> int:
 
 @functools.cache  # JAX reads the environment once
 def threads_of_a_computation() -> int:
-    """Return the number of threads that XLA has for one computation on a CPU.
+    """Return the number of threads that XLA uses for one computation on a CPU.
 
-    The environment variable PJRT_NPROC or NPROC sets it; by default it is one for each usable core.
-    On some CPUs it decides the last digits. Call this function when JAX has started, or is about
-    to start.
+    The environment variable PJRT_NPROC or NPROC sets the number. Its default is the number of
+    usable cores. On some CPUs it affects the last digits of results. Call this function when JAX
+    has started, or is about to start.
     """
     number = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
     return max(int(number), 1) if number.isdecimal() else usable_cores()
@@ -104,9 +107,9 @@ def threads_of_a_computation() -> int:
 
 @functools.cache
 def processor() -> str:
-    """Return the name of the processor and its widest vectors.
+    """Return the name of the processor and its widest vector instructions.
 
-    NumPy and XLA choose by both how they compute, and so the last digits.
+    NumPy and XLA choose their algorithms by both, which affects the last digits of results.
     """
     entries: dict[str, str] = {}
     try:
@@ -123,18 +126,18 @@ def processor() -> str:
 
 
 def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Return a function that another thread computes in the type of numbers of this thread.
+    """Wrap a function so that another thread runs it with the JAX precision of this thread.
 
     `jax.enable_x64(True)` holds only for the thread that calls it.
     """
-    import jax  # the command line measures memory without it
+    import jax  # the command line measures memory without JAX
 
     here = jax.config.jax_enable_x64  # type: ignore[attr-defined]
 
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        # To enable what is enabled would have programs compiled anew.
-        is_so = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
-        with contextlib.nullcontext() if is_so else jax.enable_x64(here):
+        # Enabling a precision that is enabled would compile programs again.
+        is_equal = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
+        with contextlib.nullcontext() if is_equal else jax.enable_x64(here):
             return function(*args, **kwargs)
 
     return call

@@ -1,10 +1,11 @@
-"""Commands that are stopped from outside: Ctrl-C, SIGTERM or SIGHUP, each with a line and a code.
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: the command prints one line and exits with its own code.
 
-A signal ends the process at once, wherever its threads are: files appear whole or not at all, and
-no help of the main thread is needed, which may be inside the compiler. Within `under_way` the first
-signal is left to the main thread, which calls `check` where it can stop tidily, for at most `GRACE`
-seconds. Nothing is raised elsewhere, so that no signal is lost or ends in a traceback. The
-interpreter is not taken down, since threads of XLA that still compute would crash without it.
+By default a signal ends the process at once, from a thread of its own: the main thread may be
+inside the compiler. Files are whole at any moment, because they are renamed into place. Within
+`under_way` the first signal only sets a flag. The main thread calls `check` where it can stop
+cleanly, and has `GRACE` seconds to do so. No exception is raised elsewhere, so that no signal is
+lost or causes a traceback. The process exits without shutting the interpreter down, because
+threads of XLA that still compute would crash.
 """
 
 import contextlib
@@ -24,17 +25,17 @@ _WORDS = {
 
 
 class Stopped(KeyboardInterrupt):
-    """The process was told to stop."""
+    """The process received a signal to stop."""
 
 
 class _State:
-    """Of the process, which has one set of signal handlers."""
+    """State of the process, which has one set of signal handlers."""
 
     def __init__(self) -> None:
-        self.told: int | None = None  # number of the first signal
+        self.number: int | None = None  # of the first signal
         self.patient = False
         self.bar = False
-        self.rest: Callable[[], str] = lambda: NOTHING
+        self.remainder: Callable[[], str] = lambda: NOTHING
         self.leaving = threading.Lock()
 
 
@@ -42,71 +43,73 @@ _STATE = _State()
 
 
 def listen() -> None:
-    """Hear SIGINT, SIGTERM and SIGHUP from now on; in the main thread of a command only.
+    """Start to handle SIGINT, SIGTERM and SIGHUP; call this in the main thread of a command.
 
-    A shell starts background jobs deaf to SIGINT; it is heard there too. SIGHUP is not, where
-    `nohup` has asked for that.
+    A shell starts background jobs with SIGINT ignored; this function handles it there too. SIGHUP
+    stays ignored under `nohup`.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
     for number in _WORDS:
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
-            signal.signal(number, lambda *_: None)  # what is done is `_watch`'s
+            signal.signal(number, lambda *_: None)  # `_watch` acts on the signal
     threading.Thread(target=_watch, args=(reader,), daemon=True).start()
 
 
 @contextlib.contextmanager
-def under_way(rest: Callable[[], str], *, patient: bool = True, bar: bool = True) -> Iterator[None]:
-    """Say within the block what a stop leaves; it may be left to the block for a while.
+def under_way(
+    remainder: Callable[[], str], *, patient: bool = True, bar: bool = True
+) -> Iterator[None]:
+    """Define what the process prints when a signal stops it within the block.
 
     Args:
-        rest: called when the process is stopped; says what is left and how to go on with it, or
-            `NOTHING`, where nothing has to be waited for.
-        patient: whether the block calls `check`.
-        bar: whether it shows a bar, whose line is ended first.
+        remainder: called when the process is stopped; returns a text on what is left and how to
+            continue, or `NOTHING`, in which case the process ends at once.
+        patient: whether the block calls `check`; if not, the process ends at once.
+        bar: whether the block shows a progress bar, whose line is ended first.
     """
-    before = _STATE.patient, _STATE.bar, _STATE.rest
-    _STATE.patient, _STATE.bar, _STATE.rest = patient, bar, rest
+    before = _STATE.patient, _STATE.bar, _STATE.remainder
+    _STATE.patient, _STATE.bar, _STATE.remainder = patient, bar, remainder
     try:
         yield
     finally:
-        if not is_told():
-            _STATE.patient, _STATE.bar, _STATE.rest = before
+        if not is_stopped():
+            _STATE.patient, _STATE.bar, _STATE.remainder = before
 
 
 def check() -> None:
-    """Raise `Stopped` if the process has been told to stop."""
-    if is_told():
+    """Raise `Stopped` if the process received a signal to stop."""
+    if is_stopped():
         raise Stopped
 
 
-def is_told() -> bool:
-    """Whether the process has been told to stop."""
-    return _STATE.told is not None
+def is_stopped() -> bool:
+    """Return whether the process received a signal to stop."""
+    return _STATE.number is not None
 
 
 def leave() -> NoReturn:
-    """End a process that was told to stop, with a line on the standard error stream."""
-    told = _STATE.told or signal.SIGINT
+    """End a process that received a signal, with one line on the standard error stream."""
+    number = _STATE.number or signal.SIGINT
     if not _STATE.leaving.acquire(blocking=False):
-        threading.Event().wait()  # another thread ends the process
+        threading.Event().wait()  # wait: another thread ends the process
     try:
         end = "\n" if _STATE.bar else ""
-        line = f"planner-jax: {_WORDS[signal.Signals(told)]}; {_STATE.rest()}\n"
+        line = f"planner-jax: {_WORDS[signal.Signals(number)]}; {_STATE.remainder()}\n"
         os.write(2, (end + line).encode(errors="replace"))
     finally:
-        os._exit(128 + told)
+        os._exit(128 + number)
 
 
 def _watch(reader: int) -> None:
-    """Read the numbers of signals, as the interpreter's own handler writes them."""
+    """Read the numbers of signals, which the interpreter's own handler writes to a pipe."""
     while True:
         for number in os.read(reader, 64):
             if number not in _WORDS:
                 continue
-            first, _STATE.told = not is_told(), _STATE.told or number
-            if not first or not _STATE.patient or _STATE.rest() == NOTHING:
+            first, _STATE.number = not is_stopped(), _STATE.number or number
+            if not first or not _STATE.patient or _STATE.remainder() == NOTHING:
                 leave()
             late = threading.Timer(GRACE, leave)
             late.daemon = True

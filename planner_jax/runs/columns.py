@@ -1,4 +1,4 @@
-"""The columns of the run: a row a case, SI units, world frame (z up)."""
+"""Columns of the rows of a run: one row for each case, in SI units."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from planner_jax.runs.source import Chunk
 
 @dataclasses.dataclass(frozen=True)
 class RefereedBatch:
-    """B cases with everything that is known about them; leaves are NumPy or JAX arrays."""
+    """B cases with their plans and verdicts; leaves are NumPy or JAX arrays."""
 
     chunk: Chunk
     plans: PyTree
@@ -22,7 +22,7 @@ class RefereedBatch:
 
     @property
     def cases(self) -> PyTree:
-        """The cases themselves."""
+        """The cases, leaves with leading axis B."""
         return self.chunk.cases
 
 
@@ -44,22 +44,22 @@ _KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # kind of a NumPy type -> type of a
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
-    """Return the type of a list column, under the name that Parquet gives its entries back."""
+    """Return the type of a list column; Parquet returns the entries under the name "element"."""
     return pa.list_(pa.field("element", kind), length)
 
 
 VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
 
-INDEX = Column("index", "", "place in the whole", pa.int64(), lambda b: b.chunk.index)
+INDEX = Column("index", "", "index of the case in the run", pa.int64(), lambda b: b.chunk.index)
 
 
 def leaves_of(part: str, *rows: tuple) -> list[Column]:
     """Return columns that are leaves of one part of a batch.
 
     Args:
-        part: dotted path of it in a `RefereedBatch`.
-        *rows: name, unit and meaning of a column; then, where they are not these, its type,
-            NUMBER, and the leaf's dotted path in the part, the name.
+        part: dotted path of the part in a `RefereedBatch`.
+        *rows: name, unit and meaning of a column; optionally its type, by default NUMBER, and the
+            dotted path of the leaf in the part, by default the name.
     """
     return [_leaf_column(part, *row) for row in rows]
 
@@ -74,7 +74,7 @@ _STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
 
 
 def status_column(meaning: str) -> Column:
-    """Return the column of the plans' statuses, by name."""
+    """Return the column of the plans' statuses by name."""
     return Column("status", "", meaning, TEXT, lambda b: _STATUS_NAMES[np.asarray(b.plans.status)])
 
 
@@ -82,8 +82,8 @@ SOLVER = [
     *leaves_of(
         "plans",
         ("cost", "1", "the planner's own objective"),
-        ("violation", "1", "largest relative excess the planner saw"),
-        ("iterations", "", "of the round that gave the plan", COUNT),
+        ("violation", "1", "largest relative excess that the planner measured"),
+        ("iterations", "", "of the attempt that found the plan", COUNT),
     ),
     status_column("of the solver"),
 ]
@@ -91,20 +91,21 @@ SOLVER = [
 OUTCOME = [
     *leaves_of(
         "verdict",
-        ("success", "", "the referee's word", BOOL),
+        ("success", "", "whether the referee accepts the plan", BOOL),
         ("failed_limit", "", "first limit that fails, or empty", TEXT),
-        ("failed_time", "s", "where that limit is worst"),
-        ("failed_excess", "as in `sentence`", "by how much, tolerance not taken off"),
+        ("failed_time", "s", "at which this limit is exceeded most"),
+        ("failed_excess", "as in `sentence`", "excess over this limit, tolerance not subtracted"),
     ),
-    Column("sentence", "", "what failed, in words", TEXT, lambda b: _sentences(b.verdict)),
+    Column("sentence", "", "failure as a sentence", TEXT, lambda b: _sentences(b.verdict)),
 ]
 
 
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """Return a column for every leaf of the cases, the plans and the verdict.
 
-    Names are those of the fields, joined by dots, behind "case.", "plan." or "verdict."; what
-    every task has is named as in all runs. A field's metadata may hold its `unit` and `meaning`.
+    A name consists of "case", "plan" or "verdict" and the names of the fields, joined by dots. The
+    columns of `SOLVER` and `OUTCOME` have the same names in all runs. The metadata of a field may
+    hold its `unit` and `meaning`.
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]
@@ -118,7 +119,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
         fields = [
             (f.name, vars(tree)[f.name], f.metadata)
             for f in dataclasses.fields(tree)
-            if f.metadata.get("pytree_node", True)  # what is static is not of one row
+            if f.metadata.get("pytree_node", True)  # static fields have no value for each row
         ]
         return [
             column
@@ -138,7 +139,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """Return the rows of a batch; the metadata hold the frame, in words."""
+    """Return the rows of a batch; their metadata hold the frame as text."""
     num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
@@ -148,7 +149,7 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
 
 
 def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
-    """Return an Arrow array of `num` entries from (num,) or (num, ...) values."""
+    """Return an Arrow array of `num` entries from values (num,) or (num, ...)."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):

@@ -1,8 +1,8 @@
-"""The rows of a run: a Parquet dataset that `pyarrow.dataset`, pandas and DuckDB read.
+"""The rows of a run: a Parquet dataset, which `pyarrow.dataset`, pandas and DuckDB read.
 
-A dataset is a folder with a file for each part, such as `part-000007-1a2b3c4d.parquet`: the number
-of the part and the CRC-32 of the file. A part appears whole or not at all. Its metadata hold a
-record of how its rows were made.
+A dataset is a folder with one file for each part, such as `part-000007-1a2b3c4d.parquet`, named by
+the number of the part and the CRC-32 of the file. A part is written completely or not at all. Its
+metadata hold a record of how its rows were made.
 """
 
 import io
@@ -19,19 +19,20 @@ from pyarrow import dataset
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.runs.manifest import Entries, Row
 
-ROW_GROUP = 2048  # rows, some 3 MB: little has to be read for one of them
+ROW_GROUP = 2048  # rows of about 3 MB, the least that is read for one row
 _RECORD = b"part"
 _NAME = re.compile(r"part-([0-9]{6,12})-([0-9a-f]{8})\.parquet")
 
 
 class DamagedPart(ValueError):
-    """A file is not the part that was written; a few words that say why."""
+    """A file is not the part that was written; the text says why."""
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
     """Return the content of a part.
 
-    Numbers hardly repeat: only text is worth a dictionary, and lists are not worth compressing.
+    Only text has a dictionary, because numbers hardly repeat. Lists are not compressed, which would
+    save little.
     """
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]
@@ -49,13 +50,13 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
 
 
 def number_of(path: Path) -> int:
-    """Return the number of a part, as its name has it.
+    """Return the number in the name of a part.
 
     Raises:
-        DamagedPart: it is not the name of a part.
+        DamagedPart: the name is not the name of a part.
     """
     if (name := _NAME.fullmatch(path.name)) is None:
-        raise DamagedPart("is no part of a run")
+        raise DamagedPart("is not a part of a run")
     return int(name[1])
 
 
@@ -63,39 +64,39 @@ def check_part(path: Path) -> Entries:
     """Return the record of a part after a check of its name, checksum and number of rows.
 
     Raises:
-        DamagedPart: the file is not what was written.
-        OSError: it cannot be read, or it is no plain file.
+        DamagedPart: the file is not the part that was written.
+        OSError: the file cannot be read, or is not a regular file.
     """
     number_of(path)
     with open_plain(path) as file:
         content = file.read()
     if f"{zlib.crc32(content):08x}" != path.stem.rpartition("-")[2]:
-        raise DamagedPart("is damaged: its checksum is not that of its name")
+        raise DamagedPart("is damaged: its checksum is not the one in its name")
     try:
         with pq.ParquetFile(pa.BufferReader(content)) as file:
             record = json.loads((file.schema_arrow.metadata or {})[_RECORD])
             return {**record, "num": file.metadata.num_rows}
     except (pa.ArrowException, OSError, KeyError, TypeError, ValueError):
-        raise DamagedPart("is no part of a run") from None
+        raise DamagedPart("is not a part of a run") from None
 
 
 class Dataset:
     """The parts in a folder, in the order of their numbers.
 
     Args:
-        folder: of the parts, which need not exist.
+        folder: folder of the parts, which need not exist.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def files(self) -> list[Path]:
-        """Return everything in the folder but hidden files, sorted."""
+        """Return all files of the folder except hidden ones, sorted."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()
         return sorted(path for path in there if not path.name.startswith("."))
 
     def write(self, number: int, content: bytes) -> None:
-        """Write a part, as `encode` returns it, and remove another one of this number.
+        """Write the content of a part, and remove other files of the same number.
 
         Raises:
             OSError: the file cannot be written.
@@ -113,7 +114,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return what is wrong, in words, by file; for another number of rows by folder."""
+        """Return a text on each damaged file; for a wrong number of rows, on the folder."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
@@ -144,7 +145,7 @@ class Dataset:
             yield fragment.to_table(columns=known)
 
     def pick(self, rows: Sequence[int], columns: Sequence[str] | None = None) -> list[Row]:
-        """Return some rows by their places, in ascending order; reads only their row groups."""
+        """Return the rows with some indices, in ascending order; read only their row groups."""
         wanted, first, picked = sorted(set(rows)), 0, []
         for fragment in self._open().get_fragments():
             size = fragment.metadata.num_rows

@@ -1,4 +1,4 @@
-"""Where a run took place: versions, code, commit, device."""
+"""The environment of a run: versions, code, commit and device."""
 
 import functools
 import hashlib
@@ -12,12 +12,12 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.machine import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
 
-_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # that decide rows
+_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # these affect the numbers of rows
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def find_version(name: str) -> str | None:
-    """Return the version of a package; None where it is used without being installed."""
+    """Return the version of an installed package; None if it is not installed."""
     try:
         return metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -38,7 +38,7 @@ def code_digest() -> str:
 
 
 def environment() -> Entries:
-    """Return versions, code, git commit and device, for the manifest."""
+    """Return versions, code, git commit and device for the manifest."""
     import jax
 
     device = jax.devices()[0]
@@ -63,7 +63,7 @@ def environment() -> Entries:
 
 
 def makers_of(found: Entries) -> Entries:
-    """Return what decides rows besides settings and cases, out of `environment()`."""
+    """Return the entries of `environment()` that affect the numbers of rows."""
     device = found["device"]
     return {
         **{name: found["versions"][name] for name in _PACKAGES},
@@ -75,10 +75,10 @@ def makers_of(found: Entries) -> Entries:
 
 
 def require_backend() -> str:
-    """Return the platform that JAX computes on.
+    """Return the platform on which JAX computes.
 
     Raises:
-        ArgumentError: JAX has none that works, or the switch for kernels has a wrong value.
+        ArgumentError: JAX has no platform that works, or the switch for kernels has a wrong value.
     """
     import jax
 
@@ -88,7 +88,7 @@ def require_backend() -> str:
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        # JAX 0.10 only asserts, without a word, where it knows a platform but has no device of it.
+        # JAX 0.10 raises an empty AssertionError if it knows a platform but has no device of it.
         reason = (str(error) or "JAX finds no device of it").splitlines()[0]
         asked = os.environ.get("JAX_PLATFORMS", "")
         raise ArgumentError(
@@ -100,7 +100,7 @@ def require_backend() -> str:
 
 
 def _git_commit() -> str | None:
-    """Return the commit of this checkout, with "+" where files differ; None where there is none."""
+    """Return the commit of this checkout, with "+" if files were changed; None without git."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(_PACKAGE), *arguments]

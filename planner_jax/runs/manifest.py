@@ -1,7 +1,7 @@
-"""JSON files of runs: their format, and whether they are as they were written.
+"""JSON files of runs: their format, and a digest that detects damage.
 
-A file holds an object with `format`, a number, and `digest`, the SHA-256 of all other entries, by
-which damage and edits are found.
+A file holds an object with the entries `format`, a number, and `digest`, the SHA-256 of all other
+entries.
 """
 
 import hashlib
@@ -15,18 +15,18 @@ from planner_jax.host.files import open_plain
 
 FORMAT = 2  # of manifest, parts, rows and recordings
 MANIFEST = "manifest.json"
-_LARGEST = 1 << 26  # bytes
+_LARGEST = 1 << 26  # [bytes]
 
 Entries: TypeAlias = dict[str, Any]  # of a JSON object, such as a manifest
 Row: TypeAlias = Mapping[str, Any]  # a row of a dataset, by columns
 
 
 class JsonError(PlannerJaxError, ValueError):
-    """A text is not what was written; a few words that say why."""
+    """A text is not what was written; the message says why."""
 
 
 def digest_of(entries: Mapping[str, object]) -> str:
-    """Return the SHA-256 of the entries but `digest`, whatever their order."""
+    """Return the SHA-256 of all entries except `digest`; their order does not matter."""
     kept = {name: value for name, value in entries.items() if name != "digest"}
     text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
@@ -39,10 +39,10 @@ def to_write(entries: Mapping[str, object]) -> Entries:
 
 
 def parse_object(text: bytes | str) -> Entries:
-    """Return the object of a text.
+    """Return the JSON object in a text.
 
     Raises:
-        JsonError: there is none.
+        JsonError: the text is not a JSON object.
     """
     try:
         found = json.loads(text)
@@ -56,29 +56,34 @@ def parse_object(text: bytes | str) -> Entries:
 
 
 def parse_written(text: bytes | str) -> Entries:
-    """Return entries as `to_write` returned them.
+    """Return entries that `to_write` returned.
 
     Raises:
-        JsonError: the text is of another format, or it is not as it was written.
+        JsonError: the text is of another format, or was changed.
     """
     entries = parse_object(text)
     if type(found := entries.get("format")) is not int or found != FORMAT:
-        told = "no format" if found is None else f"format {str(found)[:40]}"
-        raise JsonError(f"has {told}, and this version reads format {FORMAT} alone")
+        shown = "no format" if found is None else f"format {str(found)[:40]}"
+        raise JsonError(f"has {shown}, and this version reads format {FORMAT} alone")
     try:
         is_whole = entries.get("digest") == digest_of(entries)
     except (RecursionError, ValueError):
         is_whole = False
     if not is_whole:
-        raise JsonError("was edited or damaged: its digest is not that of its entries")
+        raise JsonError("was edited or damaged: its digest does not fit its entries")
     return entries
 
 
 def read_written(path: Path, name: str, what: str) -> Entries:
-    """Return the entries of a file that `to_write` returned; `name` and `what` are for messages.
+    """Return the entries of a file that holds what `to_write` returned.
+
+    Args:
+        path: the file.
+        name: the caller's argument that holds the folder, for messages.
+        what: noun for the contents, such as "a run", for messages.
 
     Raises:
-        ArgumentError: there is none, it is of another format, or it is not as it was written.
+        ArgumentError: the file is missing, of another format, or was changed.
     """
     shown = repr(str(path.parent))
     try:

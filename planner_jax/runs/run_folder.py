@@ -1,8 +1,8 @@
-"""The folder that a run writes: manifest, rows, table, figures and page.
+"""The folder of a run: manifest, rows, table, figures and page.
 
-Everything appears whole: files are written beside their place and renamed into it, so that a
-run which was killed at any moment can be resumed. One process writes at a time: it holds a lock
-of the file `.lock`, which the system frees when the process ends.
+Files are written under another name and renamed when they are complete, so that a run which was
+killed at any moment can be resumed. One process writes at a time. It holds a lock on the file
+`.lock`, which the system releases when the process ends.
 """
 
 import contextlib
@@ -27,15 +27,15 @@ from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_w
 
 LOCK = ".lock"
 FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # in figures
-_TRIES, _BETWEEN = 20, 0.01  # of a lock that is taken, and seconds from one to the next
+_TRIES, _BETWEEN = 20, 0.01  # attempts to take the lock, and the pause between them [s]
 
 
 class RunFolder:
-    """One run's folder.
+    """The folder of one run.
 
     Args:
-        path: of the folder, which need not exist.
-        name: of the caller's argument that holds the path, for messages.
+        path: folder, which need not exist.
+        name: the caller's argument that holds the path, for messages.
     """
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
@@ -47,7 +47,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require_new(self) -> None:
-        """Raise `ArgumentError` unless a run may be written here; writes no run."""
+        """Raise `ArgumentError` unless a run can be written here; write nothing."""
         try:
             if (self.path / LOCK).exists():
                 with self._hold_lock():
@@ -62,14 +62,14 @@ class RunFolder:
 
     @contextlib.contextmanager
     def create(self, manifest: Entries) -> Iterator[None]:
-        """Make the folder with its first manifest, and own it for the length of the block.
+        """Create the folder with its first manifest, and hold its lock within the block.
 
         Raises:
-            ArgumentError: the folder cannot be made, or is not new any more.
+            ArgumentError: the folder cannot be created, or is not empty.
         """
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
         with self.lock():
-            self._require_empty()  # another process may have been quicker
+            self._require_empty()  # another process may have written a run meanwhile
             try:
                 self.write_manifest(manifest)
             except OSError as error:
@@ -79,10 +79,10 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Make the folder if it is not there, and own it for the length of the block.
+        """Create the folder if it is missing, and hold its lock within the block.
 
         Raises:
-            ArgumentError: another process owns it, or it cannot be made or written.
+            ArgumentError: another process holds the lock, or the folder cannot be written.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=True)
@@ -95,7 +95,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def _hold_lock(self) -> Iterator[None]:
-        """Hold the lock, whose file says who holds it."""
+        """Hold the lock; its file names the process that holds it."""
         with contextlib.ExitStack() as opened:
             try:
                 handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
@@ -110,7 +110,10 @@ class RunFolder:
             yield
 
     def _acquire(self, handle: int) -> None:
-        """Lock an open file; a process that only looks whether a folder is free is waited for."""
+        """Lock an open file.
+
+        Retry for a moment: a process that only checks the folder holds the lock briefly.
+        """
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
                 return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -126,15 +129,18 @@ class RunFolder:
         return ArgumentError(self.name, rule, shown=f"{str(self.path)!r}{why}")
 
     def _require_empty(self) -> None:
-        """Raise `ArgumentError` if there is more than a killed process leaves before a manifest."""
+        """Raise `ArgumentError` if the folder holds files.
+
+        Files that a killed process leaves before its first manifest do not count.
+        """
         if not all(path.name == LOCK or is_scratch(path) for path in self.path.iterdir()):
             rule = "a new or empty folder"
             if (self.path / MANIFEST).exists():
-                rule += ", or that of a run with resume"
+                rule += ", or the folder of a run with resume"
             raise ArgumentError(self.name, rule, str(self.path))
 
     def discard(self) -> None:
-        """Remove all that was written since `create`, and the folders made for it."""
+        """Remove all files written since `create`, and the folders created for them."""
         for path in self.path.iterdir() if self.path.is_dir() else ():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -148,7 +154,7 @@ class RunFolder:
                 folder.rmdir()
 
     def _remove_scratch(self) -> None:
-        """Remove what a killed process was writing."""
+        """Remove scratch files of a killed process."""
         for folder in (self.path, self.plans.folder, self.baselines.folder, self.figures):
             for path in folder.iterdir() if folder.is_dir() else ():
                 if is_scratch(path):
@@ -158,24 +164,24 @@ class RunFolder:
         """Return the manifest.
 
         Raises:
-            ArgumentError: the folder is not that of a run, or its manifest was changed.
+            ArgumentError: the folder is not the folder of a run, or its manifest was changed.
         """
         return read_written(self.path / MANIFEST, self.name, "a run")
 
     def write_manifest(self, manifest: Entries) -> Entries:
-        """Put a manifest in the place of the old one; returns it as it is written."""
+        """Replace the manifest, and return it as it is written."""
         text = json.dumps(to_write(manifest), indent=2, allow_nan=False)
         self.write_text(MANIFEST, text + "\n")
         return json.loads(text)
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file of the folder whole."""
+        """Write a file of the folder."""
         with replacing(self.path / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
 
     @contextlib.contextmanager
     def reading_rows(self) -> Iterator[None]:
-        """Raise `ArgumentError` if the block cannot read the rows of the run."""
+        """Raise `ArgumentError` if the block fails to read the rows of the run."""
         errors = (pa.ArrowException, LookupError, OSError, TypeError, ValueError, ZeroDivisionError)
         try:
             yield
@@ -194,14 +200,14 @@ class RunFolder:
 
 @dataclasses.dataclass(frozen=True)
 class RunRows:
-    """What the figures of a run are drawn from."""
+    """Manifest and rows of a run, from which its figures are drawn."""
 
     folder: RunFolder
     manifest: Entries
     failures: list[Row]  # the first few rows that failed
 
     def sample(self) -> list[Row]:
-        """Return rows taken evenly from the run; where nearly all succeed, failures are added."""
+        """Return evenly spaced rows of the run, with further failures if few are among them."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
         shown = self.folder.plans.pick(spread)
@@ -210,7 +216,7 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return planner and row of the run's example, and of other planners for the same case."""
+        """Return planner and row of the run's example, then of other planners for this case."""
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []

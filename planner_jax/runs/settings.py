@@ -1,7 +1,7 @@
-"""What a run is asked to do, checked before anything is read, compiled or written.
+"""Settings of a run, checked before anything is read, compiled or written.
 
-Settings are frozen dataclasses; the command line is made from their fields. Nothing here imports
-JAX.
+Settings are frozen dataclasses; the options of the command line are made from their fields. Nothing
+here imports JAX.
 """
 
 import dataclasses
@@ -22,11 +22,11 @@ from planner_jax.core.registry import Task, require_name
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
-Options = dict[str, Any]  # values by their names in Python
+Options = dict[str, Any]  # values by the names of their fields
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
-    """Workers could not make a chunk of a run, which can be resumed: "workers must RULE"."""
+    """Workers could not make a chunk of a run: "workers must RULE". The run can be resumed."""
 
     def __init__(self, rule: str):
         super().__init__(rule)
@@ -42,32 +42,32 @@ def option(default: object, metavar: str, words: str) -> Any:
 
 
 def recovery_option(usual: str = NONE) -> str:
-    """Return the field of settings `recovery` of a task of quadrotors."""
+    """Return the field `recovery` of the settings of a task of quadrotors."""
     words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return the options of a planner for the argument `recovery`."""
+    """Return the options of a planner for the setting `recovery`."""
     return {} if value == NONE else {"recovery": value}
 
 
 def require_count(name: str, value: int | None, least: int, *, none: bool = False) -> None:
-    """Raise unless a value is a whole number of at least `least`, or None where that is allowed."""
+    """Raise unless a value is a whole number >= `least`; None is accepted if `none` is set."""
     if value is not None or not none:
         require_size(name, value, least)  # type: ignore[arg-type]
 
 
 def require_recovery(value: str) -> None:
-    """Raise `ArgumentError` unless the argument `recovery` is one, or none."""
+    """Raise `ArgumentError` unless the setting `recovery` is one of the known names."""
     require_one_of(CHOICES, "recovery", value)
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
-    """The arguments that the sweeps of all tasks have; a task's own class adds its own.
+    """Settings that the sweeps of all tasks have; the class of a task adds its own.
 
-    Together they decide every number of the run's table.
+    Together the settings decide every number of the rows of a run.
 
     Raises:
         ArgumentError: a value breaks its rule.
@@ -79,16 +79,16 @@ class SweepSettings:
     batch: int | None = option(
         None, "B", "cases planned, judged and written at once; bounds the memory"
     )
-    seed: int = option(0, "K", "of what is drawn")
+    seed: int = option(0, "K", "of the cases that are drawn")
 
-    RUN: ClassVar[str] = ""  # what carries it out, "module:Class"; "": `Sweep`
+    RUN: ClassVar[str] = ""  # subclass of `Sweep`, "module:Class"; "" is `Sweep` itself
     DEFAULT_NUM: ClassVar[int] = 1000
-    # As estimated, bytes of memory for a case of a batch, and of the disk for a row.
+    # Estimates of the memory of a case in a batch, and of the size of a row on the disk.
     CASE_BYTES: ClassVar[int] = 20_000
     ROW_BYTES: ClassVar[int] = 1_000
     CPU_BATCH: ClassVar[int] = 1024
     GPU_BATCH: ClassVar[int] = 65536
-    # Names of the settings that are options of the task's `planner`, `draw` and `judge`.
+    # Names of the fields that are options of the task's `planner`, `draw` and `judge`.
     PLANNER: ClassVar[tuple[str, ...]] = ()
     DRAW: ClassVar[tuple[str, ...]] = ()
     JUDGE: ClassVar[tuple[str, ...]] = ()
@@ -99,7 +99,7 @@ class SweepSettings:
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
-        """Return the same with the names of the task's planner and suite filled in, or checked.
+        """Return the settings with default names of planner and suite filled in, and names checked.
 
         Raises:
             ArgumentError: the task has no planner or suite of the name.
@@ -116,39 +116,38 @@ class SweepSettings:
 
     @property
     def case_bytes(self) -> int:
-        """Memory that a case of a batch takes while it is planned, judged and written."""
+        """Memory [bytes] of one case of a batch while it is planned, judged and written."""
         return self.CASE_BYTES
 
     def require_room(self, out: str | os.PathLike) -> None:
-        """Raise `ArgumentError` if the rows of the run do not fit on the disk of its folder."""
+        """Raise `ArgumentError` if the rows of the run do not fit on the disk of `out`."""
         require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 
     def parameters(self) -> Options:
-        """Return the settings as plain values for `manifest.json`; the class brings them back."""
+        """Return the settings as plain values for `manifest.json`; the class accepts them again."""
         return dataclasses.asdict(self)
 
     def planner_options(self) -> Options:
-        """Return options of the planner that these settings decide."""
+        """Return the options of the planner that these settings decide."""
         return self._values(self.PLANNER)
 
     def draw_options(self) -> Options:
-        """Return options of the task's `draw` that these settings decide; None is left to it."""
+        """Return the options of the task's `draw` that these settings decide, without None."""
         return {k: value for k, value in self._values(self.DRAW).items() if value is not None}
 
     def judge_options(self) -> Options:
-        """Return options of the task's `judge` that these settings decide."""
+        """Return the options of the task's `judge` that these settings decide."""
         return self._values(self.JUDGE)
 
     def _values(self, names: tuple[str, ...]) -> Options:
-        """Return the settings of some names."""
         return {name: vars(self)[name] for name in names}
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the settings of a run that is resumed, after a check of those passed again.
+    """Return the settings of a run that is resumed, after a check of the settings passed again.
 
     Raises:
-        ArgumentError: a given value is not the run's, or the run's are not such settings.
+        ArgumentError: a passed value differs from the run's, or these are not of `kind`.
     """
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
@@ -164,7 +163,7 @@ def settings_of_manifest(
     """Return the settings of a run; `name` is the argument that holds its folder.
 
     Raises:
-        ArgumentError: they are not such settings, as where another version wrote them.
+        ArgumentError: the parameters do not fit the class, as another version wrote them.
     """
     try:
         return kind(**parameters)
@@ -174,7 +173,7 @@ def settings_of_manifest(
 
 
 def _difference(name: str, old: object, new: object) -> tuple[str, object, object]:
-    """Return the name of the first part in which two settings differ, and its values."""
+    """Return name and both values of the first field in which two settings differ."""
     if dataclasses.is_dataclass(old) and dataclasses.is_dataclass(new) and type(old) is type(new):
         for field in dataclasses.fields(old):
             mine, other = vars(old)[field.name], vars(new)[field.name]

@@ -1,4 +1,4 @@
-"""The cases of a sweep, chunk by chunk."""
+"""Sources of the cases of a sweep, chunk by chunk."""
 
 import abc
 import dataclasses
@@ -14,16 +14,16 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 
-_MOST_PARTS = 10**6  # of a run: files in one folder
+_MOST_PARTS = 10**6  # of a run; each is a file of one folder
 
 
 @dataclasses.dataclass(frozen=True)
 class Chunk:
-    """B cases that are next to each other in a sweep."""
+    """B consecutive cases of a sweep."""
 
-    index: np.ndarray  # (B,) int, places in the whole
+    index: np.ndarray  # (B,) int, indices in the sweep
     cases: PyTree  # the task's pytree, NumPy leaves with leading axis B
-    origin: object = None  # what the cases were made from, where a task has that
+    origin: object = None  # data that the cases were made from, in some tasks
 
     def __len__(self) -> int:
         return len(self.index)
@@ -31,15 +31,15 @@ class Chunk:
 
 @dataclasses.dataclass(frozen=True)
 class Source(abc.ABC):
-    """Where the cases of a sweep come from."""
+    """The source of the cases of a sweep."""
 
     settings: SweepSettings  # of the task's sweep, with `num` and `batch` filled in
     num: int  # of all cases
-    batch: int  # cases a chunk
+    batch: int  # cases of a chunk
 
     @property
     def num_chunks(self) -> int:
-        """How many chunks the sweep has; the last one may be smaller."""
+        """Number of chunks of the sweep; the last chunk may be smaller."""
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
@@ -47,15 +47,15 @@ class Source(abc.ABC):
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
-        """Look at cases before anything is written; those of one chunk.
+        """Check cases before anything is written, and return the cases of one chunk.
 
-        They stand for all, where all are drawn from one law.
+        One chunk suffices where all cases are drawn from one distribution.
         """
         return self.chunk(0).cases
 
     @abc.abstractmethod
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases from place `first` up to `last`, that one left out, checked.
+        """Return the cases `first` to `last - 1`, checked.
 
         Raises:
             ArgumentError: a case breaks a rule.
@@ -63,7 +63,7 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def description(self) -> Entries:
-        """Return entries of the manifest by which the same cases are known again."""
+        """Return entries of the manifest that identify the cases when the run is resumed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,10 +73,10 @@ class DrawnSource(Source):
     task: Task
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases from place `first` up to `last`, that one left out.
+        """Return the cases `first` to `last - 1`.
 
         Raises:
-            ArgumentError: what draws them refuses a setting.
+            ArgumentError: the suite rejects a setting.
         """
         settings = self.settings
         drawn = self.task.draw(
@@ -85,7 +85,7 @@ class DrawnSource(Source):
         return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
 
     def description(self) -> Entries:
-        """Return suite, and digest of the numbers of the first chunk."""
+        """Return the suite, and a digest of the numbers of the first chunk."""
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(self.chunk(0).cases):
             digest.update(np.ascontiguousarray(leaf).tobytes())
@@ -93,14 +93,14 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return fields of a `Source`; `num` and `batch` are used where the settings name none.
+    """Return the fields of a `Source`; `num` and `batch` are defaults of the settings.
 
     Raises:
         ArgumentError: the cases of a chunk do not fit into memory, or there are too many chunks.
     """
     num, batch = settings.num or num, settings.batch or batch
     if num > _MOST_PARTS * batch:
-        rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, of which each is a file"
+        rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"
         raise ArgumentError("num", rule, num)
     if settings.batch is None:
         require_memory("num", min(num, batch), settings.case_bytes)

@@ -1,4 +1,4 @@
-"""One look for all figures: colours that colour-blind readers can tell apart (Okabe and Ito)."""
+"""One style for all figures, in the colours of Okabe and Ito for colour-blind readers."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -34,7 +34,7 @@ PLANNER_COLOURS = {
 
 Look: TypeAlias = dict[str, Any]  # named arguments of Matplotlib
 
-_LOOK: "dict[RcKeyType, object]" = {
+_STYLE: "dict[RcKeyType, object]" = {
     "font.size": 10.0,
     "axes.titlesize": 11.0,
     "axes.titlelocation": "left",
@@ -58,15 +58,15 @@ _LOOK: "dict[RcKeyType, object]" = {
 
 
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
-    """Draw one figure and write it whole, as PNG.
+    """Draw one figure and write it as PNG.
 
     Args:
-        path: of the file.
-        figure: called with an empty figure and the data.
+        path: file to write.
+        figure: function that draws into an empty figure, called with the figure and the data.
         size: (width, height) [inch].
-        *data: what the figure shows.
+        *data: arguments of `figure`.
     """
-    with matplotlib.rc_context(_LOOK):
+    with matplotlib.rc_context(_STYLE):
         canvas = Figure(figsize=size)
         FigureCanvasAgg(canvas)
         figure(canvas, *data)
@@ -75,7 +75,7 @@ def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *da
 
 
 def label(axes: Axes, x: str, y: str, title: str = "") -> None:
-    """Name both axes, with their units."""
+    """Set the labels of both axes, with units, and the title."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_title(title)

@@ -1,4 +1,4 @@
-"""Success rates of a sweep, counted row by row from what was written."""
+"""Success rates of a sweep, counted from the rows that were written."""
 
 from collections import Counter
 from typing import ClassVar
@@ -11,11 +11,11 @@ from planner_jax.runs.manifest import Entries
 
 
 def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """Return the 95 % interval of a success rate [Wilson1927].
+    """Return the 95 % Wilson interval of a success rate.
 
     Args:
-        successes: how many trials succeeded.
-        num: of how many; no trial says nothing, (0, 1).
+        successes: number of successful trials.
+        num: number of trials; the interval of no trial is (0, 1).
     """
     if num == 0:
         return 0.0, 1.0
@@ -24,30 +24,29 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
 
 
 def percent(successes: int, num: int) -> str:
-    """Return a success rate in percent with two decimals; 100 and 0 only where they are exact."""
+    """Return a success rate in percent with two decimals; 100 and 0 only if exact."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)
     return f"{rate:.2f}"
 
 
-# What every tally reads.
+# Columns that every tally reads.
 COUNTED = ("index", "success", "status", "failed_limit")
 
 
 class Tally:
-    """Counts over the rows of a sweep, chunk by chunk; its size does not grow with them."""
+    """Counts over the rows of a sweep; memory does not grow with the number of rows."""
 
-    READS: ClassVar[tuple[str, ...]] = ()  # the columns that are counted; none named: any may be
-    MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is told
+    READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all
+    MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is reported
 
     def __init__(self) -> None:
         self.num = 0
         self.successes = 0
         self.status: Counter[str] = Counter()
         self.failed_limits: Counter[str] = Counter()
-        # Index of the case that the figure of one plan shows.
-        self.example = 0
+        self.example = 0  # index of the case that the figure of one plan shows
         self._example_rank: int | None = None
         self._sums = dict.fromkeys(self.MEANS, 0.0)
 
@@ -67,11 +66,11 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return which rows (B,) make examples, the best kind first."""
+        """Return masks (B,) of the rows that may serve as example, the preferred ones first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:
-        """Return rates as fractions, 0 to 1, and means over successes, None without any."""
+        """Return success rates from 0 to 1, and means over the successes, None without any."""
         num = self.successes
         means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
         return {

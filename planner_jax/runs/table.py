@@ -1,4 +1,4 @@
-"""The table of a run, and what its numbers mean, as text, Markdown and HTML."""
+"""The table of a run as text, Markdown and HTML, and its headline."""
 
 import html
 from collections.abc import Sequence
@@ -9,16 +9,16 @@ from planner_jax.runs.summary import percent, wilson_interval
 
 
 class RateTable(NamedTuple):
-    """Text of a table."""
+    """Cells of a table as text."""
 
     title: str
     header: list[str]
     rows: list[list[str]]
-    strong: int | None = None  # the row that stands out
+    strong: int | None = None  # index of the highlighted row
 
 
 def rate_cells(successes: int, num: int) -> list[str]:
-    """Return cases, success in percent and its interval, the run's own cells of a row."""
+    """Return number of cases, success rate [%] and its interval [%] as cells."""
     low, high = wilson_interval(successes, num)
     return [
         f"{num:,}",
@@ -28,7 +28,7 @@ def rate_cells(successes: int, num: int) -> list[str]:
 
 
 def align(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return cells as lines, the first column to the left and the others to the right."""
+    """Return lines of cells; the first column is aligned to the left, others to the right."""
     first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [
         "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
@@ -36,7 +36,7 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
-    """Return success, findings of the task, speed and failures of a run, a sentence each."""
+    """Return sentences on success, findings of the task, speed and failures of a run."""
     summary, times = manifest["summary"], manifest["times"]
     settings, device = manifest["parameters"], manifest["device"]
     low, high = summary["wilson_95"]
@@ -60,8 +60,8 @@ def to_markdown(title: str, lines: Sequence[str], table: RateTable, remarks: Seq
     """Return the contents of `table.md`."""
     text = [f"# {title}", "", *(line + "  " for line in lines), ""]
     text += [_bars(table.header), _bars(["---"] + ["---:"] * (len(table.header) - 1))]
-    for place, row in enumerate(table.rows):
-        strong = place == table.strong
+    for index, row in enumerate(table.rows):
+        strong = index == table.strong
         text.append(_bars([f"**{cell}**" if strong and cell else cell for cell in row]))
     text += ["", *(f"- {remark}" for remark in remarks)]
     return "\n".join(text) + "\n"
@@ -74,8 +74,8 @@ def _bars(cells: Sequence[str]) -> str:
 def to_html(table: RateTable) -> str:
     """Return the table as HTML, without its title."""
     rows = [_html_row(table.header, "th")]
-    for place, row in enumerate(table.rows):
-        rows.append(_html_row(row, "td", " class=strong" if place == table.strong else ""))
+    for index, row in enumerate(table.rows):
+        rows.append(_html_row(row, "td", " class=strong" if index == table.strong else ""))
     return f"<table>\n{''.join(rows)}</table>\n"
 
 

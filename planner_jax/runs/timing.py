@@ -1,4 +1,4 @@
-"""Seconds of a sweep: those in which JAX compiled apart from those of warm planning."""
+"""Time measurements of a sweep: seconds of compilation, and seconds of planning without it."""
 
 import time
 from collections.abc import Callable
@@ -12,16 +12,16 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
-# Tracing, lowering and the backend's compilation, which includes reading the compile cache.
-# Inner functions are traced inside outer ones: spans are joined, not added.
+# Events of tracing, lowering and compilation, which includes reading the compile cache. Inner
+# functions are traced within outer functions, so that time spans are joined, not added.
 _COMPILING = "/jax/core/compile/"
-_WARM_CALLS = 3  # at most, until nothing is compiled
+_WARM_CALLS = 3  # greatest number of calls until nothing is compiled
 
-FoundT = TypeVar("FoundT")
+ResultT = TypeVar("ResultT")
 
 
 class CompileClock:
-    """Seconds within its block in which JAX traced, lowered or compiled, in any thread."""
+    """Seconds in which JAX traced, lowered or compiled within the block, in any thread."""
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
@@ -40,7 +40,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Length of the union of all spans so far [s]."""
+        """Length [s] of the union of all time spans so far."""
         total, reached = 0.0, 0.0
         for start, end in sorted(self._spans):
             total += max(end - max(start, reached), 0.0)
@@ -48,7 +48,7 @@ class CompileClock:
         return total
 
     def lap(self) -> float:
-        """Return what `seconds` have grown by since the last call, or since the start."""
+        """Return the growth of `seconds` since the last call, or since the start."""
         last, self._last = self._last, self.seconds
         return self._last - last
 
@@ -59,29 +59,29 @@ class CompileClock:
 
 
 class Stopwatch:
-    """Seconds since the last lap."""
+    """A clock that returns the seconds since its last call."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
 
     def lap(self) -> float:
-        """Return seconds since the last call, or since the start."""
+        """Return the seconds since the last call, or since the start."""
         last, self._last = self._last, time.perf_counter()
         return self._last - last
 
 
-def measure(call: Callable[[], FoundT]) -> tuple[FoundT, float, bool]:
-    """Return a call's result, its seconds, and whether nothing was compiled meanwhile."""
+def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
+    """Return the result of a call, its seconds, and whether nothing was compiled meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
         found = call()
     return found, watch.lap(), not clock.compiled
 
 
-def measure_warm(call: Callable[[], FoundT]) -> tuple[FoundT, float]:
-    """Return what a call gives, and the seconds that it takes once nothing is compiled.
+def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
+    """Return the result of a call, and its seconds when nothing is compiled.
 
-    One that compiles something in every call is timed with that.
+    The seconds include compilation if every call compiles something.
     """
     for _ in range(_WARM_CALLS - 1):
         found, seconds, warm = measure(call)

@@ -174,5 +174,5 @@ def test_what_is_no_part_of_the_run_is_removed_from_its_rows(runs, tmp_path):
         (out / "plans" / name).write_bytes(part.read_bytes())
     ended = run("sweep", "hit", "--resume", "--out", out)
     assert ended.code == 0 and ended.err.count("planned again") == 4
-    assert "is no part of a run" in ended.err and "is there twice" in ended.err
+    assert "is not a part of a run" in ended.err and "is there twice" in ended.err
     assert rows_of(out) == rows_of(runs / "whole")
