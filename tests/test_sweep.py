@@ -250,7 +250,7 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
         resume_sweep(TASK, out, progress=False)
     for path in (tmp_path / "serves").iterdir():
         path.write_text(path.read_text().replace("7.2", "7.0"))
-    with pytest.raises(ArgumentError, match="serves must be the same as when the run began"):
+    with pytest.raises(ArgumentError, match="serves must be the same as when the run started"):
         resume_sweep(TASK, out, progress=False)
 
 

@@ -132,7 +132,7 @@ def test_cases_that_are_drawn_otherwise_are_not_mixed_into_a_run(finished, tmp_p
         "planner_jax.task.catch.draw",
         lambda num, suite, seed, **options: real(num, suite, seed + 1, **options),
     )
-    with pytest.raises(ArgumentError, match="suite must be the same as when the run began"):
+    with pytest.raises(ArgumentError, match="suite must be the same as when the run started"):
         resume_sweep(TASK, out)
 
 

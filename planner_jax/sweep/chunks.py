@@ -29,7 +29,7 @@ from planner_jax.runs.summary import percent
 from planner_jax.runs.timing import CompileClock, Stopwatch, measure, measure_warm
 from planner_jax.sweep.sweep import Sweep
 
-_UNDER_WAY = 2  # chunks that are judged or written while the next is planned
+_PENDING = 2  # chunks that are judged or written while the next one is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
@@ -44,7 +44,7 @@ _MEASURED = {
 
 
 class Record(TypedDict):
-    """How the rows of a part were made; its metadata hold this."""
+    """How the rows of a part were made; the part's metadata hold it."""
 
     run: str  # the digest of the `Maker`
     number: int
@@ -57,27 +57,27 @@ class Record(TypedDict):
 
 
 Made = tuple[bytes, Record]  # content and record of a part
-# Start to make parts of these numbers, and yield functions that wait for each of them, in order.
+# Starts to make parts of some numbers, and yields in order functions that wait for each part.
 Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None, None]]
 
 
 @dataclass(frozen=True)
 class Maker:
-    """What makes the rows of chunks."""
+    """Source, planner and referee that make the rows of chunks."""
 
     sweep: Sweep
     source: Source
     planner: Planner
-    makers: Entries  # versions, code and devices that decide rows
+    makers: Entries  # versions, code and devices that affect the rows
     description: Entries  # of the source
-    run: str  # the SHA-256 of all that decides rows: these, the settings, and files they name
+    run: str  # SHA-256 of all that affects the rows, with settings and the files they name
 
     @classmethod
     def of(cls, sweep: Sweep, settings: SweepSettings, batch: int) -> "Maker":
         """Open the source and the planner of a sweep.
 
         Raises:
-            ArgumentError: the settings ask for what is not there.
+            ArgumentError: a file or name in the settings does not exist.
         """
         source = sweep.open_source(settings, batch)
         makers, description = makers_of(environment()), source.description()
@@ -87,7 +87,7 @@ class Maker:
         return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
-        """Plan a chunk; what the clock has counted since its last lap is its compilation."""
+        """Plan a chunk; the growth of `clock` since its last lap is the compilation."""
         plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,
@@ -101,7 +101,7 @@ class Maker:
         }
 
     def make(self, number: int) -> Made:
-        """Draw, plan, judge and encode a chunk."""
+        """Draw and plan a chunk, judge its plans, and encode its rows."""
         chunk = self.source.chunk(number)
         with CompileClock() as clock:
             return self.judge(chunk, *self.plan(chunk, clock))
@@ -120,7 +120,7 @@ class Maker:
 
 
 def _files_of(parameters: Entries) -> dict[str, int]:
-    """Return checksums of the files that settings name, as in "library:FILE"."""
+    """Return CRC-32 checksums of files that settings name, as in "library:FILE"."""
     found = {}
     for name, value in parameters.items():
         path = value.partition(":")[2] if isinstance(value, str) else ""
@@ -134,13 +134,20 @@ def _files_of(parameters: Entries) -> dict[str, int]:
 def make_parts(
     maker: Maker, rows: Dataset, there: dict[int, Record], workers: Workers | None, progress: bool
 ) -> dict[int, Record]:
-    """Make every chunk that has no part yet, and return the records of all parts by number.
+    """Make every chunk without a part, and return the records of all parts by number.
 
-    While one chunk is planned, the next is drawn, and the last ones are judged and written.
+    While one chunk is planned, the next one is drawn and the previous ones are judged and written.
+
+    Args:
+        maker: makes the rows.
+        rows: dataset for the parts.
+        there: records of parts that exist.
+        workers: start to make parts elsewhere; None makes them in this process.
+        progress: whether a progress bar is shown.
     """
     source, records = maker.source, dict(there)
     done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))
-    look = {"unit": " plans", "desc": source.settings.planner, "disable": not progress}
+    options = {"unit": " plans", "desc": source.settings.planner, "disable": not progress}
     pending: deque[Future[Record]] = deque()
 
     def write(make: Callable[[], Made]) -> Record:
@@ -148,7 +155,7 @@ def make_parts(
         rows.write(record["number"], content)
         return record
 
-    with tqdm(total=source.num, initial=done, **look) as bar, ThreadPoolExecutor(2) as pool:
+    with tqdm(total=source.num, initial=done, **options) as bar, ThreadPoolExecutor(2) as pool:
         missing = [number for number in range(source.num_chunks) if number not in there]
         making = workers(maker, missing) if workers else _make_here(maker, missing, pool)
 
@@ -166,7 +173,7 @@ def make_parts(
             wait_until(0)
             for make in making:
                 pending.append(pool.submit(as_here(write), make))
-                wait_until(_UNDER_WAY)
+                wait_until(_PENDING)
             wait_until(0)
     return records
 
@@ -174,7 +181,7 @@ def make_parts(
 def _make_here(
     maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
 ) -> Generator[Callable[[], Made], None, None]:
-    """Plan chunks in this process, and yield what judges them."""
+    """Plan chunks in this process, and yield functions that judge them."""
     with CompileClock() as clock:
         draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)
@@ -184,7 +191,7 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return the times of the manifest but `wall_seconds`, from the records of all parts."""
+    """Return the times of the manifest except `wall_seconds` from the records of all parts."""
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -1,7 +1,7 @@
-"""The chunks of a sweep as tasks of a Ray cluster, for sweeps that outgrow a machine.
+"""The chunks of a sweep as tasks of a Ray cluster.
 
-Every chunk is one task, which returns the content of its part. A worker refuses a chunk unless its
-rows would be those of the run. Where a worker dies, Ray repeats its task on another one.
+Every chunk is one task, which returns the content of its part. A worker rejects a chunk if its rows
+could differ from the rows of the run. If a worker dies, Ray repeats its task on another worker.
 """
 
 import contextlib
@@ -31,15 +31,18 @@ from planner_jax.sweep.chunks import Made, Maker, Workers
 from planner_jax.sweep.sweep import sweep_of
 
 _ADDRESS, _GPUS = "RAY_ADDRESS", "CUDA_VISIBLE_DEVICES"  # environment variables
-_RETRIES = 3  # of a chunk whose worker dies
-_AHEAD = 2  # chunks for each worker that are made or wait to be written
-WORKERS_OF_GPU = 8  # at most, and at most one for two cores: a GPU idles while a worker judges
-_MEMORY = 0.6  # of a GPU, for all of its workers, each of which takes some more to start
+_RETRIES = 3  # attempts to repeat a chunk whose worker died
+_AHEAD = 2  # chunks for each worker that are being made or wait to be written
+WORKERS_OF_GPU = 8  # greatest number; a GPU is idle while one worker judges
+_MEMORY = 0.6  # share of a GPU for all its workers; each needs more memory to start
 
 
 @contextlib.contextmanager
 def workers_of(kind: str | None) -> Iterator[Workers | None]:
-    """Join the cluster of RAY_ADDRESS, or start one of this machine; of kind None, do neither."""
+    """Provide the workers of a cluster within the block; None if `kind` is None.
+
+    Joins the cluster of RAY_ADDRESS, or starts one on this machine.
+    """
     if kind is None:
         yield None
         return
@@ -52,7 +55,7 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     with tempfile.TemporaryDirectory("", "ray-", "/tmp", ignore_cleanup_errors=True) as folder:
         _start(ray, folder)
         try:
-            # JAX starts here with one GPU, as in each worker.
+            # JAX starts in this process with one GPU, as in each worker.
             os.environ[_GPUS] = os.environ.get(_GPUS, "0").partition(",")[0]
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
@@ -69,11 +72,11 @@ def _start(ray: ModuleType, folder: str) -> None:
     try:
         if address:
             host, _, port = address.removeprefix("ray://").rpartition(":")
-            if host and port.isdecimal():  # Ray itself would try for minutes
+            if host and port.isdecimal():  # Ray itself would retry for minutes
                 socket.create_connection((host.strip("[]"), int(port)), timeout=10.0).close()
             how = {"address": address}
         else:
-            # Without this switch Ray takes an address that other machines can reach.
+            # Without this switch Ray listens on an address that other machines can reach.
             os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
             how = {"address": "local", "_node_ip_address": "127.0.0.1", "_temp_dir": folder}
             how |= {"num_cpus": len(os.sched_getaffinity(0)), "include_dashboard": False}
@@ -83,14 +86,14 @@ def _start(ray: ModuleType, folder: str) -> None:
         rule = "the address of a Ray cluster that answers, or left out where Ray starts"
         raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
     finally:
-        with contextlib.suppress(ValueError):  # Ray has replaced it, but in the main thread only
+        with contextlib.suppress(ValueError):  # Ray replaces it in the main thread
             signal.signal(signal.SIGTERM, handler)
 
 
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Have parts of these numbers made, and yield them in order as they are there."""
+    """Start to make parts of these numbers, and yield in order functions that fetch them."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}
@@ -100,26 +103,26 @@ def _make_parts(
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
         memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
         environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
-        how = {"num_gpus": 1.0 / shared, "max_calls": 0}  # a worker stays on its first GPU
+        how = {"num_gpus": 1.0 / shared, "max_calls": 0}  # keeps a worker on its first GPU
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
     run = (maker.sweep.task, maker.source.settings, maker.makers, maker.run)
     order = ray.put(pickle.dumps((environ, config, run)))
     make = ray.remote(num_cpus=1, max_retries=_RETRIES, **how)(_make)
-    waiting, under_way = iter(numbers), deque()
+    waiting, started = iter(numbers), deque()
     while True:
-        following = itertools.islice(waiting, _AHEAD * num - len(under_way))
-        under_way.extend((number, make.remote(order, number)) for number in following)
-        if not under_way:
+        following = itertools.islice(waiting, _AHEAD * num - len(started))
+        started.extend((number, make.remote(order, number)) for number in following)
+        if not started:
             return
-        number, promise = under_way.popleft()
+        number, promise = started.popleft()
         while not ray.wait([promise], timeout=0.5)[0]:
             stopping.check()
         yield functools.partial(_fetch, ray, number, promise)
 
 
 def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
-    """Return the part that a worker has made, or raise its exception here."""
+    """Return the part that a worker has made, or raise its exception."""
     try:
         return ray.get(promise)
     except ray.exceptions.RayTaskError as error:
@@ -131,15 +134,17 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
 
 
 def _make(order: bytes, number: int) -> Made:
-    """Make a part, in a worker."""
+    """Make a part in a worker."""
     return _maker_of(order).make(number)
 
 
 @functools.lru_cache(maxsize=1)
 def _maker_of(order: bytes) -> Maker:
-    """Return what makes the chunks of a run; a worker keeps it, with its compiled programs."""
+    """Return the maker of a run; a worker keeps it with its compiled programs."""
     environ, config, (task, settings, makers, run) = pickle.loads(order)
-    os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)  # an older name, refused beside the new
+    os.environ.pop(
+        "XLA_PYTHON_CLIENT_MEM_FRACTION", None
+    )  # JAX rejects the old name beside the new one
     os.environ.update(environ)
     for name, value in config.items():
         jax.config.update(name, value)

@@ -1,4 +1,4 @@
-"""Several runs side by side: rates, costs, speeds, and which cases tell them apart."""
+"""Comparison of several runs: rates, costs, speeds, and the cases that only some runs solve."""
 
 import csv
 import dataclasses
@@ -19,17 +19,17 @@ from planner_jax.runs.table import align
 from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 
-# Columns of the rows that are read, which all sweeps have.
+# Columns that are read; all sweeps have them.
 _READ = ("index", "success", "failed_limit", "cost", "iterations")
 
 
 @dataclasses.dataclass(frozen=True)
 class ComparedRun:
-    """A finished sweep, and of its B cases what is compared."""
+    """A finished sweep with the compared columns of its B cases."""
 
-    name: str  # as it was given
+    name: str  # path, as the user wrote it
     manifest: Entries
-    deciding: tuple[str, ...]  # names of the settings that decide the cases
+    deciding: tuple[str, ...]  # names of the settings that determine the cases
     index: np.ndarray  # (B,) int
     success: np.ndarray  # (B,) bool
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
@@ -38,12 +38,12 @@ class ComparedRun:
 
     @property
     def settings(self) -> Entries:
-        """The settings of the run."""
+        """Settings of the run."""
         return self.manifest["parameters"]
 
     @property
     def rate(self) -> float:
-        """The share of successes."""
+        """Share of successes."""
         return float(self.success.mean())
 
     @property
@@ -53,23 +53,23 @@ class ComparedRun:
 
 
 class Difference(NamedTuple):
-    """How the success of a run differs from the success of the first one."""
+    """Difference between a run's success and the success of the first run."""
 
     difference: float  # of the rates, -1 to 1
-    difference_low: float  # of its 95 % interval
+    difference_low: float  # ends of its 95 % interval
     difference_high: float
-    # Of the same cases: how many the first run alone solves, how many this one alone, and the
-    # chance of as uneven a split if neither were better (McNemar, exact). None otherwise.
+    # Cases that only the first run and only this run solves, and the p-value of McNemar's exact
+    # test. None for runs of different cases.
     first_only: int | None = None
     this_only: int | None = None
     mcnemar_p: float | None = None
 
 
 def read_run(path: str | os.PathLike) -> ComparedRun:
-    """Read a run to be compared.
+    """Read a run for a comparison.
 
     Raises:
-        ArgumentError: the folder is not that of a whole, finished sweep.
+        ArgumentError: the folder does not hold a complete, finished sweep.
     """
     folder = RunFolder(path, name="RUN")
     manifest, sweep = read_finished(folder)
@@ -82,7 +82,7 @@ def read_run(path: str | os.PathLike) -> ComparedRun:
 
 
 def require_comparable(runs: Sequence[ComparedRun]) -> None:
-    """Raise `ArgumentError` unless there are several runs, of one task, suite and seed."""
+    """Raise `ArgumentError` unless there are several runs of one task, suite and seed."""
     if len(runs) < 2:
         raise ArgumentError("RUN", "the folders of two runs or more", len(runs))
     first = runs[0]
@@ -96,7 +96,7 @@ def require_comparable(runs: Sequence[ComparedRun]) -> None:
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
-    """Return the settings in which the cases of two runs differ, as "name VALUE and VALUE"."""
+    """Return the settings by which the cases of two runs differ, as "name VALUE and VALUE"."""
     return _unlike(first, other, first.deciding)
 
 
@@ -112,12 +112,12 @@ def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> lis
 
 
 def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
-    """Return how much more often a run succeeds than the first one.
+    """Return the difference between the success rates of a run and of the first run.
 
-    Of the same cases only those count that one run alone solves: given how many these are, either
-    run is as likely to have each of them if neither is better (the exact test of [McNemar1947]),
-    and the interval is of [Clopper1934] for its share of them. Of other cases the interval is of
-    [Newcombe1998], from both intervals of [Wilson1927].
+    For runs of the same cases, only the cases that exactly one run solves are used. If neither run
+    is better, each such case is equally likely to be solved by either run (McNemar's exact test).
+    The interval is the Clopper-Pearson interval of the share of this run. For runs of different
+    cases, the interval is Newcombe's, from the Wilson intervals of both rates.
     """
     change = other.rate - first.rate
     if other_cases(first, other):
@@ -128,7 +128,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    if not apart:  # as of no event in so many trials
+    if not apart:  # as of no event in `num` trials
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
     test = binomtest(theirs, apart)
@@ -138,9 +138,9 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
 
 
 def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
-    """Return a row of numbers for every run; those of the difference are empty for the first."""
+    """Return a row of numbers for every run; the first run has no differences."""
     rows = []
-    for place, run in enumerate(runs):
+    for index, run in enumerate(runs):
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]
         low, high = run.interval
         row = {
@@ -161,18 +161,18 @@ def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
             "wall_seconds": times["wall_seconds"],
             **dict.fromkeys(Difference._fields),
         }
-        rows.append(row | difference_of(runs[0], run)._asdict() if place else row)
+        rows.append(row | difference_of(runs[0], run)._asdict() if index else row)
     return rows
 
 
 def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float | None:
-    """Return a measure of the finite ones among values, if there are any."""
+    """Return a measure of the finite values, or None without any."""
     finite = values[np.isfinite(values)]
     return float(measure(finite)) if finite.size else None
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """Return the cases that only some runs solve: index, and what fails in each run."""
+    """Return index and failed limits of the cases that some runs solve and others do not."""
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index
@@ -180,7 +180,7 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
 
 
 def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
-    """Return the comparison as lines of text; list at most `most` cases that differ."""
+    """Return the comparison as lines of text, with at most `most` differing cases."""
     first, *others = runs
     own, rows = first.settings, table_of(runs)
     lines = [f"{first.manifest['kind']}, suite {own['suite']}, seed {own['seed']}", ""]
@@ -205,7 +205,7 @@ def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
 
 
 def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> Iterator[str]:
-    """Yield how one run differs from the first one."""
+    """Yield the differences between a run and the first one."""
     low, high = 100.0 * row["difference_low"], 100.0 * row["difference_high"]
     change = f"[{k}] less [1]: {100.0 * row['difference']:+.2f} points of success"
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
@@ -217,14 +217,14 @@ def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> It
         f"{change}, {interval}; of the same cases [1] alone solves {row['first_only']:,} and [{k}] "
         f"alone {row['this_only']:,}, p = {row['mcnemar_p']:.3g} (McNemar, exact)."
     )
-    # The batch decides no plan but in its last digits.
+    # The batch affects only the last digits of plans.
     names = [name for name in first.settings if name not in ("batch", *first.deciding)]
     if settings := _unlike(first, run, names):
         yield f"    settings that differ: {'; '.join(settings)}"
 
 
 def _cells(rows: Sequence[Entries]) -> list[list[str]]:
-    """Return the table of all runs as text, a line a measure and a column a run."""
+    """Return the table of all runs as text: a line for each measure, a column for each run."""
     spread = [
         f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
     ]
@@ -251,9 +251,9 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
 
 
 def as_csv(runs: Sequence[ComparedRun]) -> str:
-    """Return the comparison as comma-separated text: a column a run, a row a measure or case.
+    """Return the comparison as CSV text: a column for each run, a row for each measure or case.
 
-    The rows of cases hold what fails in each run, for all cases that tell runs apart.
+    The rows of cases hold the limit that fails in each run, for all differing cases.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

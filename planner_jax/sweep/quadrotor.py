@@ -1,4 +1,4 @@
-"""What the runs of every quadrotor task share: columns, and trajectories sampled from rows."""
+"""Parts that the runs of all quadrotor tasks share: columns, and trajectories of rows."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ MOTION = leaves_of(
     ("min_height", "m", "of the propeller plane"),
     ("min_thrust", "m/s^2", "per unit mass"),
     ("max_thrust", "m/s^2", "per unit mass"),
-    ("min_rotor_thrust", "N", "of any rotor; NaN where plans are not asked what the rotors do"),
-    ("max_rotor_thrust", "N", "likewise"),
+    ("min_rotor_thrust", "N", "of any rotor; NaN where rotors have no limits"),
+    ("max_rotor_thrust", "N", "of any rotor; NaN where rotors have no limits"),
     ("continuity_error", "m", "worst jump between pieces"),
     ("head_error", "m", "of the state at time 0"),
 )
 
 
 def _of_recovery(name: str, unit: str, meaning: str) -> Column:
-    """Return a leaf of the ways to rest; null where plans have none."""
+    """Return a column of a leaf of the recovery trajectories; null if plans have none."""
 
     def values(batch: RefereedBatch) -> np.ndarray | None:
         recovery = batch.plans.recovery
@@ -47,18 +47,18 @@ TRAJECTORY = [
         ("durations", "s", "of the pieces", LIST),
         ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
     ),
-    _of_recovery("durations", "s", "of the pieces behind the last contact, to rest; null if none"),
-    _of_recovery("coeffs", "m/s^k", "likewise, as `coeffs`"),
+    _of_recovery("durations", "s", "of the recovery trajectory's pieces; null without one"),
+    _of_recovery("coeffs", "m/s^k", "of the recovery trajectory, as `coeffs`; null without one"),
 ]
 
 _RESTS = {
-    "brake": "to rest where that is cheapest",
-    "home": "back to rest where the case begins",
+    "brake": "a trajectory to standstill at the cheapest place",
+    "home": "a trajectory back to the start",
 }
 
 
 def recovery_remark(parameters: Row) -> list[str]:
-    """Return a sentence on what plans do behind their last contact, if they do anything."""
+    """Return a sentence on the recovery trajectory, if the run has one."""
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
@@ -67,7 +67,7 @@ def recovery_remark(parameters: Row) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class SampledMotion:
-    """A trajectory at N times."""
+    """A trajectory sampled at N times."""
 
     time: np.ndarray  # (N,) [s]
     pos: np.ndarray  # (N, 3) [m]
@@ -79,10 +79,10 @@ class SampledMotion:
 def sample_motion(
     coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
 ) -> SampledMotion:
-    """Sample a trajectory at even times in float64.
+    """Sample a trajectory at evenly spaced times in float64.
 
     Args:
-        coeffs: flat, M pieces x ascending powers of the piece's own time x 3 axes.
+        coeffs: flat: M pieces x ascending powers of the piece's own time x 3 axes.
         durations: (M,) [s].
         num: number of samples.
     """
@@ -95,7 +95,7 @@ def sample_motion(
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
-    """Sample the recovery trajectory of a row, at the plan's times; None where there is none."""
+    """Sample the recovery trajectory of a row, at times of the plan; None without one."""
     if row["recovery_durations"] is None:
         return None
     rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)
@@ -108,10 +108,11 @@ def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
 
 
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the size (N,) [rad/s] of the body rate by the Hopf fibration at zero heading.
+    """Return the magnitude (N,) [rad/s] of the body rate at zero heading.
 
-    From  c = thrust x jerk: |z'| = |c| / |thrust|^2 across the body z axis, and
-    -c_z / (|thrust| (|thrust| + thrust_z)) about it. NaN without thrust and upside down.
+    With  c = thrust x jerk,  the rate about axes across the body z axis is  |c| / |thrust|^2,  and
+    the rate about the body z axis is  -c_z / (|thrust| (|thrust| + thrust_z))  by the Hopf
+    fibration. NaN without thrust and upside down.
     """
     thrust = net_thrust(motion, gravity)
     size = np.linalg.norm(thrust, axis=1)

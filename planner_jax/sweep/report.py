@@ -1,4 +1,4 @@
-"""Table, figures and page of a run, from nothing but its folder."""
+"""Table, figures and page of a run, made from its folder alone."""
 
 import html
 import math
@@ -30,7 +30,7 @@ def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
     """Return manifest and sweep of a folder after a check of the manifest and all parts.
 
     Raises:
-        ArgumentError: the folder is not that of a whole, finished sweep.
+        ArgumentError: the folder does not hold a complete, finished sweep.
     """
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
@@ -45,7 +45,7 @@ def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `ArgumentError` unless a sweep's rows are whole, and its summary counts them."""
+    """Raise `ArgumentError` unless the rows of a sweep are complete and fit its summary."""
     manifest, sweep = read_finished(folder)
     parameters = manifest["parameters"]
     settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
@@ -55,18 +55,18 @@ def require_sound(folder: RunFolder) -> None:
     require_counted(folder, {**manifest["summary"], "example": manifest.get("example")}, counted)
 
 
-def require_counted(folder: RunFolder, told: Mapping[str, object], counted: Entries) -> None:
+def require_counted(folder: RunFolder, summary: Mapping[str, object], counted: Entries) -> None:
     """Raise `ArgumentError` unless a manifest's summary agrees with the counts of the rows."""
     for name, value in counted.items():
-        if not _agree(told.get(name), value):
-            rule = f"a run whose {name} is that of its rows, {value}"
+        if not _agree(summary.get(name), value):
+            rule = f"a run whose {name} fits its rows, {value}"
             raise ArgumentError(
-                folder.name, rule, shown=f"{told.get(name)} in {str(folder.path)!r}"
+                folder.name, rule, shown=f"{summary.get(name)} in {str(folder.path)!r}"
             )
 
 
 def _agree(one: object, other: object) -> bool:
-    """Whether two plain values are the same, but for the order in which numbers were added."""
+    """Return whether two plain values are equal up to rounding."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_agree(one[key], other[key]) for key in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
@@ -77,7 +77,7 @@ def _agree(one: object, other: object) -> bool:
 
 
 def write_report(folder: RunFolder) -> None:
-    """Write `table.md`, `figures/` and `index.html` of a finished run anew."""
+    """Write `table.md`, `figures/` and `index.html` of a finished run."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     folder.figures.mkdir(exist_ok=True)
@@ -92,7 +92,7 @@ def write_report(folder: RunFolder) -> None:
 
 
 def _pick_failures(plans: Dataset) -> list[Row]:
-    """Return the first failures, a few."""
+    """Return the first few failures."""
     failed, first = [], 0
     for rows in plans.parts(["success"]):
         failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()
@@ -120,7 +120,7 @@ tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; 
 
 
 def _page(sweep: Sweep, manifest: Entries, lines: Sequence[str], failures: Sequence[Row]) -> str:
-    """Return `index.html`: everything in the folder of a run on one plain page."""
+    """Return `index.html`: all contents of a run's folder on one plain page."""
     title, rates = html.escape(sweep.title(manifest)), sweep.table(manifest)
     lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
     notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in sweep.remarks(manifest))

@@ -1,4 +1,4 @@
-"""Cases and plans of finished sweeps, read back from their rows bit for bit."""
+"""Cases and plans of finished sweeps, read from their rows bit for bit."""
 
 from typing import NamedTuple
 
@@ -21,9 +21,9 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 class PlannedRow(NamedTuple):
-    """A plan, bit for bit as in its row, and what the referee says against it."""
+    """The plan of a row, bit for bit, and the referee's objection."""
 
-    plan: Plan  # of its robot's class, such as `QuadrotorPlan`
+    plan: Plan  # of the robot's class, such as `QuadrotorPlan`
     sentence: str  # "" where the referee accepts the plan
 
 
@@ -31,23 +31,23 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     """Return the case of a row of a run, read or drawn again.
 
     Raises:
-        ArgumentError: the folder is not that of a whole, finished sweep, or the case that is read
-            or drawn now is another one.
+        ArgumentError: the folder does not hold a complete, finished sweep, or the case differs from
+            the case that was planned.
     """
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases
     if sweep.setting(cases) != manifest["setting"]:
-        rule = "a run whose cases are drawn or read as they were"
+        rule = "a run whose cases are drawn or read as before"
         raise ArgumentError(folder.name, rule, shown=f"others for row {row}")
     return take(cases, 0)
 
 
 def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Return the plan of a row of a run, and what the referee says against it.
+    """Return the plan of a row of a run, and the referee's objection.
 
     Raises:
-        ArgumentError: the folder is not that of a whole, finished sweep, or there is no such row.
+        ArgumentError: the folder does not hold a complete, finished sweep, or has no such row.
     """
     manifest, sweep = read_finished(folder)
     last = manifest["summary"]["num"] - 1
@@ -64,7 +64,7 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
 
 
 def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
-    """Return the plan of a row of a quadrotor; gravity is that of the run's setting."""
+    """Return the plan of a row of a quadrotor, with the gravity of the run's setting."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
@@ -75,7 +75,7 @@ def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
 
 
 def arm_plan(row: Row) -> ArmPlan:
-    """Return the plan of a row of blocks; it begins at the row's `delay`."""
+    """Return the plan of a row of blocks; it starts at the row's `delay`."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )

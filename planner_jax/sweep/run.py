@@ -1,4 +1,4 @@
-"""A sweep: cases in, refereed plans and a report out, in one run folder."""
+"""A sweep: cases are planned and refereed into one run folder, with a report."""
 
 import contextlib
 import dataclasses
@@ -30,7 +30,7 @@ from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """A sweep was stopped by hand; its folder, the message, can be resumed."""
+    """A sweep was interrupted by Ctrl-C; the message is its folder, which can be resumed."""
 
 
 def start_sweep(
@@ -44,12 +44,12 @@ def start_sweep(
     """Plan and referee a sweep into a new folder.
 
     Args:
-        task: that is swept.
-        settings: of the sweep, of the task's class.
+        task: task of the sweep.
+        settings: settings of the sweep, of the task's class.
         out: folder, new or empty.
         progress: show a bar on the standard error stream.
-        workers: "ray", to have the chunks made by a Ray cluster, on all of its GPUs where JAX
-            computes on one here. A row is then that of one device, whatever their number.
+        workers: "ray" has the chunks made by a Ray cluster, on all its GPUs if JAX computes on a
+            GPU in this process. The rows do not depend on the number of devices.
 
     Returns:
         The manifest of the finished run.
@@ -94,23 +94,23 @@ def resume_sweep(
     workers: str | None = None,
     **given: object,
 ) -> Entries:
-    """Finish a sweep that was interrupted or killed; a whole, finished one is left as it is.
+    """Finish a sweep that was interrupted or killed; a complete run is left unchanged.
 
     Parts that are missing, damaged or of another run are planned again.
 
     Args:
-        task: that was swept.
-        out: its folder.
+        task: task of the sweep.
+        out: folder of the run.
         progress: show a bar on the standard error stream.
-        workers: as of `start_sweep`, whoever made the chunks that are there.
-        **given: settings named again; they must be those of the run.
+        workers: as for `start_sweep`; the first session may have used others.
+        **given: settings passed again; they must equal the settings of the run.
 
     Returns:
-        The manifest of the finished run, whose rows are those of an uninterrupted one.
+        The manifest of the finished run. Its rows equal the rows of an uninterrupted run.
 
     Raises:
-        ArgumentError: the folder is not that of such a sweep, a given setting is not the
-            run's, or its rows would not be what they were.
+        ArgumentError: the folder is not the folder of such a sweep, a passed setting differs from
+            the run's, or the rows would differ.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
         WorkersFailed: workers could not make a chunk; the folder can be resumed.
     """
@@ -126,12 +126,12 @@ def resume_sweep(
         session = _session(workers)
         for what, old in manifest["makers"].items():
             if (new := makers_of(session).get(what)) != old:
-                rule = f"resumed by {what} {old}, as it began"
-                raise ArgumentError("out", rule, shown=f"{new}; or begin anew in another folder")
+                rule = f"resumed by {what} {old}, as it started"
+                raise ArgumentError("out", rule, shown=f"{new}; or start again in another folder")
         maker = _maker_of(sweep, settings)
         for entry, known in maker.description.items():
             if known != manifest.get(entry):
-                raise ArgumentError(entry, "the same as when the run began", shown="")
+                raise ArgumentError(entry, "the same as when the run started", shown="")
         if maker.run != manifest["run"]:
             raise ArgumentError(
                 "out", "resumed with the files that its settings named then", shown=""
@@ -142,7 +142,7 @@ def resume_sweep(
 
 
 def _session(workers: str | None) -> Entries:
-    """Return when and where a session begins, and who makes its chunks if not its own process."""
+    """Return start and environment of a session, and its workers if it has any."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     made = {} if workers is None else {"workers": workers}
     return {"started": now, **environment(), **made}
@@ -151,7 +151,7 @@ def _session(workers: str | None) -> Entries:
 def _settings_of_run(
     folder: RunFolder, sweep: Sweep, given: Mapping[str, object]
 ) -> tuple[Entries, SweepSettings]:
-    """Return manifest and settings of a run that may be resumed with some settings named again."""
+    """Return manifest and settings of a run that is resumed, settings passed again checked."""
     manifest = folder.read_manifest()
     if manifest["kind"] != sweep.kind:
         raise ArgumentError(
@@ -167,22 +167,22 @@ def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
 
 
 def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
-    """Return the records of the parts of a run by number; remove files that are none of it."""
+    """Return the records of the parts of a run by number; remove all other files."""
     files, found = folder.plans.files(), {}
     for path in files:
         if not path.is_file():
-            rule = "a run whose parts are plain files"
-            raise ArgumentError(folder.name, rule, shown=f"{str(path)!r}, which is none")
+            rule = "a run whose parts are regular files"
+            raise ArgumentError(folder.name, rule, shown=f"{str(path)!r}, which is not")
     for path in files:
         try:
             number, record = number_of(path), check_part(path)
             if (record.get("run"), record.get("number")) != (manifest["run"], number):
-                raise DamagedPart("is of another run or place")
+                raise DamagedPart("is of another run or number")
             if number in found:
-                raise DamagedPart("is there twice")
+                raise DamagedPart("is a duplicate")
             found[number] = record
         except DamagedPart as error:
-            print(f"planner-jax: {path} {error}; what it held is planned again", file=sys.stderr)
+            print(f"planner-jax: {path} {error}; its cases are planned again", file=sys.stderr)
             path.unlink()
     return found
 
@@ -195,7 +195,7 @@ def _finish(
     workers: Workers | None,
     progress: bool,
 ) -> Entries:
-    """Make everything that is missing, from the first chunk to the report."""
+    """Make all missing parts and the report."""
     source, watch = maker.source, Stopwatch()
     *earlier, session = manifest["sessions"]
     try:
@@ -221,12 +221,12 @@ def _finish(
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
     except ArgumentError:
-        # A case that was drawn late breaks a rule, so that this run can never be finished.
+        # A case of a later chunk breaks a rule, so that this run cannot be finished.
         folder.discard()
         raise
     except (KeyboardInterrupt, WorkersFailed, OSError) as error:
         session.setdefault("seconds", watch.lap())
-        with contextlib.suppress(OSError):  # it may be the disk that is full
+        with contextlib.suppress(OSError):  # the disk may be full
             folder.write_manifest({**manifest, "state": "interrupted"})
         if isinstance(error, KeyboardInterrupt):
             raise SweepInterrupted(str(folder.path)) from None
@@ -236,7 +236,7 @@ def _finish(
 def plan_baselines(
     sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
 ) -> pa.Table:
-    """Return the rows of other planners' plans for one case, with a column `planner`."""
+    """Return rows of other planners' plans for one case, with a column `planner`."""
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
         stopping.check()

@@ -1,4 +1,4 @@
-"""What a run has to know of its task; every task has a sweep, and changes of it what it wants."""
+"""The sweep of a task: everything that a run needs from its task."""
 
 import contextlib
 import dataclasses
@@ -33,19 +33,18 @@ class RunFigure:
     name: str  # of the file
     caption: str
     size: tuple[float, float]  # width and height [inch]
-    draw: Callable[[Figure, RunRows], None]  # takes an empty figure and a `report.RunRows`
+    draw: Callable[[Figure, RunRows], None]  # draws into an empty figure
 
 
 class Sweep(Generic[AnySettings]):
     """The sweep of a task: sources, planning, judging, columns, table and figures.
 
-    What stands here serves any task; a task's own class, named by `SweepSettings.RUN`, replaces
-    what it has better.
+    This class serves any task. The class of a task, named by `SweepSettings.RUN`, overrides parts.
     """
 
-    frame: ClassVar[str] = ""  # axes and times of the columns, in words
+    frame: ClassVar[str] = ""  # axes and time of the columns, as text
     own_columns: ClassVar[Sequence[Column]] = ()
-    single_columns: ClassVar[Sequence[Column]] = ()  # of one case that was asked for alone
+    single_columns: ClassVar[Sequence[Column]] = ()  # of the command `plan`
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure(
             "outcomes.png",
@@ -55,8 +54,8 @@ class Sweep(Generic[AnySettings]):
         ),
     )
     counts: ClassVar[type[Tally]] = Tally  # of rows
-    single_figures: ClassVar[Sequence[RunFigure]] = ()  # of one case that was asked for alone
-    failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column that is shown of a failure
+    single_figures: ClassVar[Sequence[RunFigure]] = ()  # of the command `plan`
+    failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column of the list of failures
         "case": "index",
         "solver's status": "status",
         "referee": "sentence",
@@ -67,11 +66,11 @@ class Sweep(Generic[AnySettings]):
 
     @property
     def kind(self) -> str:
-        """Of a run, as its manifest has it."""
+        """Kind of the run in its manifest."""
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of the run: the task's own, or every leaf of case, plan, verdict."""
+        """Return the columns of the run: `own_columns`, or every leaf of case, plan and verdict."""
         return self.own_columns or leaf_columns(batch)
 
     def planner(self, settings: AnySettings) -> Planner:
@@ -79,7 +78,7 @@ class Sweep(Generic[AnySettings]):
         return self.task.planner(settings.planner, **settings.planner_options())
 
     def other_planners(self, settings: AnySettings) -> Entries:
-        """Return the task's other planners of such cases by name, as far as they are installed."""
+        """Return the task's other planners for such cases by name, if they are installed."""
         own, _ = self.task.split_planner(settings.planner)
         made = {}
         for name in self.task.all_planners():
@@ -90,7 +89,7 @@ class Sweep(Generic[AnySettings]):
         return {name: one for name, one in made.items() if one.case_type is kind}
 
     def require_fit(self, settings: AnySettings, planner: Planner, cases: PyTree) -> None:
-        """Raise `ArgumentError` unless the planner is one of such cases."""
+        """Raise `ArgumentError` unless the planner takes such cases."""
         require(
             isinstance(cases, planner.case_type),
             "planner",
@@ -99,10 +98,10 @@ class Sweep(Generic[AnySettings]):
         )
 
     def open_source(self, settings: AnySettings, batch: int) -> Source:
-        """Return the source of a sweep's cases; `batch` where the settings name none.
+        """Return the source of a sweep's cases; `batch` is the default of the settings.
 
         Raises:
-            ArgumentError: the settings ask for what is not there.
+            ArgumentError: a file or name in the settings does not exist.
         """
         return DrawnSource(**fill_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
@@ -111,44 +110,44 @@ class Sweep(Generic[AnySettings]):
         return plan(planner, cases)
 
     def judge(self, cases: PyTree, plans: PyTree, settings: AnySettings) -> PyTree:
-        """Return the referee's verdict on plans."""
+        """Return the referee's verdicts on plans."""
         return self.task.judge(cases, plans, **settings.judge_options())
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return physics and limits that all cases have in common, for the manifest."""
+        """Return physics and limits that all cases share, for the manifest."""
         return {}
 
     def plan_of_row(self, row: Row, setting: Entries) -> Plan | None:
-        """Return the plan of a row; None where rows of the task are not read back."""
+        """Return the plan of a row; None if the task does not read rows back."""
         return None
 
     def tally(self, settings: AnySettings) -> Tally:
-        """Return an empty count of rows."""
+        """Return a tally without counts."""
         return self.counts()
 
     def title(self, manifest: Entries) -> str:
-        """Return margins of table and page."""
+        """Return the title of table and page."""
         settings = manifest["parameters"]
         name = self.task.name.capitalize()
         return f"{name} sweep, suite {settings['suite']}, planner {settings['planner']}"
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success rates."""
+        """Return the table of success rates."""
         summary, settings = manifest["summary"], manifest["parameters"]
         header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
         cells = rate_cells(summary["successes"], summary["num"])
         return RateTable("Success", header, [[settings["suite"], *cells]])
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return what else a run says of itself at the top, a sentence each."""
+        """Return sentences on findings of the task, for the headline."""
         return []
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return where the numbers come from, a sentence each."""
+        """Return sentences on the origin of the numbers."""
         settings = manifest["parameters"]
         return [
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
-            "A success is the referee's.",
+            "A plan is a success if the referee accepts it.",
         ]
 
 
@@ -179,10 +178,12 @@ def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
 
 
 def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> Entries:
-    """Return leaves of the first case as plain numbers, to six digits to hide float32.
+    """Return leaves of the first case as plain numbers, rounded to six digits.
 
-    Without `names` these are all fields of the tree. Those that are not there, and those that hold
-    fields of their own, are left out.
+    Args:
+        tree: batch of cases, or a part of it.
+        names: fields; by default all. None and nested fields are left out.
+        prefix: of the names in the result.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
     known = {name: vars(tree)[name] for name in names}

@@ -78,11 +78,11 @@ def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_p
     out = copied(runs, "begun", tmp_path)
     makers = manifest_of(out)["makers"]
     for what, value, told in (
-        ("jax", "0.0.1", r"jax 0\.0\.1, as it began, got 0\."),
+        ("jax", "0.0.1", r"jax 0\.0\.1, as it started, got 0\."),
         ("devices of kind", "abacus", "devices of kind abacus, as it"),
-        ("processor", "Z80", "processor Z80, as it began, got "),
-        ("threads of a computation (NPROC)", 99, r"\(NPROC\) 99, as it began, got "),
-        ("files of planner-jax", "0" * 12, "files of planner-jax 000000000000, as it began, got"),
+        ("processor", "Z80", "processor Z80, as it started, got "),
+        ("threads of a computation (NPROC)", 99, r"\(NPROC\) 99, as it started, got "),
+        ("files of planner-jax", "0" * 12, "files of planner-jax 000000000000, as it started, got"),
     ):
         rewritten(out, makers={**makers, what: value})
         with pytest.raises(ArgumentError, match=told):
@@ -96,7 +96,7 @@ def test_parts_of_another_run_are_planned_again(runs, tmp_path):
     for path in (runs / "other" / "plans").iterdir():
         shutil.copy(path, out / "plans")
     ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and ended.err.count("is of another run or place") == 4
+    assert ended.code == 0 and ended.err.count("is of another run or number") == 4
     assert rows_of(out) == rows_of(runs / "whole")
 
 
@@ -105,7 +105,7 @@ def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
     first, *_ = sorted((out / "plans").iterdir())
     first.rename(first.with_name(first.name.replace("000000", "000003")))
     ended = run("sweep", "hit", "--resume", "--out", out)
-    assert ended.code == 0 and "is of another run or place" in ended.err
+    assert ended.code == 0 and "is of another run or number" in ended.err
     assert rows_of(out) == rows_of(runs / "whole")
 
 
@@ -174,5 +174,5 @@ def test_what_is_no_part_of_the_run_is_removed_from_its_rows(runs, tmp_path):
         (out / "plans" / name).write_bytes(part.read_bytes())
     ended = run("sweep", "hit", "--resume", "--out", out)
     assert ended.code == 0 and ended.err.count("planned again") == 4
-    assert "is not a part of a run" in ended.err and "is there twice" in ended.err
+    assert "is not a part of a run" in ended.err and "is a duplicate" in ended.err
     assert rows_of(out) == rows_of(runs / "whole")
