@@ -78,7 +78,7 @@ def test_runs_that_end_alike_differ_by_nothing(pair):
     assert (found.first_only, found.this_only, found.mcnemar_p) == (0, 0, 1.0)
     low, high = found[1:3]
     assert low == -high and (1.0 - high) ** 60 == pytest.approx(0.025)
-    assert "ends alike" in describe([first, first])[-1]
+    assert "by all or none" in describe([first, first])[-1]
 
 
 def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_path):
@@ -93,7 +93,7 @@ def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_pat
     assert found.difference_high == pytest.approx(p2 - p1 + np.hypot(u2 - p2, p1 - l1))
     text = "\n".join(describe([first, other]))
     assert "the cases differ in num 60 and 50, limit_scale 1.0 and 0.5." in text
-    assert "McNemar" not in text and "tell them apart" not in text
+    assert "McNemar" not in text and "only some runs solve" not in text
 
 
 def test_the_command_shows_rates_and_cases_and_writes_them(pair, tmp_path, capsys):
@@ -102,7 +102,7 @@ def test_the_command_shows_rates_and_cases_and_writes_them(pair, tmp_path, capsy
     text = capsys.readouterr().out
     assert "of the same cases [1] alone solves 9 and [2] alone 3, p = 0.146" in text
     assert "settings that differ: planner exact and bat" in text
-    assert "Cases that tell them apart: 12." in text and "and 2 more; --all" in text
+    assert "Cases that only some runs solve: 12." in text and "and 2 more; --all" in text
     rows = {row[0]: row[1:] for row in csv.reader(out.read_text().splitlines())}
     assert rows["planner"] == ["exact", "bat"] and rows["successes"] == ["49", "43"]
     assert rows["case 40"] == ["success", "landing"] and rows["case 51"] == ["speed", "success"]

@@ -269,7 +269,9 @@ def bare(tmp_path_factory):
 def test_the_command_says_that_a_row_goes_on_to_rest(bare, here, capsys):
     assert main(["export", str(bare), "--row", "1", "--to", "csv", "--out", "a.csv"]) == 0
     out, err = capsys.readouterr()
-    told = "planner-jax: row 1 goes on to rest behind its end (brake), within the limits of its"
+    told = (
+        "planner-jax: row 1 is extended by a recovery trajectory (brake) within its case's limits"
+    )
     assert out == "a.csv\n" and err.startswith(told) and err.count("\n") == 1
     assert np.linalg.norm(table(here / "a.csv")[1][-1, 4:7]) < 0.1
     options = ["--row", "1", "--to", "csv", "--out", "b.csv", "--recovery", "none"]

@@ -115,7 +115,7 @@ def test_a_ball_that_flies_away_is_told_so_with_the_limit_that_fails(capsys):
     assert main(["plan", "hit", *away.split()]) == 1
     told = capsys.readouterr()
     assert "TOO_FAR, no plan exists" in told.out
-    assert "Referee on the best that was found: " in told.out and "above its limit" in told.out
+    assert "Referee on the best plan found: " in told.out and "above its limit" in told.out
     assert not told.err
 
 

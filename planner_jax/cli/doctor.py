@@ -1,4 +1,4 @@
-"""`planner-jax doctor`: is this machine fit for planning? Facts, and one timed plan."""
+"""The command `planner-jax doctor`: facts about this machine, and timed plans."""
 
 import dataclasses
 import os
@@ -12,7 +12,7 @@ from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend
 
 _BATCH = 1024  # hits that are planned and refereed
-# Products in float32 err by some 1e-7; those in the ten bits of TF32 by some 1e-3.
+# Products in float32 have errors of 1e-7, products in TF32 with its ten bits of 1e-3.
 _FULL_PRECISION = 1e-5
 
 
@@ -26,7 +26,7 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Look at versions, devices, precision, cache and plans, one after another.
+    """Yield findings on versions, devices, precision, cache and plans.
 
     Raises:
         ArgumentError: JAX has no platform that works.
@@ -60,7 +60,7 @@ def _devices() -> Finding:
 
 
 def _kernels() -> Finding:
-    """Whether kernels take the place of JAX's operations, which on a GPU makes plans quicker."""
+    """Return whether kernels replace JAX's operations, which makes planning faster on a GPU."""
     from planner_jax.lanes import kernels
 
     state = kernels.kernels()
@@ -81,8 +81,8 @@ def _precision() -> Finding:
         product = np.asarray(jnp.matmul(left, right, precision=precision))
         return float(np.max(np.abs(product - exact)) / np.max(np.abs(exact)))
 
-    ours, unasked = error(lax.Precision.HIGHEST), error(lax.Precision.DEFAULT)
-    text = f"float32 products err by {ours:.0e}; unasked JAX would err by {unasked:.0e}"
+    ours, default = error(lax.Precision.HIGHEST), error(lax.Precision.DEFAULT)
+    text = f"float32 products have errors of {ours:.0e}, by the default of JAX {default:.0e}"
     return Finding("precision", text, good=ours < _FULL_PRECISION)
 
 
@@ -97,7 +97,7 @@ def _cache(folder) -> Finding:
 
 
 def _plans() -> Iterator[Finding]:
-    """A hit alone and hits in a batch, timed cold and warm and judged by the referee."""
+    """Yield findings on one hit and on a batch of hits, timed and refereed."""
     import jax
     import numpy as np
 
@@ -110,9 +110,9 @@ def _plans() -> Iterator[Finding]:
     for name, cases in (("one plan", take(batch, 0)), (f"{_BATCH} plans", batch)):
         seconds, plans = [], None
         for _ in range(6):
-            began = time.perf_counter()
+            start = time.perf_counter()
             plans = plan(planner, cases)
-            seconds.append(time.perf_counter() - began)
+            seconds.append(time.perf_counter() - start)
         success = float(np.mean(hit.judge(cases, plans).success))
         text = (
             f"{1e3 * min(seconds[1:]):.2f} ms (the first call, with what had to be compiled, "
@@ -122,7 +122,7 @@ def _plans() -> Iterator[Finding]:
 
 
 def report() -> bool:
-    """Print the findings as they are made; whether all are good."""
+    """Print the findings, and return whether all are good."""
     print(f"planner-jax doctor, Python {platform.python_version()}")
     good = True
     for finding in examine():

@@ -1,7 +1,7 @@
-"""The command line: `planner-jax` with `sweep`, `fly`, `serve`, `train`, `library`, `view`, ...
+"""The command line `planner-jax` with the commands `sweep`, `fly`, `serve`, `train` and others.
 
 Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
-settings: nothing here knows a task.
+settings. Nothing here is specific to a task.
 """
 
 import functools
@@ -22,22 +22,25 @@ _INTERRUPTED = 130  # exit code
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command of these arguments, by default those of the process.
+    """Run a command.
+
+    Args:
+        arguments: words of the command; by default the arguments of the process.
 
     Returns:
-        The exit code: 0, 1 where file system or workers fail, 2 for a bad argument, 130 after
-        Ctrl-C. Where the process hears signals by `stopping.listen`, they end it.
+        The exit code: 0, 1 if file system or workers fail, 2 for a bad argument, 130 after Ctrl-C.
+        If the process handles signals by `stopping.listen`, they end it instead.
     """
-    flags: dict[str, str] = {}  # options of the command by their names in Python
+    flags: dict[str, str] = {}  # options of the command by the names of their arguments
     try:
-        with warnings.catch_warnings():  # of another package, such as a task that does not work
+        with warnings.catch_warnings():  # of another package, such as a task that fails
             warnings.simplefilter("always")
             warnings.showwarning = lambda text, *_, **__: print(
                 f"planner-jax: warning: {text}", file=sys.stderr
             )
             words = sys.argv[1:] if arguments is None else arguments
             if any("\0" in word for word in words):
-                raise BadOption("arguments must hold no NUL")
+                raise BadOption("arguments must not contain NUL")
             options = vars(_make_parser().parse_args(words))
         flags = options.pop("flags")
         return options.pop("command")(options) or 0
@@ -51,14 +54,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except PlannerJaxError as error:
         return fail(error, flags)
     except MemoryError:
-        return fail("the machine has not memory enough: ask for less at once", code=FAILED)
+        return fail("the machine has too little memory: use a smaller batch", code=FAILED)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         return fail(f"{place}{error.strerror or error}", code=FAILED)
 
 
 def _make_parser() -> Parser:
-    """Return the parser of all commands; options are added for the command that is used."""
+    """Return the parser of all commands; options are added when a command is used."""
     parser = Parser(
         prog="planner-jax",
         description="Plan for robots that meet flying objects, thousands of cases at once.",
@@ -75,7 +78,7 @@ def _make_parser() -> Parser:
         return added
 
     for name, words, add in (
-        ("plan", "plan and referee one case that is given in a few numbers", single.add_plan),
+        ("plan", "plan and referee one case that is specified by a few numbers", single.add_plan),
         ("sweep", "plan and referee many cases of a task", runs.add_sweep),
         ("fly", "fly many cases of a task in closed loop", runs.add_fly),
     ):
@@ -83,34 +86,34 @@ def _make_parser() -> Parser:
         tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
         for task in all_tasks().values():
             if {"sweep": task.sweep, "fly": task.flight, "plan": task.single}[name] is not None:
-                # Settings are imported for the one task that is asked for.
+                # Settings are imported for the requested task only.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, argument_default=SUPPRESS)
     words = "train a policy that decides about catches"
     commands.add_parser("train", help=words, fill=runs.add_train, argument_default=SUPPRESS)
-    library = commands.add_parser("library", help="motions that the block planner looks up")
+    library = commands.add_parser("library", help="stored motions that the block planner looks up")
     runs.add_library(library)
     view = command("view", "play a run's flights in a browser", runs.view)
     view.add_argument("run", metavar="RUN", help="folder of a run of flights")
     view.add("--host", default="localhost", help="where to serve (default: localhost)")
-    free = "0 takes a free one (default: 8080)"
-    view.add("--port", type=int, default=8080, metavar="N", help=free)
-    report = command("report", "write table, figures and page of a run anew", runs.report)
+    port = "0 uses a free one (default: 8080)"
+    view.add("--port", type=int, default=8080, metavar="N", help=port)
+    report = command("report", "write table, figures and page of a run again", runs.report)
     report.add_argument("run", metavar="RUN", help="folder of a finished run")
-    words = "ready robots with their main figures, or one of them as a YAML file to begin from"
+    words = "known robots with their main figures, or one of them as a YAML file to start from"
     robots = command("robots", words, single.robots)
     robots.add_argument("robot", metavar="NAME", nargs="?", help="one of them, or a file")
-    words = "plan live for one robot: what it sees in, setpoints out, over UDP"
+    words = "plan live for one robot: observations in, setpoints out, over UDP"
     serve = commands.add_parser("serve", help=words)
     served = serve.add_subparsers(title="tasks", required=True, metavar="task")
     for name, kind in SERVED.items():
         fill = functools.partial(single.add_serve, kind)
         served.add_parser(name, help=task_named(name).summary, fill=fill, argument_default=SUPPRESS)
-    words = "set runs side by side, and say which cases tell them apart"
+    words = "compare runs, and list the cases that only some of them solve"
     compare = command("compare", words, runs.compare)
     compare.add_argument("runs", nargs="+", metavar="RUN", help="folders of finished sweeps")
     compare.add("--all", action="store_true", help="list all cases that differ, not ten")
-    compare.add("--out", metavar="FILE", help="new file, .csv, for the same as a table")
+    compare.add("--out", metavar="FILE", help="new file, .csv, for the comparison as a table")
     words = "write a plan for a controller, or send it in real time"
     commands.add_parser("export", help=words, fill=single.add_export, argument_default=SUPPRESS)
     bench = commands.add_parser("bench", help="measure this machine")

@@ -1,4 +1,4 @@
-"""Parsers of the command line, and the options that the fields of settings become.
+"""Parsers of the command line, and options made from the fields of settings.
 
 Settings are dataclasses whose fields have `metavar` and `help` in their metadata, as
 `planner_jax.runs.settings.option` makes them.
@@ -17,16 +17,16 @@ from planner_jax.core.errors import ArgumentError, MissingExtra, PlannerJaxError
 from planner_jax.core.registry import Task
 from planner_jax.runs.settings import SweepSettings
 
-Options = dict[str, Any]  # values of the options that were given, by their names in Python
+Options = dict[str, Any]  # values of the options that the user passed, by argument names
 FAILED, BAD_ARGUMENT = 1, 2  # exit codes
 
 
 class BadOption(PlannerJaxError):
-    """A word of the command line is not of the kind that its option takes."""
+    """A word of the command line is not of the type of its option."""
 
 
 class Unfinished(PlannerJaxError):
-    """The file system or workers failed while a run was under way; the text says how to go on."""
+    """The file system or workers failed during a run; the text says how to continue."""
 
 
 def fail(
@@ -34,7 +34,10 @@ def fail(
 ) -> int:
     """Print an error in one line and return its exit code.
 
-    `flags` are the options of the command by the names of their arguments.
+    Args:
+        error: the error.
+        flags: options of the command by the names of their arguments.
+        code: exit code.
     """
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
@@ -46,7 +49,7 @@ class Parser(argparse.ArgumentParser):
     """A parser that reports a bad argument in one line.
 
     Args:
-        fill: adds the options, when the parser is first used.
+        fill: adds the options when the parser is first used.
         **look: arguments of `argparse.ArgumentParser`.
     """
 
@@ -56,17 +59,17 @@ class Parser(argparse.ArgumentParser):
         )
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill, self._flags = fill, {}
-        # What is a number and no option: argparse's own pattern knows no exponents, before 3.14.
+        # Words that are numbers, not options; the pattern of argparse lacks exponents.
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the options, and parse words; the flags of the options are one of the results."""
+        """Add the options, and parse words; the result includes the options' flags."""
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
-        """Add an option, of whole numbers or numbers if its type is `int` or `float`."""
+        """Add an option; `type` int or float makes it a number."""
         if type in (int, float):
             how["type"] = functools.partial(_read_number, flag, type)
         self._flags[self.add_argument(flag, **how).dest] = flag
@@ -77,7 +80,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
-    """Return the number that a word of the command line stands for."""
+    """Return the number in a word of the command line."""
     try:
         return kind(word)
     except ValueError:
@@ -86,7 +89,7 @@ def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
 
 
 def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
-    """Add an option for every field of a class of settings; options not given stay absent."""
+    """Add an option for every field of a class of settings; unused options stay absent."""
     hints = typing.get_type_hints(kind)
     names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
     defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}
@@ -112,7 +115,7 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _form_of(field: dataclasses.Field) -> Options:
-    """Return how an option is read that is required, holds several numbers, or is repeated."""
+    """Return the arguments of `add_argument` for required, multiple or repeated values."""
     names = field.metadata["metavar"].split()
     how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
     if len(names) == 1:
@@ -123,9 +126,9 @@ def _form_of(field: dataclasses.Field) -> Options:
 
 
 def _type_of(hint: Any) -> type:
-    """Return the type of an option's words: int or float where its field holds these, or str."""
+    """Return the type of an option's words: int or float if its field holds these, or str."""
     held = typing.get_args(hint) or (hint,)
-    if str in held:  # beside numbers, as where "uniform" may stand for three of them
+    if str in held:  # beside numbers: "uniform" may replace three numbers
         return str
     inner = [_type_of(kind) for kind in held if typing.get_args(kind)]
     return next((kind for kind in (int, float) if kind in held), next(iter(inner), str))

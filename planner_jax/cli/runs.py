@@ -1,4 +1,4 @@
-"""Commands that make run folders or files of motions, and those that read run folders."""
+"""Commands that write run folders or files of motions, and commands that read run folders."""
 
 import contextlib
 import datetime
@@ -25,16 +25,16 @@ _THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 
 
 def add_sweep(task: Task, parser: Parser) -> None:
-    """Add the options of `sweep` of one task."""
+    """Add the options of `sweep` for one task."""
     parser.description = (
-        f"Many cases of one task, {task.summary}:\nplanned, and every plan judged by a referee.\n"
+        f"Plan many cases of one task, {task.summary},\nand judge every plan by a referee.\n"
         "Writes a run folder: index.html, table.md, figures, plans (Parquet), manifest.json."
     )
     add_settings(parser, pkgutil.resolve_name(task.sweep), task)
     where = f"run folder (default: runs/{task.name}-PLANNER-DATE-TIME)"
     parser.add("--out", metavar="DIR", help=where)
     parser.add("--resume", action="store_true", help="finish the interrupted run in --out")
-    where = "ray: chunks are made by a Ray cluster, that of RAY_ADDRESS or one of this machine"
+    where = "ray: chunks are made by a Ray cluster, at RAY_ADDRESS or on this machine"
     parser.add("--workers", metavar="KIND", help=f"{where} (default: by this process)")
     parser.set_defaults(command=lambda given: _sweep(task, given))
 
@@ -50,8 +50,8 @@ def _sweep(task: Task, given: Options) -> None:
     from planner_jax.sweep import run
 
     again = f"finish with: planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
-    rest = functools.partial(_how_to_continue, Path(out), again)
-    with stopping.under_way(rest), _tell_how_to_continue(rest):
+    remainder = functools.partial(_how_to_continue, Path(out), again)
+    with stopping.under_way(remainder), _tell_how_to_continue(remainder):
         if resume:
             manifest = run.resume_sweep(task, out, workers=workers, **given)
         else:
@@ -68,19 +68,19 @@ def _print_sweep(manifest: Options, out: str) -> None:
 
 
 def add_fly(task: Task, parser: Parser) -> None:
-    """Add the options of `fly` of one task."""
+    """Add the options of `fly` for one task."""
     parser.description = (
-        f"Many flights of one task, {task.summary},\n"
+        f"Fly many cases of one task, {task.summary},\n"
         "in MuJoCo MJX with noise and latency.\n"
         "Writes a run folder: index.html, table.md, a figure, plans and flights (Parquet),\n"
         "manifest.json."
     )
     kind = pkgutil.resolve_name(str(task.flight))
     add_settings(parser, kind, task)
-    kept = "flights kept look by look for `planner-jax view`, the first ones (default: 16)"
+    kept = "number of flights recorded for `planner-jax view`, the first ones (default: 16)"
     parser.add("--record", type=int, metavar="K", help=kept)
     film = (
-        "film the first three of these into the run folder, .gif, or .mp4 where ffmpeg is "
+        "film the first three of these into the run folder, .gif, or .mp4 if ffmpeg is "
         "installed (default name: flights.gif)"
     )
     parser.add("--video", nargs="?", const="flights.gif", metavar="FILE", help=film)
@@ -90,13 +90,13 @@ def add_fly(task: Task, parser: Parser) -> None:
 
 def _fly(task: Task, kind: type, given: Options) -> None:
     out = pop_out(given) or _name_run_folder(f"fly-{task.name}")
-    kept = {name: given.pop(name) for name in ("video", "record") if name in given}
+    recorded = {name: given.pop(name) for name in ("video", "record") if name in given}
     settings = kind(**given)
     keep_compiled_programs()
     from planner_jax.sims.run import start_flights
 
-    with _tell_how_to_continue(lambda: "nothing is kept of these flights, fly again"):
-        start_flights(settings, out, **kept)
+    with _tell_how_to_continue(lambda: "these flights are lost, fly again"):
+        start_flights(settings, out, **recorded)
     _print_flights(Path(out))
 
 
@@ -127,16 +127,16 @@ def _train(given: Options) -> None:
         from planner_jax.policies.training import train_from_settings
     except ModuleNotFoundError as error:
         raise MissingExtra("train", error.name, "policies") from None
-    rest = functools.partial(
+    remainder = functools.partial(
         _how_to_continue, Path(out), f"continue with: {_quote_command()}", "training.json"
     )
-    with stopping.under_way(rest), _tell_how_to_continue(rest):
+    with stopping.under_way(remainder), _tell_how_to_continue(remainder):
         train_from_settings(settings, out)
     print(f"{Path(out) / 'policy.npz'}")
 
 
 def report(options: Options) -> None:
-    """Write the report of a run anew."""
+    """Write the report of a run again."""
     from planner_jax.runs.run_folder import RunFolder
 
     folder = RunFolder(options["run"], "RUN")
@@ -157,7 +157,7 @@ def report(options: Options) -> None:
 
 
 def compare(options: Options) -> None:
-    """Print a comparison of runs, and write it as a table if asked."""
+    """Print a comparison of runs, and write it as a table if requested."""
     from planner_jax.sweep.compare import as_csv, describe, read_run, require_comparable
 
     out = pop_out(options, "file")
@@ -205,38 +205,38 @@ def _throughput(given: Options) -> None:
 
 
 def _name_run_folder(name: str) -> str:
-    """Return the run folder of a name and this moment."""
+    """Return the path of a run folder with a name and the current time."""
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _quote_command() -> str:
-    """Return the command of this process, as a shell takes it."""
+    """Return the command of this process, quoted for a shell."""
     return shlex.join(["planner-jax", *sys.argv[1:]])
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return how to continue a stopped run, if the file `sign` shows that it has begun."""
+    """Return how to continue a stopped run, if the file `sign` shows that the run has started."""
     return again if (out / sign).exists() else stopping.NOTHING
 
 
 @contextlib.contextmanager
 def _tell_how_to_continue(
-    rest: Callable[[], str], rule: str = "--out must be a folder that can be written"
+    remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `rest()` to the message of an interruption, and of a file system or workers that fail."""
+    """Add `remainder()` to the message of an interruption or a failure."""
     try:
         yield
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(f"interrupted; {rest()}") from None
+        raise KeyboardInterrupt(f"interrupted; {remainder()}") from None
     except WorkersFailed as error:
-        raise Unfinished(f"--workers must {error.rule}; {rest()}") from None
+        raise Unfinished(f"--workers must {error.rule}; {remainder()}") from None
     except OSError as error:
         shown = f"{error.filename!r} ({error.strerror or error})"
-        raise Unfinished(f"{rule}, got {shown}; {rest()}") from None
+        raise Unfinished(f"{rule}, got {shown}; {remainder()}") from None
 
 
 def add_library(library: Parser) -> None:
-    """Add the commands about files of stored motions."""
+    """Add the commands on libraries of stored motions."""
     commands = library.add_subparsers(title="commands", required=True, metavar="command")
 
     def command(name: str, words: str) -> Parser:
@@ -245,32 +245,32 @@ def add_library(library: Parser) -> None:
         added.set_defaults(command=functools.partial(_library, name))
         return added
 
-    build = command("build", "plan for every pair of cells; goes on where it was interrupted")
+    build = command("build", "plan for every pair of cells; continues an interrupted build")
     build.add("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
     build.add("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
     build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
     build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
-    angles = "six angles [rad] where the arm waits, or six for each of several homes"
+    angles = "six angles [rad] of the arm's home, or six for each of several homes"
     build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
-    show = command("show", "coverage, memory and hashes of a library")
+    show = command("show", "print coverage, memory and hashes of a library")
     show.add("--map", metavar="FILE", help="write a picture of the coverage")
-    check = command("check", "have the referee judge stored motions as answers to random balls")
+    check = command("check", "referee stored motions for random balls")
     check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
     check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
-    repair = command("repair", "plan anew what touches a pole that has moved")
-    place = "where it stands now [m]"
+    repair = command("repair", "plan again the motions that touch a pole that has moved")
+    place = "new position of the pole [m]"
     repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
     repair.add("--out", metavar="FILE", help="of the new library", required=True)
-    repair.add("--retry", action="store_true", help="pairs without a motion, too")
+    repair.add("--retry", action="store_true", help="also plan for pairs without a motion")
 
 
 def _library(name: str, given: Options) -> None:
     keep_compiled_programs()
     run = pkgutil.resolve_name(f"planner_jax.baselines.block.library.command:{name}_library")
     parts = Path(f"{given['path']}.parts")
-    rest = functools.partial(
+    remainder = functools.partial(
         _how_to_continue, parts, f"continue with: {_quote_command()}", "what.json"
     )
     rule = "FILE must be one that can be written"
-    with stopping.under_way(rest, patient=False), _tell_how_to_continue(rest, rule):
+    with stopping.under_way(remainder, patient=False), _tell_how_to_continue(remainder, rule):
         run(**given)

@@ -1,4 +1,4 @@
-"""Commands about one case, one plan or one robot: `plan`, `export`, `serve`, `robots`."""
+"""Commands on one case, one plan or one robot: `plan`, `export`, `serve`, `robots`."""
 
 import contextlib
 import math
@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 
 def add_plan(task: Task, parser: Parser) -> None:
-    """Add the options of `plan` of one task."""
+    """Add the options of `plan` for one task."""
     parser.description = (
-        f"One case, {task.summary}: planned, and the plan judged by a referee.\n"
-        "Says when and where the contact is, and how close the plan comes to each limit."
+        f"Plan one case, {task.summary}, and judge the plan by a referee.\n"
+        "Prints time and position of the contact, and how close the plan comes to each limit."
     )
     add_settings(parser, pkgutil.resolve_name(str(task.single)), task)
     parser.add("--rate", type=float, metavar="HZ", help="setpoints a second (default: 100)")
@@ -52,7 +52,7 @@ def _plan(task: Task, given: Options) -> int:
     if rate is not None and answer.success:
         from planner_jax.export.setpoints import setpoints_of
 
-        setpoints_of(answer.plan, rate)  # raises for a rate that the plan cannot have
+        setpoints_of(answer.plan, rate)  # raises an error if the plan does not allow this rate
     print("\n".join(single.describe(answer)))
     if out is not None:
         _write_answer(task, settings.planner, answer, Path(out), rate)
@@ -62,7 +62,7 @@ def _plan(task: Task, given: Options) -> int:
 def _write_answer(
     task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
 ) -> None:
-    """Write a new folder: the plan, its setpoints where the referee lets it pass, and pictures."""
+    """Write a new folder with plan and pictures, and setpoints if the referee accepts the plan."""
     from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
 
@@ -85,7 +85,7 @@ def add_export(parser: Parser) -> None:
         "One plan of a sweep, or of a file that plan.save wrote, in a format that controllers read."
     )
     parser.add_argument("plans", metavar="RUN", help="folder of a sweep, or a file of plans")
-    rows = "of the plan, from 0; left out for a file that holds one plan"
+    rows = "index of the plan, from 0; left out for a file with one plan"
     parser.add("--row", type=int, metavar="K", help=rows)
     formats = "; ".join(f"{name}: {form.summary}" for name, form in FORMATS.items())
     parser.add("--to", metavar="FORMAT", required=True, help=formats)
@@ -93,9 +93,9 @@ def add_export(parser: Parser) -> None:
     endings = "; ".join(f"{name}: {', '.join(form.writers)}" for name, form in FORMATS.items())
     name = "default: RUN-K-FORMAT with the first ending"
     parser.add("--out", metavar="FILE", help=f"new file; its ending says which ({endings}; {name})")
-    port = "of this machine, to which px4 is sent in real time over UDP in the place of a file"
+    port = "port of this machine that receives px4 in real time over UDP, instead of a file"
     parser.add("--udp", type=int, metavar="PORT", help=port)
-    rest = "how a plan comes to rest behind its end, where it does not do so itself"
+    rest = "recovery trajectory behind a plan that does not end at rest"
     parser.add("--recovery", metavar="NAME", help=f"{rest}: {', '.join(CHOICES)} (default: brake)")
     parser.set_defaults(command=_export)
 
@@ -116,21 +116,21 @@ def _export(given: Options) -> None:
         lacks = recovery is not None and api.lacks_recovery(plan)
         given |= {"recovery": recovery, "case": _case_of(source, row, name) if lacks else None}
         if udp is None:
-            told = str(api.export(plan, out=out, **given))
+            written = str(api.export(plan, out=out, **given))
         else:
-            told = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
+            written = f"{api.stream(plan, udp=udp, **given)} setpoints sent"
     except PlanFileError as error:
         raise error.with_names({"path": "RUN"}) from None
     if against:
         print(f"planner-jax: warning: row {row} fails the referee: {against}", file=sys.stderr)
     if lacks:
-        rest = f"row {row} goes on to rest behind its end ({name}), within the limits of its case"
-        print(f"planner-jax: {rest}; --recovery none leaves that out", file=sys.stderr)
-    print(told)
+        rest = f"row {row} is extended by a recovery trajectory ({name}) within its case's limits"
+        print(f"planner-jax: {rest}; --recovery none leaves it out", file=sys.stderr)
+    print(written)
 
 
 def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
-    """Return the plan of a row of a sweep or a file, and the referee's objection, if known."""
+    """Return a plan of a sweep or a file, and the referee's objection, if known."""
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
         from planner_jax.sweep.rows import read_plan
@@ -144,7 +144,7 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
 
 
 def _case_of(source: str, row: int | None, recovery: str) -> "Case":
-    """Return the case of a row of a sweep, whose limits a recovery trajectory has to keep."""
+    """Return the case of a row of a sweep, whose limits a recovery trajectory must keep."""
     if row is None or not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
         raise ArgumentError("recovery", rule, recovery)
@@ -156,9 +156,9 @@ def _case_of(source: str, row: int | None, recovery: str) -> "Case":
 
 
 def add_serve(kind: type[ServeSettings], parser: Parser) -> None:
-    """Add the options of `serve` of one task."""
+    """Add the options of `serve` for one task."""
     parser.description = (
-        "Takes what is seen of a ball and of the robot as packets of UDP on localhost, plans as\n"
+        "Receives observations of a ball and of the robot as UDP packets on localhost, plans as\n"
         "soon as the ball is known, and answers every packet with the setpoints that are due."
     )
     add_settings(parser, kind)
@@ -178,8 +178,8 @@ def _serve(settings: ServeSettings) -> None:
     server = Server(planner, settings.port)
     server.warm_up()
     report = server.planner.report
-    rest = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
-    with stopping.under_way(rest, bar=False), contextlib.closing(server):
+    remainder = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
+    with stopping.under_way(remainder, bar=False), contextlib.closing(server):
         print(f"Answering on 127.0.0.1:{server.port}; Ctrl-C stops.", flush=True)
         ends = time.monotonic() + (settings.seconds or math.inf)
         server.run(lambda: not stopping.is_stopped() and time.monotonic() < ends)
@@ -188,7 +188,7 @@ def _serve(settings: ServeSettings) -> None:
 
 
 def robots(options: Options) -> None:
-    """Print the ready robots, or one of them as YAML."""
+    """Print the known robots, or one of them as YAML."""
     from planner_jax.robot.quadrotor_file import RobotError, as_yaml
     from planner_jax.robot.quadrotor_models import listing, robot_named
 

@@ -142,9 +142,7 @@ def _make(order: bytes, number: int) -> Made:
 def _maker_of(order: bytes) -> Maker:
     """Return the maker of a run; a worker keeps it with its compiled programs."""
     environ, config, (task, settings, makers, run) = pickle.loads(order)
-    os.environ.pop(
-        "XLA_PYTHON_CLIENT_MEM_FRACTION", None
-    )  # JAX rejects the old name beside the new one
+    os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)  # JAX rejects both names together
     os.environ.update(environ)
     for name, value in config.items():
         jax.config.update(name, value)

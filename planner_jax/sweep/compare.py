@@ -193,9 +193,9 @@ def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
         return lines
     apart = differing([run for _, run in same])
     if not apart:
-        return [*lines, "Every case ends alike in all runs of the same cases."]
+        return [*lines, "Every case is solved by all or none of the runs of the same cases."]
     shown = apart[:most]
-    lines.append(f"Cases that tell them apart: {len(apart):,}.")
+    lines.append(f"Cases that only some runs solve: {len(apart):,}.")
     header = ["case", *(f"[{k}]" for k, _ in same)]
     listed = [[str(at), *(failed or "success" for failed in fails)] for at, fails in shown]
     lines += align([header, *listed])

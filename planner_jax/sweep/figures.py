@@ -25,7 +25,7 @@ FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
 _SAMPLES = 800  # of a plan
 CAPTION = (
     "One plan along its time against the limits, beside the other planners' plans for the same "
-    "case. Thin: the way to rest behind the last contact, where there is one."
+    "case. Thin: the recovery trajectory behind the last contact, if there is one."
 )
 _OF_REST: Look = {"linewidth": 0.9}
 
@@ -33,19 +33,19 @@ _OF_REST: Look = {"linewidth": 0.9}
 class Drawn(NamedTuple):
     """A plan of the figure."""
 
-    row: Row  # of the run
+    row: Row
     motion: SampledMotion  # up to the last contact
-    rest: SampledMotion | None  # behind it
-    look: Look  # of its curves
+    rest: SampledMotion | None  # recovery trajectory
+    look: Look  # style of its lines
 
     def draw(self, axes: Axes, values: Callable[[SampledMotion], np.ndarray]) -> None:
-        """Draw values (N,) of the plan along its time."""
+        """Draw values (N,) of the plan over time."""
         axes.plot(self.motion.time, values(self.motion), **self.look)
         if self.rest is not None:
             axes.plot(self.rest.time, values(self.rest), **{**self.look, **_OF_REST})
 
 
-# What is drawn of a plan: (label of the axis, title, values (N,) of a motion and the gravity).
+# Panels: label of the axis, title, and the function of motion and gravity that returns values (N,).
 PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]] = {
     "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
     "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),
@@ -66,10 +66,14 @@ def quadrotor_figure(
     first: Callable[[Axes, Entries, list[Drawn]], None],
     word: Callable[[Row], str],
 ) -> None:
-    """Draw a quadrotor's plans for the same case along their time against the limits.
+    """Draw plans of several planners for one case over time, with the limits.
 
-    `first` draws the first panel, `panels` names the other four in `PANELS`, and `word` describes a
-    plan that succeeds.
+    Args:
+        figure: empty figure.
+        run: run with the plans.
+        panels: names in `PANELS` of the panels behind the first.
+        first: draws the first panel.
+        word: returns a text on a plan that succeeds.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
@@ -101,18 +105,18 @@ def quadrotor_figure(
     write_verdicts(axes[1, 2], run, plans, word)
 
 
-def look_of(place: int, name: str, row: Row) -> Entries:
-    """Return the look of a plan's curves: dashed if it failed, thick for the sweep's own."""
+def look_of(index: int, name: str, row: Row) -> Entries:
+    """Return the line style of a plan: dashed if it failed, thick for the run's own planner."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
         "linestyle": "-" if row["success"] else (0, (4, 1.5)),
-        "linewidth": 2.2 if place == 0 else 1.5,
-        "zorder": 3 if place == 0 else 2,
+        "linewidth": 2.2 if index == 0 else 1.5,
+        "zorder": 3 if index == 0 else 2,
     }
 
 
 def draw_upper_limit(axes: Axes, limit: float) -> None:
-    """Draw a limit as a dashed line, the forbidden side above it shaded."""
+    """Draw a limit as a dashed line, and shade the forbidden region above it."""
     top = min(max(axes.get_ylim()[1], 1.15 * limit), 3.0 * limit)
     axes.axhline(limit, **DASHED)
     axes.axhspan(limit, top, **FORBIDDEN)
@@ -120,7 +124,7 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
-    """Hover and limits; a bound that only follows from the acceleration's is grey, not red."""
+    """Draw hover thrust and limits; a bound that follows from another limit is grey."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:
@@ -129,7 +133,7 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
     most = setting.get("acceleration")
-    if most is None:  # of a robot whose rotors are the only limit
+    if most is None:  # the rotors are the only limit
         return
     bound = gravity + most
     axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.1 * bound), 3.0 * most))
@@ -144,11 +148,11 @@ def write_verdicts(
     plans: Sequence[tuple[str, Row]],
     word: Callable[[Row], str],
 ) -> None:
-    """Write the legend, each planner with the referee's word."""
+    """Write the legend: each planner with its verdict."""
     axes.axis("off")
     look: Look = {"va": "top", "transform": axes.transAxes}
     row, suite = plans[0][1], run.manifest["parameters"].get("suite")
-    origin = "as asked for" if suite is None else f"suite {suite}"
+    origin = "single case" if suite is None else f"suite {suite}"
     origin = f"scenario {row['scenario']}" if "scenario" in row else origin
     axes.text(
         0.0,
@@ -157,8 +161,8 @@ def write_verdicts(
         **look,
     )
     step = min(0.22, 0.9 / len(plans))
-    for place, (name, row) in enumerate(plans):
-        top = 0.78 - step * place
+    for index, (name, row) in enumerate(plans):
+        top = 0.78 - step * index
         text = f"success: {word(row)}" if row["success"] else f"fails: {row['sentence']}"
         colour = style.PLANNER_COLOURS.get(name, style.INK)
         axes.text(0.0, top, name, color=colour, weight="bold", **look)
@@ -166,7 +170,7 @@ def write_verdicts(
 
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the rate, failures if there are any, and a histogram of iterations."""
+    """Draw the success rate, failures if there are any, and a histogram of iterations."""
     failed = run.manifest["summary"]["failed_limits"]
     widths = [1.0, 1.2, 1.8] if failed else [1.0, 3.0]
     panels = figure.subplots(1, len(widths), width_ratios=widths)
@@ -196,14 +200,14 @@ def _draw_rate(axes: Axes, manifest: Entries) -> None:
 
 
 def _draw_failures(axes: Axes, failed: dict[str, int]) -> None:
-    """Draw how many plans fail each limit first."""
+    """Draw the number of failures by the first limit that fails."""
     style.label(axes, "plans", "", f"First failed limit of {sum(failed.values()):,}")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    places = range(len(failed))
-    axes.barh(places, list(failed.values()), 0.7, color=style.RED)
-    for place, count in zip(places, failed.values(), strict=True):
-        axes.annotate(f" {count:,}", (count, place), va="center")
-    axes.set_yticks(places, list(failed))
+    positions = range(len(failed))
+    axes.barh(positions, list(failed.values()), 0.7, color=style.RED)
+    for index, count in zip(positions, failed.values(), strict=True):
+        axes.annotate(f" {count:,}", (count, index), va="center")
+    axes.set_yticks(positions, list(failed))
     axes.set_ylim(max(len(failed), 4) - 0.5, -0.5)
     axes.margins(x=0.15)
     axes.grid(axis="y", visible=False)

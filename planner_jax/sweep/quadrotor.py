@@ -62,7 +62,7 @@ def recovery_remark(parameters: Row) -> list[str]:
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
-    return [f"Behind the last contact: {words}; a plan is a success with that or not at all."]
+    return [f"Behind the last contact: {words}; a plan is a success only together with it."]
 
 
 @dataclasses.dataclass(frozen=True)

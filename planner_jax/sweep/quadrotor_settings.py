@@ -1,7 +1,7 @@
-"""Settings of sweeps and single cases of quadrotors; a manifest holds all of their robot.
+"""Settings of the sweeps of quadrotors; the manifest holds all parameters of their robot.
 
-Nothing here imports JAX, and robots are imported where one is named, so that a command's help
-needs no NumPy.
+Nothing here imports JAX. Robots are imported when one is named, so that the help of a command needs
+no NumPy.
 """
 
 import dataclasses
@@ -24,16 +24,16 @@ if TYPE_CHECKING:
 
 
 def robot_option(usual: str) -> Any:
-    """Return the field of settings `robot`, a `QuadrotorModel` or None."""
+    """Return the field `robot` of settings, a `QuadrotorModel` or None."""
     words = f"as `planner-jax robots` lists them, or a file .yaml, .yml, .xml (default: {usual})"
     return option(None, "NAME", words)
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the `QuadrotorModel` that a setting names, or None without one.
+    """Return the `QuadrotorModel` that a setting names; None without one.
 
     Raises:
-        ArgumentError: there is no such robot, its file is not sound, or it carries something else.
+        ArgumentError: there is no such robot, its file is not sound, or it has another tool.
     """
     if given is None:
         return None
@@ -55,7 +55,7 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
 
 
 def robot_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the robot of a run, where one was named."""
+    """Return a sentence on the robot of a run, if one was named."""
     robot = parameters.get("robot")
     if robot is None:
         return []
@@ -65,14 +65,14 @@ def robot_remark(parameters: Row) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorSettings(SweepSettings):
-    """The arguments of the sweeps of all quadrotor tasks; a task's own class adds its own."""
+    """Settings that the sweeps of all quadrotor tasks have."""
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
     effort: str = option(EFFORTS[0], "NAME", f"of the planner: {', '.join(EFFORTS)}")
     recovery: str = recovery_option()
 
-    TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
+    TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
     WITHOUT_EFFORT: ClassVar[str]  # the planner that minimises nothing
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""One case that was asked for in a few numbers: its plan, the referee's word, what limits leave."""
+"""One case of the command `plan`: its plan, the referee's verdict, and margins to the limits."""
 
 import abc
 import dataclasses
@@ -30,7 +30,7 @@ SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # of a plan
 
-# Limits of the flight that are bounds from above: name, unit, size at every time.
+# Upper bounds of the flight: name, unit, and function of the value at every time.
 _ABOVE = {
     "speed": ("m/s", lambda motion, gravity: np.linalg.norm(motion.vel, axis=1)),
     "acceleration": ("m/s^2", lambda motion, gravity: np.linalg.norm(motion.acc, axis=1)),
@@ -42,15 +42,15 @@ _ABOVE = {
 class Margin:
     """How close a plan comes to one limit."""
 
-    limit: str  # in words, with its unit
+    limit: str  # name and unit
     reached: float
     allowed: float
-    time: float  # [s], when it is closest
-    least: bool = False  # whether the limit is a bound from below
+    time: float  # [s], at which the plan is closest
+    least: bool = False  # whether the limit is a lower bound
 
     @property
     def share(self) -> float:
-        """Of the limit that is used; above one where it is exceeded, infinite where altogether."""
+        """Used share of the limit; above 1 if it is exceeded, infinite without a finite ratio."""
         part, whole = (self.allowed, self.reached) if self.least else (self.reached, self.allowed)
         if whole > 0.0:
             return max(part, 0.0) / whole
@@ -67,7 +67,7 @@ class Answer:
 
     @property
     def success(self) -> bool:
-        """The referee's word."""
+        """Whether the referee accepts the plan."""
         return bool(self.verdict.success)
 
 
@@ -75,11 +75,11 @@ class Single(abc.ABC, Generic[SingleT]):
     """The single cases of one task.
 
     Args:
-        task: of the cases.
-        settings: of the case, of the task's class, their planner filled in.
+        task: task of the cases.
+        settings: settings of the case, of the task's class, with the planner filled in.
     """
 
-    # Names of a case's fields, where they are not those of the settings behind their last dot.
+    # Settings by fields of the case; by default a setting has the last name of the dotted path.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):
@@ -91,14 +91,14 @@ class Single(abc.ABC, Generic[SingleT]):
 
     @abc.abstractmethod
     def contact(self, answer: Answer) -> list[str]:
-        """Return when and where the contact is, a sentence each."""
+        """Return sentences on time and position of the contact."""
 
     @abc.abstractmethod
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins of the limits that quadrotors of other tasks do not have."""
+        """Return margins of limits that only this task has."""
 
     def answer(self) -> Answer:
-        """Return the plan, and the referee's verdict on it.
+        """Return the plan and the referee's verdict.
 
         Raises:
             ArgumentError: a number of the case breaks a rule.
@@ -119,28 +119,28 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return the answer as lines of text."""
         status = Status(int(answer.plan.status))
         sentence = answer.verdict.sentence()
-        told = f"Planner {self.settings.planner}: {status.name}, {status.message}."
+        planner = f"Planner {self.settings.planner}: {status.name}, {status.message}."
         if answer.success:
-            lines = [*self.contact(answer), told, f"Referee: {sentence}."]
+            lines = [*self.contact(answer), planner, f"Referee: {sentence}."]
         else:
-            lines = ["No plan that keeps every limit was found.", told]
-            lines.append(f"Referee on the best that was found: {sentence}.")
+            lines = ["No plan that keeps every limit was found.", planner]
+            lines.append(f"Referee on the best plan found: {sentence}.")
         return [*lines, "", *_table(self.margins(answer))]
 
     def margins(self, answer: Answer) -> list[Margin]:
-        """Return how close the plan comes to each limit that the case has."""
+        """Return the margins to all limits of the case."""
         of_flight = _of_flight(answer, sample_plan(answer.plan))
         return [*of_flight, *_of_rotors(answer), *self.task_margins(answer)]
 
 
 def sample_plan(found: QuadrotorPlan) -> SampledMotion:
-    """One plan of a quadrotor with its way to rest, if it has one, at even times."""
+    """Sample a plan of a quadrotor with its recovery trajectory at evenly spaced times."""
     coeffs, durations = _pieces(found)
     return sample_motion(coeffs.ravel(), durations, _SAMPLES)
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Coefficients (M, D + 1, 3) and durations (M,) [s] of all that one plan flies."""
+    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan with its recovery."""
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0
@@ -155,8 +155,9 @@ def _closest(
     *,
     least: bool = False,
 ) -> Margin:
-    """Return the margin at the time at which a plan is closest to a limit, or beyond it most."""
-    values = np.nan_to_num(values, nan=-np.inf if least else np.inf)  # no attitude: no limit kept
+    """Return the margin at the time when a plan is closest to a limit, or exceeds it most."""
+    # Without an attitude no limit holds.
+    values = np.nan_to_num(values, nan=-np.inf if least else np.inf)
     at = int(np.argmin(values) if least else np.argmax(values))
     return Margin(words, float(values[at]), float(allowed), float(times[at]), least)
 
@@ -183,7 +184,7 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
 
 
 def _of_rotors(answer: Answer) -> list[Margin]:
-    """Return the margins of the rotors with the least and the greatest thrust."""
+    """Return margins of the least and the greatest thrust of a rotor."""
     rotors = answer.case.limits.rotors
     if rotors is None:
         return []
@@ -214,12 +215,12 @@ def _table(margins: Sequence[Margin]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class OneRow(RunRows):
-    """A case that is of no run, as the figures of runs look at one."""
+    """A case without a run, for the figures of runs."""
 
     row: Row
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Planner and row."""
+        """Return planner and row."""
         return [(self.manifest["parameters"]["planner"], self.row)]
 
 

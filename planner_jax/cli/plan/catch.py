@@ -1,4 +1,4 @@
-"""One catch of one ball or several that was asked for in a few numbers."""
+"""A single catch of one ball or several."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -33,10 +33,10 @@ class SingleCatch(Single[SingleCatchSettings]):
         return self.task.case(path, np.full(num, given.horizon), **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Return a sentence on every ball that meets the net."""
+        """Return a sentence on every catch."""
         lines = []
         targets = answer.case.targets
-        for place, (target, time) in enumerate(
+        for index, (target, time) in enumerate(
             zip(np.asarray(answer.plan.order), np.asarray(answer.verdict.catch_times), strict=True)
         ):
             ball = BallPath(
@@ -46,7 +46,7 @@ class SingleCatch(Single[SingleCatchSettings]):
             ).at(jnp.asarray(time, jnp.float32))
             x, y, z = np.asarray(ball.pos)
             which = f"Ball {target + 1} caught" if len(targets.gravity) > 1 else "Caught"
-            off = 1e3 * float(answer.verdict.net_distance[place])
+            off = 1e3 * float(answer.verdict.net_distance[index])
             lines.append(
                 f"{which} at {time:.3f} s at ({x:.3f}, {y:.3f}, {z:.3f}) m, flying at "
                 f"{float(np.linalg.norm(ball.vel)):.2f} m/s, {off:.1f} mm from the net's centre."
@@ -54,17 +54,17 @@ class SingleCatch(Single[SingleCatchSettings]):
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return the margins of net, angle and horizon, each at the closest catch."""
+        """Return margins of net, angle and horizon, each at the closest catch."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]
-        looks = [
+        limits = [
             ("net's centre to ball [m]", np.asarray(verdict.net_distance), float(net.radius)),
             ("angle of the net [rad]", np.asarray(verdict.angle), float(net.max_angle)),
             ("time of the catch [s]", times, float(horizons[0])),
         ]
         found = []
-        for words, values, allowed in looks:
+        for words, values, allowed in limits:
             at = int(np.argmax(np.nan_to_num(values, nan=-np.inf)))
             found.append(Margin(words, float(values[at]), allowed, float(times[at])))
         return found

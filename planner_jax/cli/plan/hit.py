@@ -1,4 +1,4 @@
-"""One hit that was asked for in a few numbers."""
+"""A single hit."""
 
 import numpy as np
 from jaxtyping import PyTree

@@ -1,7 +1,4 @@
-"""Settings of the command `plan` of each task.
-
-Nothing here imports JAX, so that a command's help is quick.
-"""
+"""Settings of the command `plan` for each task; nothing here imports JAX."""
 
 import dataclasses
 import math
@@ -16,14 +13,14 @@ from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
 _OWN = "(default: the robot's)"
-_MOST_BALLS = 6  # all orders of these are tried
+_MOST_BALLS = 6  # all orders are evaluated
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleSettings:
-    """What the single cases of all quadrotor tasks have; a task's own class adds its own.
+    """Settings of single cases of all quadrotor tasks; the class of a task adds its own.
 
-    A field of several numbers has as many words in its `metavar`.
+    The `metavar` of a field with several numbers has one word for each.
 
     Raises:
         ArgumentError: a value breaks a rule.
@@ -38,28 +35,28 @@ class SingleSettings:
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: object = robot_option("the task's")
-    recovery: str = recovery_option("brake")  # its setpoints leave for a controller
+    recovery: str = recovery_option("brake")  # a controller needs setpoints to standstill
 
-    RUN: ClassVar[str]  # what answers, "module:Class"
-    PLANNER: ClassVar[tuple[str, ...]] = ()  # names of the settings that are the planner's options
-    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # of those that are no argument of the task's `case`
-    TOOL: ClassVar[str]  # that the robot has to carry, "net" or "racket"
+    RUN: ClassVar[str]  # subclass of `Single`, "module:Class"
+    PLANNER: ClassVar[tuple[str, ...]] = ()  # fields that are options of the planner
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # fields that are no arguments of `case`
+    TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL))
         require_recovery(self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
-            if isinstance(value, list):  # as a parser has it
+            if isinstance(value, list):  # from the parser
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
             for number in _numbers(value):
-                # Only a thrust may have no bound.
+                # Only the thrust may be unbounded.
                 sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
                 require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
-        """Return the same with the name of the task's planner filled in, or checked.
+        """Return the settings with the default planner filled in, and the planner's name checked.
 
         Raises:
             ArgumentError: the task has no planner of the name.
@@ -69,12 +66,12 @@ class SingleSettings:
         return dataclasses.replace(self, planner=name)
 
     def planner_options(self) -> Entries:
-        """Return options of the planner that these settings decide."""
+        """Return the options of the planner that these settings decide."""
         own = {name: vars(self)[name] for name in self.PLANNER}
         return own | recovery_options(self.recovery)
 
     def case_options(self) -> Entries:
-        """Named arguments of the task's `case` that are given."""
+        """Return the named arguments of the task's `case`."""
         apart = {"planner", "recovery", *self.PLANNER, *self.ELSEWHERE}
         given = vars(self).items()
         return {name: value for name, value in given if value is not None and name not in apart}
@@ -88,11 +85,11 @@ def _numbers(value: object) -> list[float]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleHitSettings(SingleSettings):
-    """A ball, a target, and what may be other than in the paper."""
+    """A ball, a target, and values that may differ from the paper."""
 
     pos: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m]")
     vel: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m/s]")
-    target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "where it is to land [m]")
+    target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "desired landing point [m]")
     acceleration: float | None = option(None, "A", "greatest [m/s^2] (default: the robot's)")
     hitting_speed: tuple[float, ...] | None = option(
         None, "X Y Z", "greatest at the impact, by axis [m/s] (default: 4 3 4)"
@@ -109,19 +106,21 @@ class SingleHitSettings(SingleSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleCatchSettings(SingleSettings):
-    """One ball by `pos` and `vel`, or any number of `balls`, and until when."""
+    """One ball by `pos` and `vel`, or any number of `balls`, and a horizon."""
 
     pos: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m]")
     vel: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m/s]")
     ball: tuple[tuple[float, ...], ...] = option(
-        (), "X Y Z VX VY VZ", "place and velocity of a ball now; once for each of several"
+        (), "X Y Z VX VY VZ", "position and velocity of a ball now; repeat it for several balls"
     )
-    horizon: float = option(dataclasses.MISSING, "S", "until when to catch [s]")
+    horizon: float = option(dataclasses.MISSING, "S", "latest time of a catch [s]")
     drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
     net_height: float | None = option(None, "L", "over the propellers [m] (default: the robot's)")
     net_radius: float | None = option(None, "R", "of the hoop [m] (default: the robot's)")
     max_angle: float | None = option(
-        None, "A", "between the net's axis and a ball's way back [rad] (default: the robot's)"
+        None,
+        "A",
+        "between net's axis and reversed velocity of a ball [rad] (default: the robot's)",
     )
     decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
 
@@ -143,7 +142,7 @@ class SingleCatchSettings(SingleSettings):
 
     @property
     def balls(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-        """Place and velocity of every ball."""
+        """Position and velocity of every ball."""
         if self.pos is not None and self.vel is not None:
             return [(self.pos, self.vel)]
         return [(ball[:3], ball[3:]) for ball in self.ball]

@@ -1,4 +1,4 @@
-"""The columns of a block run: ball, plan and verdict."""
+"""Columns of a block run: ball, plan and verdict."""
 
 import numpy as np
 
@@ -6,20 +6,26 @@ from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
 from planner_jax.studies.block.flight_fit import Sight
 
-FRAME = "base of the robot, z up; times from the moment at which the ball is first seen"
+FRAME = "base of the robot, z up; times from the first observation of the ball"
 
 COLUMNS = [
     known.INDEX,
     *leaves_of(
         "cases",
-        ("ball_pos", "m", "of the ball when it is first seen", VECTOR, "ball.pos"),
-        ("ball_vel", "m/s", "its velocity then", VECTOR, "ball.vel"),
+        ("ball_pos", "m", "of the ball at its first observation", VECTOR, "ball.pos"),
+        ("ball_vel", "m/s", "of the ball at its first observation", VECTOR, "ball.vel"),
         ("delay", "s", "until the arm may start"),
-        ("start_angles", "rad", "of the six joints until then", LIST, "angles"),
-        ("start_rates", "rad/s", "of the joints then", LIST, "rates"),
-        ("ends_at_rest", "", "whether the arm has to stand when it meets the ball", known.BOOL),
-        ("offset", "m", "greatest distance of the ball from the shield's middle at the contact"),
-        ("tilt_limit", "rad", "greatest angle off straight on", known.NUMBER, "tilt"),
+        ("start_angles", "rad", "of the six joints until the delay", LIST, "angles"),
+        ("start_rates", "rad/s", "of the joints until the delay", LIST, "rates"),
+        ("ends_at_rest", "", "whether the arm must be at rest at the contact", known.BOOL),
+        ("offset", "m", "greatest distance of the ball from the shield's middle at contact"),
+        (
+            "tilt_limit",
+            "rad",
+            "greatest angle between shield's normal and ball's path",
+            known.NUMBER,
+            "tilt",
+        ),
     ),
     *leaves_of(
         "plans",
@@ -28,7 +34,7 @@ COLUMNS = [
         (
             "motion_durations",
             "s",
-            "of the pieces, the first from the delay on",
+            "of the pieces; the first starts at the delay",
             LIST,
             "motion.durations",
         ),
@@ -36,37 +42,35 @@ COLUMNS = [
     *known.SOLVER,
     *leaves_of(
         "verdict",
-        ("execution_time", "s", "how long the arm moves"),
-        ("contact_time", "s", "when the shield meets the ball"),
-        ("miss", "m", "of the ball from the shield's middle then"),
-        ("tilt", "rad", "of the shield's normal against the ball's way then"),
+        ("execution_time", "s", "duration of the motion"),
+        ("contact_time", "s", "of the ball with the shield"),
+        ("miss", "m", "of the ball from the shield's middle at contact"),
+        ("tilt", "rad", "of the shield's normal from the ball's path at contact"),
         ("velocity_share", "1", "greatest rate over its limit"),
         ("acceleration_share", "1", "greatest acceleration over its limit"),
         ("pole_clearance", "m", "least"),
         ("floor_clearance", "m", "least"),
         ("rig_clearance", "m", "least"),
         ("base_clearance", "m", "least"),
-        ("self_clearance", "m", "least, of the arm's parts and the shield from each other"),
+        ("self_clearance", "m", "least between parts of the arm and the shield"),
         ("failed_part", "", "joint or links of the first limit that fails, or empty", known.TEXT),
     ),
     *known.OUTCOME,
 ]
 
-# What runs with --perception have besides, and what those with --planning-budget have.
+# Columns of runs with --perception, and of runs with --planning-budget.
 SEEN_COLUMNS = [
-    Column(
-        "sight", "", "what became of looking for the ball", known.TEXT, lambda batch: _sights(batch)
-    ),
+    Column("sight", "", "outcome of the observation", known.TEXT, lambda batch: _sights(batch)),
     *leaves_of(
         "plans",
         ("sightings", "", "frames with the ball until the first fit", known.COUNT),
         ("fit_error", "m", "of the first fit, across the flight midway between the boxes"),
-        ("fit_std", "m", "what it is believed to be"),
+        ("fit_std", "m", "estimated standard deviation of this error"),
         ("last_fit_error", "m", "of the last fit"),
-        ("motions", "", "that were begun", known.COUNT),
+        ("motions", "", "number of started motions", known.COUNT),
     ),
 ]
-TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan alone"))
+TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
 
 
 def _sights(batch: RefereedBatch) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What blocks add to a sweep: rows of their own, how long the arm moves, and what it saw."""
+"""The sweep of blocks: rows, execution times, and results of perception."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -31,12 +31,12 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.plan import BlockPlan
 
-_ROOM = 0.1  # [m], of a ball that may be met off the shield's middle
+_ROOM = 0.1  # [m], tolerance of a contact beside the shield's middle
 
 
 @struct.dataclass
 class TimedPlan(BlockPlan):
-    """A plan that was waited for."""
+    """A plan with the time that planning took."""
 
     planning_time: Array  # () [s]
 
@@ -44,14 +44,17 @@ class TimedPlan(BlockPlan):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class CountedPlanner(Planner[BlockCase, TimedPlan]):
-    """Plans one after another by the clock; a plan that comes too late begins so much later."""
+    """Planner of one case after another that counts its own planning time.
+
+    A motion starts later by the time that planning exceeds `allowed`.
+    """
 
     case_type: ClassVar[type] = BlockCase
     planner: Planner
-    allowed: float  # [s], that planning may take; in the delay already
+    allowed: float  # [s] of planning, included in the delay
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Return the plans of a batch, up to where they meet the balls."""
+        """Return plans of a batch, up to the contact with the ball."""
         plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)
@@ -59,10 +62,10 @@ class CountedPlanner(Planner[BlockCase, TimedPlan]):
 
 
 class BlockTally(Tally):
-    """Sums up how long the arm moves, how well balls were seen, and how long planning took."""
+    """Counts with means of execution time, errors of fits, and planning times."""
 
     MEANS = ("execution_time",)
-    READS = (*COUNTED, *MEANS, "fit_error", "planning_time")  # the last two where they are
+    READS = (*COUNTED, *MEANS, "fit_error", "planning_time")  # the last two in some runs only
 
     def __init__(self) -> None:
         super().__init__()
@@ -76,7 +79,7 @@ class BlockTally(Tally):
                 values.append(rows[name].to_numpy())
 
     def summary(self) -> Entries:
-        """Return those of every sweep; with a camera or a clock also errors [m] and times [s]."""
+        """Return the summary; with a camera or a clock also errors [m] and times [s]."""
         found = super().summary()
         if self._errors:
             errors = np.concatenate(self._errors)
@@ -90,17 +93,17 @@ class BlockTally(Tally):
 
 
 class BlockSweep(Sweep[BlockSettings]):
-    """Arms that block thrown balls."""
+    """Sweeps of arms that block thrown balls."""
 
     frame, counts = FRAME, BlockTally
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of blocks, and what the arms saw or waited for."""
+        """Return the columns of blocks, with columns of perception or planning time."""
         more = {SeenPlan: SEEN_COLUMNS, TimedPlan: TIMED_COLUMNS}.get(type(batch.plans), [])
         return [*COLUMNS, *more]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Return the planner of a run; `ArgumentError` where its file is no library."""
+        """Return the planner of a run; raise `ArgumentError` if its file is not a library."""
         planner = super().planner(settings)
         if settings.perception:
             for name in ("replan", "observe_longer"):
@@ -108,7 +111,7 @@ class BlockSweep(Sweep[BlockSettings]):
                 may = isinstance(planner, OnlineBlock) or value == 0.0
                 require(may, name, "0 for a planner other than online", value)
             own = not isinstance(planner, LibraryBlock)
-            require(own, "planner", "one that plans for the very ball", settings.planner)
+            require(own, "planner", "one that plans for the individual ball", settings.planner)
             names = (
                 "observe",
                 "overhead",
@@ -124,13 +127,13 @@ class BlockSweep(Sweep[BlockSettings]):
         return planner
 
     def other_planners(self, settings: BlockSettings) -> Entries:
-        """Return the task's other planners; none where a camera or a clock matters."""
+        """Return the task's other planners; none with perception or a clock."""
         if settings.perception or settings.planning_budget is not None:
             return {}
         return super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
-        """Raise `ArgumentError` unless the planner is one of such cases, and a library of these."""
+        """Raise `ArgumentError` unless the planner takes such cases, and its library fits them."""
         if isinstance(planner, SeeingArms | CountedPlanner):
             planner = planner.planner
         super().require_fit(settings, planner, cases)
@@ -138,11 +141,11 @@ class BlockSweep(Sweep[BlockSettings]):
             planner.check(cases)
 
     def plan_of_row(self, row: Row, setting: Entries) -> ArmPlan:
-        """Return the plan of a row; it begins when the arm may start, at the row's `delay`."""
+        """Return the plan of a row; it starts when the arm may start, at the row's `delay`."""
         return arm_plan(row)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return how long the arm moves, how well the ball was seen, and how long planning took."""
+        """Return sentences on execution time, fits of the flight, and planning time."""
         summary, found = manifest["summary"], []
         if (mean := summary["mean_execution_time"]) is not None:
             found.append(f"The arm moves for {mean:.3f} s, in the mean of the successes.")

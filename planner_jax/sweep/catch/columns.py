@@ -1,7 +1,7 @@
-"""The columns of a catch run: targets, decision, catches and verdict.
+"""Columns of a catch run: targets, decision, catches and verdict.
 
-N targets, so that lists of a row have N entries, or N points one behind the other. Those of
-the decision, the plan and the verdict are in the order of catching.
+For N targets, a list of a row has N entries, or N points in sequence. Lists of the decision, the
+plan and the verdict are in the order of catching.
 """
 
 import numpy as np
@@ -17,7 +17,7 @@ _WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
 
 
 def _target(name: str, unit: str, meaning: str, path: str) -> Column:
-    """Return a leaf of the targets at a dotted path; null for targets of a class without it."""
+    """Return the column of a leaf of the targets; null if their class does not have it."""
 
     def values(batch: known.RefereedBatch) -> known.Values:
         leaf = batch.cases.targets
@@ -45,8 +45,8 @@ COLUMNS = [
     _target("swing_phase", "rad", "of a swinging target at time 0", "phase"),
     *leaves_of(
         "cases",
-        ("present", "", "which of the targets there are", _FLAGS),
-        ("horizon", "s", "until when each target may be caught", LIST),
+        ("present", "", "whether each target exists", _FLAGS),
+        ("horizon", "s", "latest time to catch each target", LIST),
     ),
     START,
     *leaves_of(
@@ -60,11 +60,16 @@ COLUMNS = [
     *known.OUTCOME,
     *leaves_of(
         "verdict",
-        ("caught", "", "whether each catch holds, the way there aside", _FLAGS),
+        ("caught", "", "whether each catch keeps its own limits", _FLAGS),
         ("num_caught", "", "of the targets", known.COUNT),
-        ("net_distance", "m", "net's centre to target at each catch", LIST),
-        ("net_offset", "m", "its part along the net's axis", LIST),
-        ("angle", "rad", "net's axis to the target's way back at each catch", LIST),
+        ("net_distance", "m", "from the net's centre to the target at each catch", LIST),
+        ("net_offset", "m", "component of this distance along the net's axis", LIST),
+        (
+            "angle",
+            "rad",
+            "between net's axis and reversed target velocity at each catch",
+            LIST,
+        ),
     ),
     *MOTION,
     *TRAJECTORY,

@@ -20,7 +20,7 @@ from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
 
 
 def target_paths(row: Row) -> BallPath | HarmonicPath:
-    """Return the targets, leaves with a leading axis N."""
+    """Return the targets of a row; leaves have a leading axis N."""
 
     def leaf(name: str, *trailing: int) -> jax.Array:
         return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
@@ -33,7 +33,7 @@ def target_paths(row: Row) -> BallPath | HarmonicPath:
 
 
 def target_positions(row: Row, times: np.ndarray) -> np.ndarray:
-    """Return where all targets are at some times (K,) [s], (N, K, 3) [m]."""
+    """Return the positions (N, K, 3) [m] of all targets at times (K,) [s]."""
     return np.asarray(_positions(target_paths(row), jnp.asarray(times, jnp.float32)))
 
 
@@ -43,7 +43,7 @@ def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
 
 
 class SampledCatch(NamedTuple):
-    """A row, and its quadrotor, net and N targets at K times."""
+    """A row with its quadrotor, net and N targets at K times."""
 
     row: Row
     motion: SampledMotion
@@ -51,11 +51,11 @@ class SampledCatch(NamedTuple):
     centre: np.ndarray  # (K, 3) [m], of the hoop
     radius: float  # [m], of the hoop
     targets: np.ndarray  # (N, K, 3) [m]
-    catches: np.ndarray  # (n,) places of the n catches among the times
+    catches: np.ndarray  # (n,) indices of the times of the catches
 
 
 def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
-    """Return a row whose plan has been sampled, with the physics of the manifest's `setting`."""
+    """Return a row with sampled plan; `setting` holds the physics of the manifest."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -66,9 +66,9 @@ def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCa
 
 
 def due_distance(plan: SampledCatch) -> np.ndarray:
-    """Return distance (K,) [m] from the net's centre to the target that is to be caught next.
+    """Return the distance (K,) [m] from the net's centre to the next target to be caught.
 
-    NaN at the first time after a catch, so that curves have a gap there.
+    NaN at the first time after a catch, so that the line has a gap there.
     """
     times, num = plan.motion.time, len(plan.catches)
     place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
@@ -79,7 +79,7 @@ def due_distance(plan: SampledCatch) -> np.ndarray:
 
 _SAMPLES = 1601
 _ROTORS = 0.165  # [m], half the diagonal between the paper's propellers
-_CLOSE, _AROUND = 0.5, 0.4  # [m], half side of a close-up; [s], the way shown in it
+_CLOSE, _AROUND = 0.5, 0.4  # [m], half side of a close-up; [s], half of the time shown in it
 _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
 
 
@@ -100,12 +100,12 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
     style.label(views[1], "x [m]", "y [m]", "From above")
     num = len(plan.catches)
     panels = right.subplots(max(-(-num // 2), 2), 2 if num > 2 else 1).flat
-    for place, (axes, at) in enumerate(zip(panels, plan.catches, strict=False)):
-        _draw_view(axes, plan, 2, only=place)
+    for index, (axes, at) in enumerate(zip(panels, plan.catches, strict=False)):
+        _draw_view(axes, plan, 2, only=index)
         x, _, z = np.nan_to_num(plan.centre[at])
         axes.set(xlim=(x - _CLOSE, x + _CLOSE), ylim=(z - _CLOSE, z + _CLOSE), aspect="equal")
         axes.tick_params(labelsize=8)
-        style.label(axes, "", "", f"Catch {place + 1}, {motion.time[at]:.2f} s")
+        style.label(axes, "", "", f"Catch {index + 1}, {motion.time[at]:.2f} s")
     for axes in panels[num:]:
         axes.axis("off")
     entries = [
@@ -113,31 +113,31 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
         Line2D([], [], color=style.RED, label="net"),
         Line2D([], [], color=style.INK, marker="s", markersize=4, label="target from time 0"),
         Line2D([], [], color=style.INK, marker="o", linestyle="", label="catch"),
-        Line2D([], [], color=style.INK, linestyle=":", label="target, if not caught"),
+        Line2D([], [], color=style.INK, linestyle=":", label="target, if it is not caught"),
     ]
     figure.legend(handles=entries, loc="outside upper center", ncols=len(entries))
 
 
 def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest coordinates (3,) [m] that hold the plan and every target until caught."""
+    """Return least and greatest coordinates (3,) [m] of the plan and of targets until caught."""
     caught = zip(plan.row["order"], plan.catches, strict=False)
     paths = [plan.targets[target][: at + 1] for target, at in caught]
     points = np.concatenate([plan.motion.pos, plan.centre, *paths])
-    points = np.nan_to_num(points)  # of a plan that is not finite too
+    points = np.nan_to_num(points)  # the plan may not be finite
     low, high = points.min(axis=0), points.max(axis=0)
-    # No side is so short that its panel cannot be read.
+    # Keep panels high enough to be read.
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + 2.0 * _ROTORS
     half = np.maximum(half, 0.25 * half.max())
     return middle - half, middle + half
 
 
 def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = None) -> None:
-    """Paths and catches in the plane of x and a second axis; `only` one catch, close up."""
+    """Draw paths and catches in the plane of x and a second axis; `only` selects one catch."""
     where, catches, time = [0, second], plan.catches, plan.motion.time
-    for place, at in enumerate(catches):
-        if only not in (None, place):
+    for index, at in enumerate(catches):
+        if only not in (None, index):
             continue
-        target = plan.row["order"][place]
+        target = plan.row["order"][index]
         path, colour = plan.targets[target][:, where], _TARGETS[target % len(_TARGETS)]
         axes.plot(*path[: at + 1].T, color=colour, linewidth=1.6)
         axes.plot(*path[at:].T, color=colour, linewidth=1.0, linestyle=":", alpha=0.7)
@@ -150,7 +150,7 @@ def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = N
 
 
 def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha: float) -> None:
-    """Hoop, stick and rotor circle at one time."""
+    """Draw hoop, stick and rotors at one time."""
     axis, centre, pos = plan.axis[at], plan.centre[at], plan.motion.pos[at]
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= max(np.linalg.norm(across), 1e-9)
@@ -167,12 +167,12 @@ _LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw net distance, speed, body rate, thrust and jerk of plans for the same case."""
+    """Draw net distance, speed, body rate, thrust and jerk of plans for one case."""
     quadrotor_figure(figure, run, _PANELS, _draw_distances, _word)
 
 
 def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw distance of the net to the target that it catches next."""
+    """Draw the distance from the net to the next target to be caught."""
     for plan in plans:
         away = due_distance(sample_catch(plan.row, plan.motion, setting))
         axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)

@@ -1,4 +1,4 @@
-"""What a catch sweep is asked to do."""
+"""Settings of a catch sweep."""
 
 import dataclasses
 import math
@@ -15,7 +15,7 @@ NET_TESTS = ("plane", "ball")  # of `referee_catches`
 
 @dataclasses.dataclass(frozen=True)
 class CatchSettings(QuadrotorSettings):
-    """The arguments of a catch sweep."""
+    """Settings of a catch sweep."""
 
     decide: str = option(
         "best", "NAME", f"order and first times: {', '.join(DECISIONS)}, policy:FILE"
@@ -26,8 +26,8 @@ class CatchSettings(QuadrotorSettings):
     net_test: str = option(
         "plane",
         "NAME",
-        f"where the net's radius counts, {' or '.join(NET_TESTS)}: across the net in its plane, "
-        "or all around its centre",
+        f"how the net's radius is tested, {' or '.join(NET_TESTS)}: within the plane of the net, "
+        "or in all directions from its centre",
     )
 
     TOOL: ClassVar[str] = "net"
@@ -36,7 +36,7 @@ class CatchSettings(QuadrotorSettings):
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
-    GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets at once: 1 MB a case
+    GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets take 1 MB for each case
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -47,7 +47,7 @@ class CatchSettings(QuadrotorSettings):
 
     @property
     def case_bytes(self) -> int:
-        """More where all orders of several targets are looked at."""
+        """Memory [bytes] of one case; more if all orders of several targets are evaluated."""
         suite = SUITES.get(self.suite or next(iter(SUITES)))
         all_orders = self.decide == "best" and suite is not None and not suite.optional
         orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1

@@ -1,4 +1,4 @@
-"""What catches add to a sweep: targets caught, their times, the decision, and the paper's rates."""
+"""The sweep of catches: targets, times, decisions, and the rates of [Yu2023catch]."""
 
 import numpy as np
 import pyarrow as pa
@@ -20,11 +20,11 @@ from planner_jax.task.catch.spec import SUITES
 
 _SOLVED = ("CONVERGED", "FEASIBLE")
 _DECISIONS = {
-    "best": "the most promising of all orders planned, the earliest last catch kept",
-    "greedy": "next whatever can be caught earliest",
-    "random": "next any that can be caught",
-    "given": "the targets as they come, at even shares of the horizon",
-    "policy": "those of a network trained by reinforcement",
+    "best": "the most promising orders are planned; the earliest last catch is selected",
+    "greedy": "next the target that can be caught earliest",
+    "random": "next a random target that can be caught",
+    "given": "targets in the order of the case, at evenly spaced times up to the horizon",
+    "policy": "by a network trained with reinforcement learning",
 }
 _NET_TESTS = {
     "plane": "5 mm from the net's plane and there within its radius",
@@ -33,13 +33,13 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts targets caught, times of the catches and the optimal time ratio too."""
+    """Counts with targets caught, times of the catches, and the optimal time ratio."""
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
     def __init__(self, decides: bool = True) -> None:
         super().__init__()
-        self._decides = decides  # whether plans begin at the decision's times; else it has no ratio
+        self._decides = decides  # whether plans start from the times of a decision
         self._shares = self._ratios = self._times = 0.0
         self._num_ratios = self._num_caught = 0
 
@@ -58,7 +58,7 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Rates as fractions, 0 to 1, and times [s], for the manifest; None where unknown."""
+        """Return rates from 0 to 1 and times [s]; None if unknown."""
         return {
             **super().summary(),
             "caught": self._shares / self.num,
@@ -68,7 +68,7 @@ class CatchTally(Tally):
 
 
 class CatchSweep(Sweep[CatchSettings]):
-    """Quadrotors that catch flying targets with a net."""
+    """Sweeps of quadrotors that catch flying targets with a net."""
 
     frame, own_columns, single_columns = FRAME, COLUMNS, COLUMNS
     figures = (
@@ -90,7 +90,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
 
     def plan_of_row(self, row: Row, setting: Entries) -> QuadrotorPlan:
-        """Return the plan of a row, without its order and times of catches."""
+        """Return the plan of a row, without order and times of its catches."""
         return quadrotor_plan(row, setting)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
@@ -98,25 +98,25 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Success and optimal time ratio, beside Tables I and III of [Yu2023catch], every suite."""
+        """Return success and optimal time ratio beside Tables I and III of [Yu2023catch]."""
         summary, settings = manifest["summary"], manifest["parameters"]
         planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
         header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]
         header += ["Catch Planner, paper %", "Catch Planner, paper OTR", "MPP, paper %"]
-        strong, words = names.index(settings["suite"]), ("success", "time_ratio", "mpp_success")
+        strong, fields = names.index(settings["suite"]), ("success", "time_ratio", "mpp_success")
         rows = []
-        for place, name in enumerate(names):
+        for index, name in enumerate(names):
             own = ["", "", "", ""]
-            if place == strong:
+            if index == strong:
                 ratio = _number(summary["optimal_time_ratio"], 3)
                 own = [*rate_cells(summary["successes"], summary["num"]), ratio]
             suite = SUITES.get(name)
-            paper = [None if suite is None else vars(suite)[word] for word in words]
+            paper = [None if suite is None else vars(suite)[field] for field in fields]
             rows.append([name, *own, *map(_number, paper, (1, 3, 1))])
         return RateTable("Success beside the paper", header, rows, strong)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return what was caught, when, and how close the decision was."""
+        """Return a sentence on targets caught, their times and the optimal time ratio."""
         summary = manifest["summary"]
         text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
         if summary["mean_catch_time"] is not None:
@@ -133,19 +133,19 @@ class CatchSweep(Sweep[CatchSettings]):
             *robot_remark(settings),
             *recovery_remark(settings),
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}. "
-            "Suites of a name are of the paper's kind; the paper gives no ranges of its own.",
+            "Suites are modelled on suites of the same name in the paper, which states no ranges.",
             f"Order and first times, decision {settings['decide']}: "
             f"{_DECISIONS[settings['decide'].partition(':')[0]]}.",
             f"Limits: speed {limits['speed']:g} m/s, body rate {limits['body_rate']:g} rad/s, "
             f"thrust {limits['min_thrust'] / gravity:.3g} to {limits['max_thrust'] / gravity:.3g} "
             f"g, height {limits['min_height']:g} m; scale {settings['limit_scale']:g} on speed, "
             "body rate and the thrust's distance from hover.",
-            "A success is the referee's: all targets caught and every limit within "
+            "The referee accepts a success: all targets caught and every limit within "
             f"{settings['tolerance']:g} relative, the target {_NET_TESTS[settings['net_test']]}. A "
-            "target counts as caught where its catch holds, even if a limit fails on the way.",
+            "target counts as caught if its catch keeps its limits, even if another limit fails.",
             "OTR is the optimal time ratio, the mean of |T_o - T_p| / T_o over the targets of "
-            "solved cases, T_p decided and T_o optimised (eq. 29 of the paper); mpp, which decides "
-            "on its own times, has none.",
+            "solved cases, T_p decided and T_o optimised (eq. 29 of the paper); mpp has none, as "
+            "it chooses its own times.",
             "Paper: throws is its Table I (50 real throws, planned), the others its Table III "
             "(1,000 simulated each). Their limits, weights and test are not published.",
         ]

@@ -1,4 +1,4 @@
-"""The columns of a hit run: what was served, planned and judged."""
+"""Columns of a hit run: serve, plan and verdict."""
 
 from typing import cast
 
@@ -17,18 +17,18 @@ _names = lambda b: np.array(court.SCENARIOS)[b.chunk.origin.scenario]  # noqa: E
 
 
 def name_outcome_column(planner: str) -> str:
-    """Name of the column with the published outcomes of a planner."""
+    """Return the name of the column with the published outcomes of a planner."""
     return f"published_{planner.replace('-', '_')}"
 
 
-def _outcome_column(place: int, planner: str) -> Column:
+def _outcome_column(index: int, planner: str) -> Column:
     def values(batch: known.RefereedBatch) -> pa.Array | None:
         if (found := cast(Serves, batch.chunk.origin).published) is None:
             return None
-        outcome = found[:, place]
+        outcome = found[:, index]
         return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
 
-    meaning = "published outcome, null where there is none"
+    meaning = "published outcome; null if there is none"
     return Column(name_outcome_column(planner), "", meaning, BOOL, values)
 
 
@@ -41,9 +41,9 @@ COLUMNS = [
         ("line", "", "line of that file, from 1", COUNT, "origin.line"),
         ("serve_pos", "m", "ball when served", _POINT, "origin.position"),
         ("serve_vel", "m/s", "ball when served", _POINT, "origin.velocity"),
-        ("target", "m", "wanted landing point", _POINT, "origin.target"),
-        ("ball_pos", "m", "ball when planning begins", VECTOR, "cases.ball.pos"),
-        ("ball_vel", "m/s", "ball when planning begins", VECTOR, "cases.ball.vel"),
+        ("target", "m", "desired landing point", _POINT, "origin.target"),
+        ("ball_pos", "m", "ball when planning starts", VECTOR, "cases.ball.pos"),
+        ("ball_vel", "m/s", "ball when planning starts", VECTOR, "cases.ball.vel"),
     ),
     START,
     *leaves_of(
@@ -68,12 +68,12 @@ COLUMNS = [
     ),
     *MOTION,
     *TRAJECTORY,
-    *(_outcome_column(*place) for place in enumerate(court.PLANNERS)),
+    *(_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)),
 ]
 
 _ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")
-# Of a case that is no serve of the court.
+# Columns of a single case, which is not a serve of the court.
 SINGLE_COLUMNS = [
     *(c for c in COLUMNS if c.name not in _ORIGIN and not c.name.startswith("published_")),
-    *leaves_of("cases", ("target", "m", "wanted landing point", VECTOR)),
+    *leaves_of("cases", ("target", "m", "desired landing point", VECTOR)),
 ]

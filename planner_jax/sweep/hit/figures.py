@@ -16,13 +16,13 @@ from planner_jax.task.hit import court
 from planner_jax.task.hit.court import fly, landing
 
 _SAMPLES = 48
-_SHORTEST = 0.12  # half of a panel's height, in its width
+_SHORTEST = 0.12  # least ratio of half a panel's height to its width
 _FLOOR = "#F6F8FA"
 _TARGET: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
 
 
 def court_figure(figure: Figure, run: RunRows) -> None:
-    """Draw a sample of a run's cases in both views."""
+    """Draw a sample of a run's cases from above and from the side."""
     rows, setting = run.sample(), run.manifest["setting"]
     drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4
@@ -58,14 +58,14 @@ def court_figure(figure: Figure, run: RunRows) -> None:
 def ball_path(
     pos: np.ndarray, vel: np.ndarray, end: float, drag: float, gravity: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Times (N,) [s] up to `end`, and where a ball of a position and velocity (3,) is, (N, 3)."""
+    """Return times (N,) [s] up to `end`, and positions (N, 3) [m] of a ball in flight."""
     time = np.linspace(0.0, end, _SAMPLES)
     again = (_SAMPLES, 1)
     return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]
 
 
 def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: bool) -> None:
-    """Serve, trajectory and returned ball of one case in the plane of x and a second axis."""
+    """Draw serve, trajectory and returned ball of a case in the plane of x and a second axis."""
     good, gravity, drag = row["success"], setting["gravity"], setting["drag"]
 
     def line(path: np.ndarray, colour: str, width: float, alpha: float, dash: str = "-") -> None:
@@ -93,7 +93,7 @@ def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: b
 
 
 def _draw_floor(axes: Axes) -> None:
-    """Lines, dead zone and region letters, from above."""
+    """Draw lines, dead zone and letters of the regions from above."""
     length, width, dead = court.HALF_LENGTH, court.HALF_WIDTH, court.DEAD_ZONE
     line: Look = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
     whole: Look = {"facecolor": _FLOOR, "edgecolor": style.GREY}
@@ -103,17 +103,17 @@ def _draw_floor(axes: Axes) -> None:
     axes.axvline(0.0, color=style.INK, linewidth=1.6, zorder=1)
     paper = {"facecolor": _FLOOR, "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
     look: Look = {"ha": "center", "va": "center", "zorder": 7, "bbox": paper}
-    for way in (-1.0, 1.0):
+    for sign in (-1.0, 1.0):
         for side in (-court.LANE_LINE, court.LANE_LINE):
-            axes.plot([way * dead, way * length], [side] * 2, **line)
-        axes.plot([way * court.NEAR_LINE] * 2, [-court.LANE_LINE, court.LANE_LINE], **line)
+            axes.plot([sign * dead, sign * length], [side] * 2, **line)
+        axes.plot([sign * court.NEAR_LINE] * 2, [-court.LANE_LINE, court.LANE_LINE], **line)
         for letter, x, y in (("N", 1.0, 0.0), ("F", 4.7, 0.0), ("L", 4.7, 2.2), ("R", 4.7, -2.2)):
-            axes.text(way * x, y, letter, color=style.INK, **look)
+            axes.text(sign * x, y, letter, color=style.INK, **look)
     axes.grid(visible=False)
 
 
 def path_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the example from above and from the side, wherever it is."""
+    """Draw the example from above and from the side."""
     (_, row), setting = run.same_case()[0], run.manifest["setting"]
     drag_after = run.manifest["parameters"].get("drag_after_impact", False)
     above, side = figure.subplots(2, 1, sharex=True)
@@ -124,7 +124,7 @@ def path_figure(figure: Figure, run: RunRows) -> None:
         axes.plot(row["target"][0], row["target"][second], zorder=6, **target)
         low, high = axes.get_ylim()
         wide = np.ptp(axes.get_xlim())
-        # No side is so short that its panel cannot be read.
+        # Keep panels high enough to be read.
         middle, half = 0.5 * (low + high), max(0.5 * (high - low), _SHORTEST * wide)
         axes.set(ylim=(middle - half, middle + half), aspect="equal")
     side.axhline(0.0, color=style.GREY, linewidth=1.5)
@@ -138,7 +138,7 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw height, speed, acceleration, body rate and thrust of plans for the same serve."""
+    """Draw height, speed, acceleration, body rate and thrust of plans for one serve."""
     quadrotor_figure(figure, run, _PANELS, _draw_heights, _word)
 
 
@@ -147,12 +147,12 @@ def _word(row: Row) -> str:
 
 
 def _draw_heights(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw height of the quadrotor, and of the ball down to the floor as if nobody hit it."""
+    """Draw the height of the quadrotor, and of the ball until it would land."""
     row, physics = plans[-1].row, (setting["drag"], setting["gravity"])
     pos, vel = np.array(row["ball_pos"]), np.array(row["ball_vel"])
     time, path = ball_path(pos, vel, float(landing(pos, vel, *physics)[0]), *physics)
     look: Look = {"color": style.INK, "linewidth": 1.2, "linestyle": ":"}
-    axes.plot(time, path[:, 2], label="ball, if nobody hits it", **look)
+    axes.plot(time, path[:, 2], label="ball, if it is not hit", **look)
     axes.legend(loc="upper right", fontsize=8.5)
     for plan in plans:
         plan.draw(axes, lambda motion: motion.pos[:, 2])

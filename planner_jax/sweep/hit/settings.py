@@ -1,4 +1,4 @@
-"""What a hit sweep is asked to do."""
+"""Settings of a hit sweep."""
 
 import dataclasses
 import math
@@ -18,10 +18,10 @@ _FARTHEST = 1e6  # [m]
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(QuadrotorSettings):
-    """The arguments of a hit sweep.
+    """Settings of a hit sweep.
 
-    `num` is by default the whole folder, or `DEFAULT_NUM` drawn serves; `seed` is of drawn serves
-    and of uniform starts.
+    The default of `num` is the whole folder of serves, or `DEFAULT_NUM` drawn serves. `seed` is the
+    seed of drawn serves and of uniform starts.
     """
 
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")

@@ -1,4 +1,4 @@
-"""What hits add to a sweep: serves, the 36 scenarios of the court, and their published rates."""
+"""The sweep of hits: serves, the 36 scenarios of the court, and published success rates."""
 
 import dataclasses
 import hashlib
@@ -33,13 +33,16 @@ from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to
 
 @dataclasses.dataclass(frozen=True)
 class ServeSource(Source):
-    """Where the serves of a sweep come from; they are the origin of its cases."""
+    """Source of serves; a chunk holds them as the origin of its cases."""
 
     settings: HitSettings
-    folder: Serves | None  # the serves of the published files, if these were asked for
+    folder: Serves | None  # serves of published files, if the settings name a folder
 
     def cases(self, first: int, last: int) -> Chunk:
-        """As `Source.cases`; a ball that is down before planning begins breaks a rule, too."""
+        """Return cases as `Source.cases` does.
+
+        A ball that lands before planning starts breaks a rule as well.
+        """
         settings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
@@ -54,7 +57,7 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Look at every serve of a folder; drawn ones obey their law."""
+        """Check all serves of a folder; of drawn serves, the first chunk."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
@@ -73,12 +76,15 @@ class ServeSource(Source):
 
 
 def choose_reference(planner: str) -> str:
-    """Return the published planner that a planner's rates stand beside: itself, or else bat."""
+    """Return the published planner for comparison: the planner itself, or else bat."""
     return planner if planner in court.PLANNERS else "bat"
 
 
 class HitTally(Tally):
-    """Counts by scenario too; the example is from the left to the far target (002, Fig. 7)."""
+    """Counts by scenario; the example flies from the left to the far target.
+
+    [Yu2023bat, Fig. 7] shows such a case.
+    """
 
     READS = (*COUNTED, "scenario", *map(name_outcome_column, court.PLANNERS))
 
@@ -103,13 +109,13 @@ class HitTally(Tally):
             self._published.update((planner, name) for name in scenario[solved])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Which rows (B,) make examples, the best kind first."""
+        """Return masks (B,) of possible examples, the preferred ones first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
 
     def summary(self) -> Entries:
-        """Rates as fractions, 0 to 1, for the manifest; published ones of these very serves."""
+        """Return success rates from 0 to 1, with published rates of the same serves."""
         per_scenario = {
             name: {
                 "num": self._num[name],
@@ -128,15 +134,14 @@ class HitTally(Tally):
 
 
 class HitSweep(Sweep[HitSettings]):
-    """Quadrotors that return served balls with a racket."""
+    """Sweeps of quadrotors that return served balls with a racket."""
 
     frame, own_columns, counts = FRAME, COLUMNS, HitTally
     figures = (
         RunFigure(
             "court.png",
             "Serves, planned trajectories and returned balls, from above and from the side. "
-            "Cases are taken evenly from the run, failures added where these hold fewer than "
-            "twelve.",
+            "Cases are evenly spaced in the run; failures are added up to twelve.",
             (9.0, 10.6),
             court_figure,
         ),
@@ -157,7 +162,9 @@ class HitSweep(Sweep[HitSettings]):
             ArgumentError: the suite is of another package, the folder is missing, a row is not
                 sound, or too few serves are in it.
         """
-        require_one_of(TASK.suites, "suite", str(settings.suite))  # others know no serves
+        require_one_of(
+            TASK.suites, "suite", str(settings.suite)
+        )  # suites of other packages have no serves
         folder = None if settings.serves is None else read_serves(settings.serves)
         if folder is not None and (settings.num or 0) > len(folder):
             rule = f"<= {len(folder)}, the serves that the folder holds"
@@ -186,10 +193,10 @@ class HitSweep(Sweep[HitSettings]):
         same = _knows_same_serves(summary, other)
         header += [f"{other}, same serves %"] if same else []
         rows, known, solved = [], 0, 0.0
-        for place, name in enumerate(court.SCENARIOS):
+        for index, name in enumerate(court.SCENARIOS):
             counts = summary["per_scenario"].get(name)
             own = rate_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
-            row = [name, *own, *(f"{rates[place]:.1f}" for rates in beside)]
+            row = [name, *own, *(f"{rates[index]:.1f}" for rates in beside)]
             if same:
                 rate = counts["published_on_these_serves"].get(other) if counts else None
                 row.append("" if rate is None else f"{100.0 * rate:.1f}")
@@ -211,20 +218,20 @@ class HitSweep(Sweep[HitSettings]):
         truth = "with" if settings["drag_after_impact"] else "without"
         same = ""
         if _knows_same_serves(summary, other):
-            same = '"Same serves" are the published outcomes of this run\'s cases, where known. '
+            same = '"Same serves" are the published outcomes of this run\'s cases, if known. '
         return [
             *robot_remark(settings),
             *recovery_remark(settings),
             f"Serves: {summary['num']:,} {origin}; {manifest['serves']['distinct']:,} distinct "
             "balls (cases may share a ball and differ in the target).",
-            f"Hover start {start}; planning begins {settings['delay']:g} s after the serve; speed, "
+            f"Hover start {start}; planning starts {settings['delay']:g} s after the serve; speed, "
             f"acceleration and body-rate limits x {settings['limit_scale']:g}; returned ball "
             f"{truth} drag.",
-            "A success is the referee's: every limit within 1e-3 relative, landing within 1 cm.",
+            "The referee accepts a success: every limit within 1e-3 relative, landing within 1 cm.",
             f'"{other}, paper" is Table I of the paper, "{other}, trial files" what its published '
             "trial files count over 1,000 rows a scenario. The two differ by up to 20 points; "
             f"their totals are means over the scenarios. {same}"
-            "All of these stand for the paper's own setting: full limits, planning from the serve.",
+            "All of these hold for the paper's own setting: full limits, planning from the serve.",
         ]
 
 

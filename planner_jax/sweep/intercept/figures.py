@@ -27,33 +27,33 @@ from planner_jax.sweep.figures import draw_upper_limit, look_of, write_verdicts
 
 @dataclasses.dataclass(frozen=True)
 class SampledDrive:
-    """A row, its obstacles as polygons, and car and target at K even times of the plan."""
+    """A row, its obstacles as polygons, and car and target at K times."""
 
     row: Row
     setting: Entries  # of the manifest
     walls: list[np.ndarray]  # (V, 2) [m] each
-    movers: list[np.ndarray]  # likewise, at time 0
+    movers: list[np.ndarray]  # (V, 2) [m] each, at time 0
     velocities: np.ndarray  # (N, 2) [m/s], of the movers
     time: np.ndarray  # (K,) [s]
     pose: np.ndarray  # (K, 3), of the rear axle: x, y [m], heading [rad]
     middle: np.ndarray  # (K, 2) [m], of the body
     speed: np.ndarray  # (K,) [m/s]
-    acceleration: np.ndarray  # (K,) [m/s^2], along the way
+    acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
     target: np.ndarray  # (K, 2) [m]
 
     def target_at(self, times: np.ndarray | float) -> np.ndarray:
-        """Return where the target is expected at times (T,) [s] up to the case's, (T, 2) [m]."""
+        """Return predicted positions (T, 2) [m] of the target at times (T,) [s]."""
         places = np.reshape(self.row["target_way"], (-1, 2))
         known = np.linspace(0.0, self.row["due_time"], len(places))
         return np.stack([np.interp(times, known, places[:, k]) for k in range(2)], axis=-1)
 
     def pose_at(self, time: float) -> np.ndarray:
-        """Pose (3,) of the rear axle at one time [s]."""
+        """Return the pose (3,) of the rear axle at one time [s]."""
         return np.array([np.interp(time, self.time, self.pose[:, k]) for k in range(3)])
 
     def footprint(self, pose: np.ndarray) -> np.ndarray:
-        """Return corners (4, 2) [m] of the body around a pose (3,) of the rear axle."""
+        """Return the corners (4, 2) [m] of the body for a pose (3,) of the rear axle."""
         behind, half = -self.setting["body_rear_overhang"], 0.5 * self.setting["body_width"]
         ahead = behind + self.setting["body_length"]
         corners = np.array([(behind, -half), (ahead, -half), (ahead, half), (behind, half)])
@@ -62,7 +62,7 @@ class SampledDrive:
 
 
 def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
-    """Return a row at so many even times, with the manifest's `setting`."""
+    """Return a row sampled at `num` evenly spaced times, with the manifest's `setting`."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
@@ -87,7 +87,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
-    """Return those of a kind that are there, (V, 2) [m] each."""
+    """Return the existing walls or movers of a row, (V, 2) [m] each."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -97,7 +97,7 @@ def _polygons(row: Row, kind: str) -> list[np.ndarray]:
 def _sample(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
-    """Return fields of `SampledDrive` of one plan at shares (K,) of its time, by name."""
+    """Return fields of `SampledDrive` at fractions (K,) of the time of a plan."""
     time = end * shares
 
     def at(time: Array) -> tuple[Array, ...]:
@@ -109,13 +109,13 @@ def _sample(
 
 _SAMPLES = 241
 _PANELS, _COLUMNS, _FAILURES = 6, 3, 2
-_MOST_BODIES, _MOST_MOVERS = 6, 16  # of instants, and of polygons that are drawn of all movers
-# Viridis without its light end, which paper does not show.
+_MOST_BODIES, _MOST_MOVERS = 6, 16  # greatest numbers of times and of polygons of movers
+# Viridis without its light end, which is invisible on paper.
 _STOPS = ("#440154", "#443983", "#31688E", "#21918C", "#35B779", "#90D743")
 
 
 def plane_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the run's example and cases beside it."""
+    """Draw the run's example and other cases."""
     setting = run.manifest["setting"]
     drives = [sample_drive(row, setting, _SAMPLES) for row in chosen(run)]
     latest = max(drive.row["due_time"] for drive in drives)
@@ -132,13 +132,13 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
     for axes in panels[:, 0]:
         axes.set_ylabel("y [m]")
     figure.colorbar(
-        colours, ax=panels, label="time since the car sets out [s]", aspect=20 * num_rows
+        colours, ax=panels, label="time since the start of the car [s]", aspect=20 * num_rows
     )
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
 def chosen(run: RunRows) -> list[Row]:
-    """Return rows to be shown: the example, others evenly from the run, and failures at the end."""
+    """Return the example, evenly spaced other rows, and a few failures."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]
     failures = [row for row in others if not row["success"]][:_FAILURES]
@@ -148,7 +148,7 @@ def chosen(run: RunRows) -> list[Row]:
 
 
 def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None:
-    """One case, all its instants on top of each other."""
+    """Draw one case, with several times in one panel."""
     row = drive.row
     draw_map(axes, drive.setting, drive.walls)
     end = float(np.nan_to_num(row["meeting_time"]))
@@ -158,10 +158,10 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
         moved = [m + time * v for m, v in zip(drive.movers, drive.velocities, strict=True)]
         draw_polygons(axes, moved, colours.to_rgba(time))
     for corners, velocity in zip(drive.movers, drive.velocities, strict=True):
-        way = corners.mean(axis=0) + np.array([[0.0], [end]]) * velocity
-        axes.plot(*way.T, color=style.GREY, linewidth=0.7, zorder=1.5)
-    way = drive.target_at(np.linspace(0.0, row["due_time"], 101))
-    axes.plot(*way.T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
+        path = corners.mean(axis=0) + np.array([[0.0], [end]]) * velocity
+        axes.plot(*path.T, color=style.GREY, linewidth=0.7, zorder=1.5)
+    path = drive.target_at(np.linspace(0.0, row["due_time"], 101))
+    axes.plot(*path.T, color=style.INK, linewidth=1.0, linestyle=(0, (4, 2)), zorder=3)
     for time in times:
         look = {"color": colours.to_rgba(time), "markersize": 5.5, "mec": style.INK, "mew": 0.6}
         axes.plot(*drive.target_at(time), "o", zorder=6, **look)
@@ -184,13 +184,13 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
 
 
 def entries(colours: ScalarMappable) -> list[Artist]:
-    """Return what the legend explains."""
+    """Return the entries of the legend."""
     early = colours.get_cmap()(0.3)
     look: Look = {"linestyle": "", "marker": "o"}
     return [
         Patch(facecolor=style.PALE, edgecolor=style.GREY, label="wall"),
         Patch(facecolor=(*early[:3], 0.25), edgecolor=early, label="mover"),
-        Line2D([], [], color=style.INK, linestyle=(0, (4, 2)), label="way of the target"),
+        Line2D([], [], color=style.INK, linestyle=(0, (4, 2)), label="path of the target"),
         Line2D([], [], color=early, markersize=5.5, mec=style.INK, mew=0.6, label="target", **look),
         Line2D([], [], color=early, linewidth=2.2, marker="s", markersize=8, label="car"),
         Line2D([], [], mfc="none", mec=style.INK, mew=1.8, markersize=11, label="meeting", **look),
@@ -198,7 +198,7 @@ def entries(colours: ScalarMappable) -> list[Artist]:
 
 
 def colours_of_time(num: int = 256) -> ListedColormap:
-    """Return the colours of times, early ones dark."""
+    """Return the colours of times; early times are dark."""
     stops = np.array([[int(stop[k : k + 2], 16) for k in (1, 3, 5)] for stop in _STOPS]) / 255.0
     at = np.linspace(0.0, len(stops) - 1.0, num)
     each = [np.interp(at, np.arange(len(stops)), stops[:, k]) for k in range(3)]
@@ -206,14 +206,14 @@ def colours_of_time(num: int = 256) -> ListedColormap:
 
 
 def instants(end: float, most: int) -> np.ndarray:
-    """Return at most so many round times [s] from 0 up to an end."""
+    """Return at most `most` round times [s] from 0 to `end`."""
     steps = [mantissa * 10.0**power for power in range(-3, 9) for mantissa in (1.0, 2.0, 2.5, 5.0)]
     num, step = next((n, step) for step in steps if (n := int(end / step + 1e-6)) < most)
     return step * np.arange(num + 1)
 
 
 def draw_map(axes: Axes, setting: Entries, walls: list[np.ndarray]) -> None:
-    """Draw the map's bounds and what stands on it."""
+    """Draw the map's bounds and walls."""
     look: Look = {"facecolor": style.PALE, "edgecolor": style.GREY, "linewidth": 0.8}
     axes.add_collection(PolyCollection(walls, zorder=1, **look))
     (left, low), (right, high) = setting["lower"], setting["upper"]
@@ -230,7 +230,7 @@ def draw_polygons(
     alpha: float = 0.25,
     zorder: float = 2,
 ) -> None:
-    """Draw polygons (V, 2) [m] in a colour, pale inside."""
+    """Draw polygons (V, 2) [m] with a pale filling."""
     look: Look = {"facecolor": colour, "alpha": alpha, "linewidth": 0.0, "zorder": zorder}
     axes.add_collection(PolyCollection(polygons, **look))
     edge: Look = {"facecolor": "none", "edgecolor": colour, "linewidth": 1.0, "zorder": zorder}
@@ -239,10 +239,10 @@ def draw_polygons(
 
 _CURVE_SAMPLES = 801
 _LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
-# Limit, label of the axis, title, and what of a drive is held against it, (K,).
+# Limit, label of the axis, title, and values (K,) of a drive that the limit bounds.
 _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] = (
     ("speed", "v [m/s]", "Speed", lambda d: d.speed),
-    ("acceleration", "|a| [m/s²]", "Acceleration along the way", lambda d: np.abs(d.acceleration)),
+    ("acceleration", "|a| [m/s²]", "Acceleration along the path", lambda d: np.abs(d.acceleration)),
     (
         "lateral_acceleration",
         "|v² κ| [m/s²]",
@@ -254,12 +254,12 @@ _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] 
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Distance to the target, speed, accelerations and curvature of plans for the same case."""
+    """Draw distance, speed, accelerations and curvature of plans for one case over time."""
     plans, setting = run.same_case(), run.manifest["setting"]
     panels = figure.subplots(2, 3, sharex=True)
     drives = [
-        (sample_drive(row, setting, _CURVE_SAMPLES), look_of(place, name, row))
-        for place, (name, row) in enumerate(plans)
+        (sample_drive(row, setting, _CURVE_SAMPLES), look_of(index, name, row))
+        for index, (name, row) in enumerate(plans)
     ][::-1]
     axes = panels[0, 0]
     for drive, look in drives:
@@ -275,7 +275,7 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
         style.label(axes, "", unit, title)
     panels[0, 2].tick_params(labelbottom=True)
     for axes in (*panels[1, :2], panels[0, 2]):
-        axes.set_xlabel("time since the car sets out [s]")
+        axes.set_xlabel("time since the start of the car [s]")
     write_verdicts(panels[1, 2], run, plans, _word)
 
 

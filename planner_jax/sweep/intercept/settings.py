@@ -1,4 +1,4 @@
-"""The settings of sweeps of interceptions and of groups."""
+"""Settings of the sweeps of interceptions and of groups."""
 
 import dataclasses
 from typing import ClassVar
@@ -10,17 +10,17 @@ from planner_jax.task.group.spec import DECISIONS
 
 @dataclasses.dataclass(frozen=True)
 class InterceptSettings(SweepSettings):
-    """The arguments of an intercept sweep."""
+    """Settings of an intercept sweep."""
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
-    CPU_BATCH: ClassVar[int] = 256  # some ms a case
+    CPU_BATCH: ClassVar[int] = 256  # a case takes some milliseconds
     GPU_BATCH: ClassVar[int] = 4096
 
 
 @dataclasses.dataclass(frozen=True)
 class GroupSettings(SweepSettings):
-    """The arguments of a sweep of groups of targets."""
+    """Settings of a sweep of groups of targets."""
 
     decide: str = option("best", "NAME", f"decision about the order: {', '.join(DECISIONS)}")
 

@@ -1,4 +1,4 @@
-"""What interceptions add to a sweep: rows of their own, times and effort, and figures."""
+"""The sweep of interceptions: rows, times, accelerations, and figures."""
 
 import numpy as np
 import pyarrow as pa
@@ -14,13 +14,13 @@ from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 
-COMPARED = ("lattice", "spacetime")  # beside a run's own planner, for one case
+COMPARED = ("lattice", "spacetime")  # other planners of the run's example
 
 
 class InterceptTally(Tally):
-    """Sums up when the targets are met, and with how much acceleration, too.
+    """Counts with means of meeting time, miss and acceleration.
 
-    The example is a success that something that moves comes near to.
+    The example is a success that comes close to a mover.
     """
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
@@ -28,20 +28,20 @@ class InterceptTally(Tally):
     NEAR = 0.1  # [m]
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Which rows (B,) make examples, the best kind first."""
+        """Return masks (B,) of possible examples, the preferred ones first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
 
 class InterceptSweep(Sweep[InterceptSettings]):
-    """Cars that meet moving targets among obstacles."""
+    """Sweeps of cars that meet moving targets among obstacles."""
 
     frame, own_columns, counts = FRAME, COLUMNS, InterceptTally
     figures = (
         RunFigure(
             "plane.png",
-            "Cases of the run from above, two of its failures at most among them. Of one colour is "
-            "what is at one time: the car's body and way, and where target and movers are then.",
+            "Cases of the run from above, with at most two failures. A colour stands for a time: "
+            "body and path of the car, target and movers.",
             (13.0, 8.7),
             plane_figure,
         ),
@@ -50,21 +50,21 @@ class InterceptSweep(Sweep[InterceptSettings]):
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:
-        """The best that splits path and speed, or the default: each takes a minute to compile."""
+        """Return the planners in `COMPARED`; each takes a minute to compile."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return map, body and limits that all cases have in common, for the manifest."""
+        """Return map, body and limits that all cases share, for the manifest."""
         bounds = first_values(cases, ["lower", "upper"])
         return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
 
     def plan_of_row(self, row: Row, setting: Entries) -> CarPlan:
-        """Return the plan of a row, without the place of the meeting."""
+        """Return the plan of a row, without the position of the meeting."""
         return car_plan(row)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return when targets are met, how closely, and with how much acceleration."""
+        """Return a sentence on time, accuracy and acceleration."""
         summary = manifest["summary"]
         if summary["mean_miss"] is None:
             return []
@@ -75,7 +75,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
         ]
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return where the numbers come from, a sentence each."""
+        """Return sentences on the origin of the numbers."""
         limits = manifest["setting"]
         return [
             *super().remarks(manifest)[:-1],
@@ -84,7 +84,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
             f"{limits['curvature']:g} 1/m, steering rate {limits['steering_rate']:g} rad/s; body "
             f"{limits['body_length']:g} x {limits['body_width']:g} m. Sizes and limits are of a "
             "model car of scale 1:10: an assumption.",
-            "A success is the referee's: every limit within 1e-3 relative, the body within 1 mm of "
-            "no obstacle at all samples, and its middle within the case's tolerance of the target "
-            "at the end.",
+            "The referee accepts a success: every limit within 1e-3 relative, at all samples no "
+            "obstacle within 1 mm of the body, and at the end the middle of the body within the "
+            "case's tolerance of the target.",
         ]

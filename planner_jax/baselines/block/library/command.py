@@ -1,4 +1,4 @@
-"""The command `planner-jax library`: build, show, check and repair libraries of blocks."""
+"""The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
 
 import dataclasses
 import math
@@ -41,15 +41,15 @@ def build_library(
     arm: str | None = None,
     home: Sequence[float] | None = None,
 ) -> None:
-    """Build a library in the scene of [Natarajan2024], or resume an interrupted build.
+    """Build a library in the scene of [Natarajan2024], or continue an interrupted build.
 
     Args:
-        path: of its file.
+        path: file of the library.
         layout: a key of `LAYOUTS`.
         regime: a key of `REGIMES`.
-        pole: whether the scene has the pole.
-        arm: path of an MJCF file; None for the IRB 1600.
-        home: angles [rad], six for each home; None for the arm's own home.
+        pole: whether the scene has its pole.
+        arm: path of an MJCF file; by default the IRB 1600.
+        home: angles [rad], six for each home; by default the arm's own.
 
     Raises:
         ArgumentError: an argument breaks a rule.
@@ -78,14 +78,14 @@ def build_library(
         arm=body, limits=chosen.limits, ends_at_rest=host_leaf(chosen.ends_at_rest), scene=scene
     )
     homes = np.reshape(body.home if home is None else home, (-1, 6))
-    began = time.perf_counter()
+    start = time.perf_counter()
     library = build(path, setting, homes, LAYOUTS[layout])
-    print(f"Built in {time.perf_counter() - began:.1f} s, compilation included.")
+    print(f"Built in {time.perf_counter() - start:.1f} s, compilation included.")
     _print(path, library, coverage(library))
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print what a library covers, and draw a map of it as PNG if a path is passed."""
+    """Print the coverage of a library, and draw a map of it as PNG if a path is passed."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -95,7 +95,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Let the referee judge the motions for `num` random balls per home."""
+    """Referee stored motions for random balls, `num` for each home."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
@@ -115,7 +115,7 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan again all motions that touch a pole moved to (2,) [m]; write a new file."""
+    """Plan again the motions that touch a moved pole at (2,) [m]; write a new file."""
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
@@ -123,12 +123,12 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
     scene = dataclasses.replace(
         library.setting.scene, pole=host_leaf(pole, np.float32), has_pole=host_leaf(True)
     )
-    began = time.perf_counter()
+    start = time.perf_counter()
     repaired, touched = repair(library, scene, retry=retry)
     save_library(out, repaired)
     print(
         f"Planned {touched.sum()} of {library.found.sum()} motions again in "
-        f"{time.perf_counter() - began:.1f} s, compilation included."
+        f"{time.perf_counter() - start:.1f} s, compilation included."
     )
     _print(out, repaired, coverage(repaired))
 
@@ -182,9 +182,9 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
         possible = feasible.sum(axis=axis)
         share = (found & feasible).sum(axis=axis) / np.maximum(possible, 1)
         values = np.where(possible > 0, 100.0 * share, np.nan)
-        begin = 0
+        first = 0
         for panel, face in zip(row, faces, strict=False):
-            cells = values[begin : begin + face.num].reshape(face.cells)
+            cells = values[first : first + face.num].reshape(face.cells)
             picture = panel.imshow(
                 cells.T,
                 origin="lower",
@@ -196,7 +196,7 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
             first, second = ("xyz"[each] for each in face.across)
             style.label(panel, f"{first} [m]", f"{second} [m]", f"{name} {face.name}")
             panel.grid(False)
-            begin += face.num
+            first += face.num
         for panel in row[len(faces) :]:
             panel.set_axis_off()
     if picture is not None:
@@ -204,7 +204,7 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
 
 
 def _ends(face: Face, box: Box) -> tuple[float, float, float, float]:
-    """Return where a face starts and ends along its two axes [m]."""
+    """Return the ends [m] of a face along its two axes."""
     (left, bottom), (right, top) = (
         (float(side[face.across[0]]), float(side[face.across[1]]))
         for side in (box.lower, box.upper)
