@@ -171,7 +171,7 @@ def test_rows_of_a_sweep_have_the_way_to_rest_that_was_judged(swept, braked):
         np.testing.assert_allclose(total_duration(found.whole), total_duration(whole), rtol=1e-3)
         np.testing.assert_allclose(states(found.recovery)[1:], 0.0, atol=2e-2)
         assert not sentence
-    assert "to rest where that is cheapest" in recovery_remark(manifest["parameters"])[0]
+    assert "standstill at the cheapest place" in recovery_remark(manifest["parameters"])[0]
     assert not recovery_remark({}) and not recovery_remark({"recovery": "none"})
 
 

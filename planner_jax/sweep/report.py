@@ -59,7 +59,7 @@ def require_counted(folder: RunFolder, summary: Mapping[str, object], counted: E
     """Raise `ArgumentError` unless a manifest's summary agrees with the counts of the rows."""
     for name, value in counted.items():
         if not _agree(summary.get(name), value):
-            rule = f"a run whose {name} fits its rows, {value}"
+            rule = f"a run whose entry {name} agrees with its rows, {value}"
             raise ArgumentError(
                 folder.name, rule, shown=f"{summary.get(name)} in {str(folder.path)!r}"
             )

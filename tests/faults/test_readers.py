@@ -71,7 +71,7 @@ def test_a_summary_that_its_rows_do_not_have_is_refused(runs, tmp_path):
     summary = manifest_of(out)["summary"]
     rewritten(out, summary={**summary, "successes": summary["successes"] - 1})
     ended = run("report", out)
-    assert is_one_line(ended) and "RUN must be a run whose successes is that of its" in ended.err
+    assert is_one_line(ended) and "RUN must be a run whose entry successes agrees" in ended.err
 
 
 def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_path):
