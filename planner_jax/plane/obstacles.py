@@ -8,7 +8,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from planner_jax.core.checks import floating, numeric
+from planner_jax.core.checks import floating, numeric, shape_of
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 
@@ -61,15 +61,13 @@ def obstacles(
     if len(checked) > num or most > size:
         shown = f"{len(checked)} of up to {most}: give more room"
         raise ArgumentError("polygons", f"at most {num} of at most {size} corners", shown=shown)
-    numbers = numeric(velocities)
-    if numbers is None:
-        raise ArgumentTypeError("velocities", "numbers", velocities)
-    if numbers.shape not in ((), (2,), (len(checked), 2)):
+    shape = shape_of("velocities", velocities)
+    if shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
-        raise ArgumentError("velocities", rule, numbers.shape, verb="have")
-    if not np.isfinite(numbers).all():
+        raise ArgumentError("velocities", rule, shape, verb="have")
+    if not np.isfinite(velocities).all():
         raise ArgumentError("velocities", "finite", velocities)
-    speeds = np.broadcast_to(np.asarray(numbers, float), (len(checked), 2))
+    speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))
     corners = np.zeros((num, size, 2))
     for k, polygon in enumerate(checked):

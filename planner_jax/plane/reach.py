@@ -147,7 +147,7 @@ def _shift(rows: Array, move: Array) -> Array:
 
 
 def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> Array:
-    """Map a function over the first `needed` entries; on a CPU in a loop, which stores each."""
+    """Map a function over entries; on a CPU over the first `needed`, storing each result."""
 
     def loop(over: Array, needed: Array) -> Array:
         one = jax.eval_shape(body, over[0])
@@ -187,7 +187,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
 
 def _word_of(row: Array, at: Array) -> Array:
-    """Return the word of the bits 0 to 31 for a row of 32 bits that starts at an index."""
+    """Return the part of a row of 32 bits that is in a word if the row starts at its bit `at`."""
     by = jnp.minimum(jnp.abs(at), 31).astype(jnp.uint32)
     moved = jnp.where(at >= 0, row << by, row >> by)
     return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))

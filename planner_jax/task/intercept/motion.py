@@ -162,7 +162,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
 
 
 def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
-    """Return half the gradient (n,) and Hessian (n, n) of a cost by the n unknowns.
+    """Return half the gradient (n,) and half the Hessian (n, n) of a cost by the n unknowns.
 
     There are n = 2 K unknowns, or 2 K + 1 with a free time.
     """

@@ -62,8 +62,9 @@ def limit_terms(
     The lateral acceleration is checked at a static number of points of every piece.
 
     Returns:
-        squares: (K, 6, 6), for every piece the sum over its residuals r of w g g', where g holds
-            the derivatives of r by the five variables of the piece (see `motion`), and r itself.
+        squares: (K, 6, 6), for every piece the sum of w g g' over its residuals r of weight w. The
+            vector g holds the derivatives of r by the five variables of the piece (see `motion`),
+            then r itself.
         violation: (), largest relative excess.
     """
     limits, dtype = case.limits, speed.dtype
@@ -110,7 +111,7 @@ def limit_terms(
 
 
 class SumOfSquares:
-    """The sum over residuals r of w g g', where g holds the derivatives of r, and r itself.
+    """The sum of w g g' over residuals r of weight w; g holds the derivatives of r, then r itself.
 
     Only the entries of g that may differ from zero are multiplied.
     """
@@ -144,8 +145,8 @@ def meeting_terms(
     """Compute the miss and the hinge on the heading at the end.
 
     Returns:
-        squares: (5, 5), the sum over residuals r of w g g', where g holds the derivatives of r by
-            x, y, heading and time of the last sample, and r itself.
+        squares: (5, 5), the sum of w g g' over the residuals r of weight w. The vector g holds the
+            derivatives of r by x, y, heading and time of the last sample, then r itself.
         violation: (), largest relative excess.
     """
     pos, heading, direction = drive.pos[-1, -1], drive.heading[-1, -1], drive.direction[-1, -1]
@@ -267,14 +268,8 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
     free = jnp.min(jnp.minimum(middle - case.lower, case.upper - middle), axis=1)
     both = join_obstacles(case.walls, case.movers)
     moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]
-    apart = separation(
-        both.corners,
-        both.present,
-        pos[:, 0] - moved[..., 0],
-        pos[:, 1] - moved[..., 1],
-        heading,
-        ends_of(case.body),
-    )
+    x, y = (pos[:, axis] - moved[..., axis] for axis in range(2))
+    apart = separation(both.corners, both.present, x, y, heading, ends_of(case.body))
     return jnp.minimum(free, jnp.min(apart, axis=0))
 
 
@@ -282,15 +277,9 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Return whether the start is blocked, and whether the meeting is, () bool each."""
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
-    before = both.centre - case.start[:2]
-    at_start = separation(
-        both.corners,
-        both.present,
-        -before[:, :1],
-        -before[:, 1:],
-        case.start[2:],
-        ends_of(case.body),
-    )
+    x, y = (-(both.centre - case.start[:2])[:, axis, None] for axis in range(2))
+    heading, body = case.start[2:], ends_of(case.body)
+    at_start = separation(both.corners, both.present, x, y, heading, body)
     apart = goal - (both.centre + both.velocity * case.time)
     at_goal, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
     on_map = jnp.all((goal > case.lower) & (goal < case.upper))
