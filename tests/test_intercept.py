@@ -16,7 +16,7 @@ from planner_jax.task.intercept.motion import Quadratic, by_unknowns, motion
 from planner_jax.task.intercept.searches import Search, make_field, make_grid
 from planner_jax.task.intercept.terms import Weights
 
-# One search is one program to compile.
+# A single search, so that a single program is compiled.
 SEARCHES = (Search(12, lattice=Lattice(layers=22)),)
 PLANNER = pj.intercept.planner(searches=SEARCHES)
 START = np.array([0.8, 4.0, 0.3])

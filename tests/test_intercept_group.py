@@ -25,7 +25,7 @@ from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.suites import SIZE
 
-# One search is one program to compile.
+# A single search, so that a single program is compiled.
 SEARCH = Search(12, LevenbergConfig(40), lattice=Lattice(layers=22))
 LEGS = SpacetimeIntercept(meet="early", pieces=16, searches=(SEARCH,))
 

@@ -194,27 +194,28 @@ PlanT = TypeVar("PlanT", bound=Plan)
 class Decision(Protocol):
     """A rule that decides what a case leaves open, such as an order; a pytree, as planners are.
 
-    Examples are the best of all orders, the output of a network, and a fixed order.
+    Examples are the best of all orders, the output of a network, and a fixed order. A class may
+    inherit the defaults of `check`, `rank` and `explain`.
     """
 
     def check(self, cases: PyTree, /) -> None:
         """Raise `ArgumentError` for a batch that this cannot decide; on the host."""
-        ...
 
     def propose(self, case: PyTree, /) -> PyTree:
         """Return choices for `case.with_choice`, best first, leaves (F, ...); a pure function."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
-        """Return one number for each plan; the plan with the least number is selected; pure.
+        """Return one number for each plan, by default its cost; pure.
 
-        The plans have any batch shape, in NumPy or jax arrays.
+        The plan with the least number is selected. The plans have any batch shape, in NumPy or jax
+        arrays.
         """
-        ...
+        return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:
         """Return the status () of an unsolved case, or a status that explains more; pure."""
-        ...
+        return status
 
 
 Tree = TypeVar("Tree")

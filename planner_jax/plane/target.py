@@ -32,7 +32,7 @@ class PlanePath(Protocol):
 class TurningPath:
     """A target of constant speed whose direction turns at a constant rate, which may be 0.
 
-    [Qu2022, Section V-A] has two modes of motion, straight and turning; here both stay on the map.
+    It covers the two modes of motion of [Qu2022, Section V-A], straight and turning.
     """
 
     pos: Array  # (2,) [m], at time 0

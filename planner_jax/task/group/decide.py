@@ -15,10 +15,9 @@ from flax import struct
 from jax import Array
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import require_settings
+from planner_jax.core.protocol import Decision, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
-from planner_jax.task.group.plan import GroupPlan
 
 _GRID = 128  # times at which every target is evaluated
 _PACE = 0.8  # assumed mean speed over the greatest speed
@@ -89,27 +88,12 @@ def _select(condition: Array, meeting: _Meeting, other: _Meeting) -> _Meeting:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), meeting, other)
 
 
-class GroupDecision:
-    """The methods that all decisions about groups share."""
-
-    def check(self, cases: InterceptGroup) -> None:
-        """Accept every batch."""
-
-    def rank(self, plans: GroupPlan) -> Array:
-        """Return the time [s] of the last meeting of every plan."""
-        return plans.cost
-
-    def explain(self, case: InterceptGroup, status: Array) -> Array:
-        """Return the status of the planner unchanged."""
-        return status
-
-
 MOST_PERMUTED = 8  # targets of a group
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Best(GroupDecision):
+class Best(Decision):
     """Plans the orders with the earliest estimated last meeting, and selects the best plan.
 
     All N! orders of at most 8 targets are estimated. The best of them are the finalists.
@@ -144,7 +128,7 @@ class Best(GroupDecision):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Greedy(GroupDecision):
+class Greedy(Decision):
     """Meets next the target with the earliest estimated meeting."""
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
@@ -165,7 +149,7 @@ class Greedy(GroupDecision):
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
-class Given(GroupDecision):
+class Given(Decision):
     """Takes the order of the cases, with absent targets last."""
 
     def check(self, cases: InterceptGroup) -> None:

@@ -205,5 +205,5 @@ def quick(**fields: object) -> SpacetimeIntercept:
 
 
 def best(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` with more paths and steps that selects the least effort."""
+    """Make a `SpacetimeIntercept` with more paths and steps, for the plan of least effort."""
     return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})
