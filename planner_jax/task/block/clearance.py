@@ -144,12 +144,10 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     trunk = np.flatnonzero(link == 0)
     before = np.flatnonzero((link >= 0) & (link <= 3))
     middle, edges = poses.middle[:, None], poses.edges[:, :, None]
-    corners = [
-        middle + a * edges[0] + b * edges[1] for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1))
-    ]
-    outline = jnp.stack(
-        [jnp.concatenate(corners, axis=1), jnp.concatenate(corners[1:] + corners[:1], axis=1)]
-    )
+    signs = ((1, 1), (1, -1), (-1, -1), (-1, 1))
+    corners = [middle + a * edges[0] + b * edges[1] for a, b in signs]
+    ends_of_edges = (corners, corners[1:] + corners[:1])
+    outline = jnp.stack([jnp.concatenate(ends, axis=1) for ends in ends_of_edges])
     beams = jnp.moveaxis(jnp.asarray(scene.beam_ends), 0, 2)[..., None]  # (2, 3, N, 1)
     beams = jnp.broadcast_to(beams, (*beams.shape[:3], poses.middle.shape[-1]))
     num_beams = beams.shape[2]

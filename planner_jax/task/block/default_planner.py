@@ -11,6 +11,7 @@ motions from a library; this planner stores only the bumps.
 import dataclasses
 import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -66,6 +67,7 @@ from planner_jax.task.block.motion import (
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
+Refine = Callable[[BlockCase, Flight, Array, "Search", BlockPlan], BlockPlan]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -192,23 +194,18 @@ class OnlineBlock(Planner):
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from the starts."""
-        flight, poses, plan, starts = self.propose(case, attempt)
-        if attempt.tries and attempt.in_turn:
-            plan = self.refine_in_turn(case, flight, starts, attempt, plan)
-        elif attempt.tries:
-            plan = self.refine_cheapest_first(case, flight, starts, attempt, plan)
-        return dataclasses.replace(plan, status=explain_status(case, poses, plan.status))
+        refine = self.refine_in_turn if attempt.in_turn else self.refine_cheapest_first
+        return self._solve_by(refine, case, attempt)
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plans of a batch; all starts of all cases are refined in step."""
+        return jax.vmap(lambda case: self._solve_by(self.refine_in_step, case, attempt))(cases)
 
-        def solve_one(case: BlockCase) -> BlockPlan:
-            flight, poses, plan, starts = self.propose(case, attempt)
-            if attempt.tries:
-                plan = self.refine_in_step(case, flight, starts, attempt, plan)
-            return dataclasses.replace(plan, status=explain_status(case, poses, plan.status))
-
-        return jax.vmap(solve_one)(cases)
+    def _solve_by(self, refine: Refine, case: BlockCase, attempt: Search) -> BlockPlan:
+        flight, poses, plan, starts = self.propose(case, attempt)
+        if attempt.tries:
+            plan = refine(case, flight, starts, attempt, plan)
+        return dataclasses.replace(plan, status=explain_status(case, poses, plan.status))
 
     def propose(
         self, case: BlockCase, attempt: Search
@@ -223,12 +220,10 @@ class OnlineBlock(Planner):
         """
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
-        ranks, bumps = (
-            each[attempt.first : attempt.first + attempt.tries] for each in read_learned_starts()
-        )
-        order = rank_poses(
-            poses, max(attempt.straight, 1 + max(ranks, default=0)), 1.0 - self.slack
-        )
+        tried = slice(attempt.first, attempt.first + attempt.tries)
+        ranks, bumps = (each[tried] for each in read_learned_starts())
+        num = max(attempt.straight, 1 + max(ranks, default=0))
+        order = rank_poses(poses, num, 1.0 - self.slack)
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         straight = jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
@@ -247,9 +242,8 @@ class OnlineBlock(Planner):
         if not attempt.tries:
             return flight, poses, best, jnp.zeros((0, 6 * self.pieces + 1), case.angles.dtype)
         starts = jax.vmap(lambda rank: self.encode_straight(case, poses, order[rank]))(ranks)
-        turns = jax.vmap(lambda height: bump_steps(height, self.pieces))(
-            jnp.asarray(bumps, starts.dtype)
-        )
+        heights = jnp.asarray(bumps, starts.dtype)
+        turns = jax.vmap(lambda height: bump_steps(height, self.pieces))(heights)
         starts = starts.at[:, :-1].add(turns.reshape(attempt.tries, -1))
         return flight, poses, best, starts
 
@@ -281,9 +275,8 @@ class OnlineBlock(Planner):
             is_trial = k < tries
             index = jnp.where(is_trial, k, jnp.argmin(costs))
             most = jnp.where(is_trial, solver.trial, solver.max_steps)
-            search = continue_search(
-                model, jax.tree.map(lambda leaf: leaf[index], searches), solver, most
-            )
+            search = jax.tree.map(lambda leaf: leaf[index], searches)
+            search = continue_search(model, search, solver, most)
             searches = jax.tree.map(lambda old, new: old.at[index].set(new), searches, search)
             costs = costs.at[index].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
             plan = lax.cond(

@@ -1,6 +1,5 @@
 """The plan that a block planner returns."""
 
-import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
@@ -38,25 +37,18 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
     )
 
 
-def has_nan(case: BlockCase) -> Array:
-    """Return whether any number of a case is NaN, () bool."""
-    leaves = [jnp.ravel(leaf) for leaf in map(jnp.asarray, jax.tree.leaves(case))]
-    numbers = [leaf for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
-    return jnp.any(jnp.isnan(jnp.concatenate(numbers)))
-
-
 def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
     """Return the status () int32 of a plan; of an unsolved plan the status that explains why.
 
-    NON_FINITE: the case has a NaN. OUT_OF_REACH: the ball does not enter both boxes, or the shield
-    reaches it nowhere. BLOCKED: the arm touches something at the start.
+    OUT_OF_REACH: the ball does not enter both boxes, or the shield reaches it nowhere. BLOCKED: the
+    arm touches something at the start.
     """
 
     def explain() -> Array:
         nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
         why = jnp.where(nearest < 0.0, Status.BLOCKED, status)
-        why = jnp.where(jnp.any(jnp.isfinite(poses.effort)), why, Status.OUT_OF_REACH)
-        return jnp.where(has_nan(case), Status.NON_FINITE, why).astype(jnp.int32)
+        is_reached = jnp.any(jnp.isfinite(poses.effort))
+        return jnp.where(is_reached, why, Status.OUT_OF_REACH).astype(jnp.int32)
 
     # `cond` skips the check of a single case that is solved.
     return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), explain)

@@ -23,7 +23,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE, Attempt, Status, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.motion import polynomial
-from planner_jax.task.block.plan import BlockPlan, has_nan
+from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _SAME_START = 1e-4  # [rad] and [rad/s], tolerance of the arm's state at a home
@@ -68,7 +68,6 @@ class LibraryBlock(Planner):
         home, fits = self.home_of(case)
         plan = _plan_from_answer(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
-        status = jnp.where(has_nan(case), Status.NON_FINITE, status)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
