@@ -1,4 +1,4 @@
-"""Closed forms that tests hold the library against."""
+"""Closed forms for comparison with the library."""
 
 import numpy as np
 
@@ -6,9 +6,9 @@ from planner_jax.task.hit import court
 
 
 def region_of(x, y):
-    """Code of the region that points (...) [m] of the court's floor lie in, whichever the half.
+    """Return the region of points (...) [m] on the floor of either half of the court.
 
-    1 to 4 for N, F, L, R; 0 in the dead zone, outside the court, or for NaN.
+    Regions N, F, L, R are 1 to 4; 0 is the dead zone, outside the court, or NaN.
     """
     depth, aside = np.abs(x), np.abs(y)
     inside = (depth >= court.DEAD_ZONE) & (depth <= court.HALF_LENGTH) & (aside <= court.HALF_WIDTH)

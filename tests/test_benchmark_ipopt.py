@@ -32,7 +32,7 @@ def setup(name):
 
 @functools.cache
 def points(name):
-    """Around first guesses, limits exceeded and not."""
+    """Return points near first guesses, some of which exceed limits."""
     starts = setup(name).batches["smooth"].starts
     return starts + 0.6 * np.random.default_rng(0).normal(size=starts.shape)
 
@@ -127,7 +127,7 @@ def test_without_casadi_it_ends_with_the_line_that_installs_it(monkeypatch, caps
 @needs_casadi
 @pytest.mark.slow
 def test_a_run_has_a_row_for_every_setting_solver_and_effort(monkeypatch, tmp_path):
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)  # this process goes on
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)  # for this process
     few = {"num": 2, "tune": 2, "repeat": 1, "batch": 16, "tasks": "hit", "out": tmp_path / "run"}
     monkeypatch.setattr("sys.argv", ["ipopt", *(f"--{name}={few[name]}" for name in few)])
     ipopt.main()

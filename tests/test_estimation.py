@@ -6,31 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import serve as balls
+from serve import DRAG, GRAVITY, LINEAR_DRAG, float64
 
-from planner_jax.ball.estimation import (
-    EkfModel,
-    EkfState,
-    ekf_init,
-    ekf_predict,
-    ekf_update,
-)
-from planner_jax.ball.flight import (
-    BallState,
-    fly,
-    linear_drag_flight,
-    rk4_step,
-)
+from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
+from planner_jax.ball.flight import BallState, fly, linear_drag_flight, rk4_step
 from planner_jax.sims.sensing import RlsState, rls_update, specific_energy
 
-GRAVITY = 9.8
-LINEAR_DRAG = (0.4, 0.3, 0.2)  # [1/s]
-QUADRATIC_DRAG = 0.0616  # [1/m]
 NUM = 121
 PERIOD = 0.01  # [s]
 NOISE = 0.02  # [m]
-SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
-
-float64 = pytest.mark.usefixtures("float64")
 
 # Compiled once for all tests of equal shapes and dtype; "many" have a row of observations a ball.
 predict_one = jax.jit(ekf_predict, static_argnames="flight")
@@ -40,7 +25,7 @@ fly_many = jax.jit(jax.vmap(functools.partial(fly, num_steps=80), in_axes=(0, No
 
 
 def filter_path(initial, times, observations, model, *, flight=linear_drag_flight):
-    """The belief after each of a row of observations (N, 3) at `times` (N,)."""
+    """Return the belief after each of N observations (N, 3) at `times` (N,)."""
 
     def advance(state, seen):
         duration, observation = seen
@@ -72,7 +57,7 @@ def times(dtype=np.float32):
 
 
 def serve(dtype=np.float32):
-    return BallState(pos=np.array(SERVE_POS, dtype), vel=np.array(SERVE_VEL, dtype))
+    return balls.serve(dtype=dtype)
 
 
 def model(drag=LINEAR_DRAG, *, density=0.0, std=NOISE, dtype=np.float32):
@@ -88,14 +73,14 @@ def drag_prior(estimate, variance, dtype=np.float32):
 
 
 def linear_path(dtype=np.float32, ball=None):
-    """The ball at every one of `times`."""
+    """Return the ball at all `times`, with linear drag."""
     ball = serve(dtype) if ball is None else ball
-    path = linear_flight(ball, times(dtype) - times(dtype)[0], np.array(LINEAR_DRAG, dtype))
+    path = linear_flight(ball, times(dtype) - times(dtype)[0], LINEAR_DRAG.astype(dtype))
     return jax.tree.map(np.asarray, path)
 
 
-def quadratic_path(dtype=np.float32, drag=QUADRATIC_DRAG):
-    """The same by eight Runge-Kutta steps between two of them."""
+def quadratic_path(dtype=np.float32, drag=DRAG):
+    """Return the ball at all `times`, with quadratic drag, by eight Runge-Kutta steps each."""
     ball = serve(dtype)
     _, fine = fly_one(ball, PERIOD * (NUM - 1), drag, GRAVITY, num_steps=8 * (NUM - 1))
     return jax.tree.map(lambda x0, x: np.concatenate([x0[None], x[7::8]]), ball, fine)
@@ -142,12 +127,10 @@ def textbook_kalman(mean, covariance, observations, drag, density, std):
 def test_filter_of_linear_flight_is_the_textbook_kalman_filter():
     observations = noisy(linear_path(np.float64).pos, seed=1)
     prior = wide_prior(np.float64)
-    states = filter_one(
-        prior, times(np.float64), observations, model(density=0.5, dtype=np.float64)
-    )
-    mean, covariance = textbook_kalman(
-        prior.mean, prior.covariance, observations, np.array(LINEAR_DRAG), 0.5, NOISE
-    )
+    belief = model(density=0.5, dtype=np.float64)
+    states = filter_one(prior, times(np.float64), observations, belief)
+    start = prior.mean, prior.covariance
+    mean, covariance = textbook_kalman(*start, observations, LINEAR_DRAG, 0.5, NOISE)
     np.testing.assert_allclose(states.mean[-1], mean, atol=1e-9)
     np.testing.assert_allclose(states.covariance[-1], covariance, atol=1e-10)
 
@@ -157,9 +140,8 @@ def test_filter_of_linear_flight_is_the_textbook_kalman_filter():
 def test_filter_recovers_the_exact_state_from_exact_observations(flight):
     linear = flight is linear_drag_flight
     path = linear_path(np.float64) if linear else quadratic_path(np.float64)
-    belief = model(
-        LINEAR_DRAG if linear else QUADRATIC_DRAG, density=1e-9, std=1e-6, dtype=np.float64
-    )
+    drag = LINEAR_DRAG if linear else DRAG
+    belief = model(drag, density=1e-9, std=1e-6, dtype=np.float64)
     states = filter_one(wide_prior(np.float64), times(np.float64), path.pos, belief, flight=flight)
     np.testing.assert_allclose(states.ball.pos[-1], path.pos[-1], atol=1e-6)
     np.testing.assert_allclose(states.ball.vel[-1], path.vel[-1], atol=1e-5)
@@ -225,7 +207,7 @@ def test_uncertainty_grows_in_a_gap_and_the_estimate_flies_on():
 
 def test_no_time_passed_changes_nothing():
     state = wide_prior()
-    for flight, drag in ((linear_drag_flight, LINEAR_DRAG), (rk4_step, QUADRATIC_DRAG)):
+    for flight, drag in ((linear_drag_flight, LINEAR_DRAG), (rk4_step, DRAG)):
         after = predict_one(state, 0.0, model(drag, density=1.0), flight=flight)
         np.testing.assert_array_equal(after.mean, state.mean)
         np.testing.assert_array_equal(after.covariance, state.covariance)
@@ -233,11 +215,11 @@ def test_no_time_passed_changes_nothing():
 
 def test_prediction_error_grows_with_the_horizon_and_stays_finite():
     path = quadratic_path()
-    belief = model(QUADRATIC_DRAG, density=1e-3)
+    belief = model(DRAG, density=1e-3)
     states = filter_many(wide_prior(), times(), noisy_balls(path.pos), belief, flight=rk4_step)
     start, horizon = 40, 80
     balls = jax.tree.map(lambda x: np.asarray(x)[:, start], states.ball)
-    _, ahead = fly_many(balls, horizon * PERIOD, QUADRATIC_DRAG, GRAVITY)
+    _, ahead = fly_many(balls, horizon * PERIOD, DRAG, GRAVITY)
     missed = np.linalg.norm(np.asarray(ahead.pos) - path.pos[start + 1 :], axis=-1)
     errors = np.sqrt(np.mean(missed**2, axis=0))
     assert np.all(np.isfinite(errors)) and np.all(np.diff(errors[9::10]) > 0.0)
@@ -247,9 +229,9 @@ def test_prediction_error_grows_with_the_horizon_and_stays_finite():
 @pytest.mark.slow
 @float64
 def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
-    """With respect to the model and the observations, the first of which are missing."""
+    """With respect to the model and the observations, where the first three are missing."""
     observations = without(noisy(quadratic_path(np.float64).pos, seed=4), slice(3))
-    belief = model(QUADRATIC_DRAG, density=0.1, dtype=np.float64)
+    belief = model(DRAG, density=0.1, dtype=np.float64)
 
     def last(belief, observations):
         states = filter_one(
@@ -278,7 +260,7 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
 
 @float64
 def test_energy_is_kept_without_drag_and_lost_with_it():
-    for drag, kept in ((0.0, True), (QUADRATIC_DRAG, False)):
+    for drag, kept in ((0.0, True), (DRAG, False)):
         energy = [
             specific_energy(BallState(*ball), GRAVITY)
             for ball in zip(*jax.tree.leaves(quadratic_path(np.float64, drag)), strict=True)
@@ -309,7 +291,7 @@ def test_batch_equals_loop():
     states = filter_many(wide_prior(), times(), observations, model())
     for k in range(3):
         state = filter_one(wide_prior(), times(), observations[k], model())
-        # The first velocities, of which little is known, would only compare roundings.
+        # The first velocities are unknown, and differ by rounding.
         np.testing.assert_allclose(states.mean[k, 20:], state.mean[20:], atol=1e-4)
 
 

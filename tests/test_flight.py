@@ -9,6 +9,18 @@ import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
 from scipy.integrate import solve_ivp
+from serve import (
+    DRAG,
+    GRAVITY,
+    LINEAR_DRAG,
+    SERVE_POS,
+    SERVE_VEL,
+    assert_close,
+    float64,
+    pick,
+    three_balls,
+)
+from serve import serve as ball
 
 from planner_jax.ball.flight import (
     BallState,
@@ -21,12 +33,7 @@ from planner_jax.ball.flight import (
     rk4_step,
 )
 
-GRAVITY, DRAG = 9.8, 0.0616
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
-LINEAR_DRAG = np.array([0.4, 0.3, 0.2])  # [1/s]
-SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
-
-float64 = pytest.mark.usefixtures("float64")
 
 # Compiled once for all tests of equal shapes and dtype.
 step_once = jax.jit(rk4_step)
@@ -39,25 +46,21 @@ fall_and_slope = jax.jit(jax.value_and_grad(drag_free_fall_time, argnums=(0, 1, 
 
 @jax.jit
 def linear_drag_and_rates(ball, duration, drag):
-    """The state, and its rates of change in time and in drag on all axes."""
+    """Return the state, and its derivatives by time and by the drag on all axes."""
     flight = functools.partial(linear_drag_flight, gravity=GRAVITY)
     state, in_time = jax.jvp(lambda t: flight(ball, t, drag), (duration,), (jnp.ones(()),))
     _, in_drag = jax.jvp(lambda k: flight(ball, duration, k), (drag,), (jnp.ones(3),))
     return state, in_time, in_drag
 
 
-def ball(pos=SERVE_POS, vel=SERVE_VEL, dtype=np.float64):
-    return BallState(pos=np.array(pos, dtype), vel=np.array(vel, dtype))
-
-
-def flown(start, duration, drag=DRAG, gravity=GRAVITY, *, num=32):
+def fly_steps(start, duration, drag=DRAG, gravity=GRAVITY, *, num=32):
     for _ in range(num):
         start = step_once(start, duration / num, drag, gravity)
     return start
 
 
 def integrate(acceleration, duration):
-    """The serve after `duration`, by SciPy and to rounding."""
+    """Integrate the serve by SciPy, to rounding."""
     flight = solve_ivp(
         lambda _, state: np.concatenate([state[3:], acceleration(state[3:])]),
         (0.0, duration),
@@ -71,10 +74,6 @@ def integrate(acceleration, duration):
 
 def with_quadratic_drag(vel):
     return WEIGHT - DRAG * np.linalg.norm(vel) * vel
-
-
-def assert_close(a, b, **tolerance):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
 
 
 # Quadratic drag
@@ -104,7 +103,7 @@ def test_one_runge_kutta_step_without_drag_is_the_closed_form():
 @float64
 def test_a_fall_from_rest_follows_its_closed_form():
     """v = -c tanh(g t / c) and z = -(c^2 / g) log cosh(g t / c), c the terminal speed."""
-    final = flown(ball((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0)
+    final = fly_steps(ball((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0)
     terminal = np.sqrt(GRAVITY / DRAG)
     x = GRAVITY * 2.0 / terminal
     fallen = terminal**2 / GRAVITY * np.log(np.cosh(x))
@@ -118,12 +117,12 @@ def test_a_ball_without_weight_follows_its_closed_form():
     start = ball((1.0, 2.0, 3.0), (2.0, -3.0, 6.0))
     x = DRAG * 7.0 * 2.0
     expected = BallState(start.pos + start.vel * np.log1p(x) / (7.0 * DRAG), start.vel / (1.0 + x))
-    assert_close(flown(start, 2.0, gravity=0.0), expected, atol=1e-7)
+    assert_close(fly_steps(start, 2.0, gravity=0.0), expected, atol=1e-7)
 
 
 @float64
 def test_a_long_fall_ends_at_the_terminal_speed():
-    final = flown(ball(), 10.0, 0.3)
+    final = fly_steps(ball(), 10.0, 0.3)
     np.testing.assert_allclose(final.vel, [0.0, 0.0, -np.sqrt(GRAVITY / 0.3)], atol=1e-6)
 
 
@@ -131,7 +130,7 @@ def test_a_long_fall_ends_at_the_terminal_speed():
 def test_runge_kutta_converges_with_order_four_to_the_flight_that_scipy_finds():
     exact = integrate(with_quadratic_drag, 1.8)
     nums = [4, 8, 16, 32]
-    errors = [np.linalg.norm(flown(ball(), 1.8, num=n).pos - exact.pos) for n in nums]
+    errors = [np.linalg.norm(fly_steps(ball(), 1.8, num=n).pos - exact.pos) for n in nums]
     assert float(observed_order(1.8 / np.array(nums), errors)) == pytest.approx(4.0, abs=0.2)
     assert errors[-1] < 1e-6
 
@@ -145,13 +144,13 @@ def test_a_flight_is_its_steps_and_its_path_holds_the_ball_after_each(float64, d
     state = ball(dtype=dtype)
     for k in range(8):
         state = step_once(state, 0.2, DRAG, GRAVITY)
-        assert_close(jax.tree.map(lambda x, k=k: x[k], path), state, rtol=tolerance, atol=tolerance)
-    assert_close(jax.tree.map(lambda x: x[7], path), final, rtol=0.0)
+        assert_close(pick(path, k), state, rtol=tolerance, atol=tolerance)
+    assert_close(pick(path, 7), final, rtol=0.0)
 
 
 def test_a_flight_in_float32_is_right_to_some_micrometres():
     exact = integrate(with_quadratic_drag, 1.8)
-    np.testing.assert_allclose(flown(ball(dtype=np.float32), 1.8).pos, exact.pos, atol=5e-6)
+    np.testing.assert_allclose(fly_steps(ball(dtype=np.float32), 1.8).pos, exact.pos, atol=5e-6)
 
 
 @float64
@@ -286,26 +285,14 @@ def test_a_plane_that_is_not_fallen_through_is_flagged_with_a_finite_gradient(he
 
 @float64
 def test_batch_equals_loop():
-    balls = BallState(
-        pos=np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)]),
-        vel=np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]),
-    )
-    durations, drags = np.array([1.8, 0.5, -0.2]), np.array([DRAG, 0.0, 0.3])
+    balls, durations, drags = three_balls(), np.array([1.8, 0.5, -0.2]), np.array([DRAG, 0.0, 0.3])
     linear_drags = drags[:, None] * LINEAR_DRAG
     axes = (0, 0, 0, None)
     many = jax.jit(jax.vmap(functools.partial(fly, num_steps=8), axes))
     many_linear = jax.jit(jax.vmap(linear_drag_flight, axes))
-    together = jax.tree.map(
-        np.asarray,
-        (
-            many(balls, durations, drags, GRAVITY),
-            many_linear(balls, durations, linear_drags, GRAVITY),
-        ),
-    )
+    together = many(balls, durations, drags, GRAVITY)
+    together = together, many_linear(balls, durations, linear_drags, GRAVITY)
     for k in range(3):
-        pick = functools.partial(jax.tree.map, lambda x, k=k: x[k])
-        alone = (
-            fly_eight_steps(pick(balls), float(durations[k]), float(drags[k]), GRAVITY),
-            linear_drag(pick(balls), float(durations[k]), linear_drags[k], GRAVITY),
-        )
-        assert_close(pick(together), alone, rtol=1e-13)
+        alone = fly_eight_steps(pick(balls, k), float(durations[k]), float(drags[k]), GRAVITY)
+        one = linear_drag(pick(balls, k), float(durations[k]), linear_drags[k], GRAVITY)
+        assert_close(pick(together, k), (alone, one), rtol=1e-13)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from derivatives import assert_gradient_matches_differences
 
-from planner_jax.ball.flight import racket_impact, required_impact
+from planner_jax.ball.flight import racket_impact, solve_impact
 
 RESTITUTION = 0.7
 BALL_VEL = np.array([-5.0, -0.4, -5.5])
@@ -17,7 +17,7 @@ STILL = np.zeros(3)
 float64 = pytest.mark.usefixtures("float64")
 
 bounce = jax.jit(racket_impact)
-required = jax.jit(required_impact)
+required = jax.jit(solve_impact)
 
 
 def split(vel):
@@ -62,7 +62,7 @@ def test_an_elastic_bounce_keeps_the_energy_and_a_plastic_one_leaves_ball_and_ra
 
 @float64
 @pytest.mark.parametrize("restitution", [0.0, 0.47, 0.7, 1.0])
-def test_the_required_impact_inverts_the_bounce(restitution):
+def test_the_solved_impact_inverts_the_bounce(restitution):
     wanted = np.array([4.0, 1.5, 6.0])
     normal, normal_speed = required(BALL_VEL, wanted, restitution)
     np.testing.assert_allclose(np.linalg.norm(normal), 1.0, rtol=1e-15)
@@ -87,7 +87,7 @@ def test_impact_gradients_match_finite_differences():
     def everything(args):
         ball_vel, racket_vel, normal, restitution = args
         after = racket_impact(ball_vel, racket_vel, normal, restitution)
-        back, normal_speed = required_impact(after, racket_vel, restitution)
+        back, normal_speed = solve_impact(after, racket_vel, restitution)
         return jnp.sum(after**3) + back @ jnp.arange(3.0) + normal_speed
 
     assert_gradient_matches_differences(everything, (BALL_VEL, RACKET_VEL, NORMAL, RESTITUTION))
@@ -97,7 +97,7 @@ def test_no_change_of_velocity_needs_no_normal_and_has_a_finite_gradient():
     vel = BALL_VEL.astype(np.float32)
 
     def require(after):
-        impact = required_impact(vel, after, RESTITUTION)
+        impact = solve_impact(vel, after, RESTITUTION)
         return impact, impact
 
     jacobian, (normal, normal_speed) = jax.jit(jax.jacfwd(require, has_aux=True))(vel)
@@ -109,7 +109,7 @@ def test_batch_equals_loop_in_float32():
     balls = np.array([BALL_VEL, [0.0, 0.0, -2.0], [-9.0, 3.0, 1.0]], np.float32)
     wanted = np.array([[4.0, 1.5, 6.0], [0.0, 0.0, 1.4], [3.0, -3.0, 7.0]], np.float32)
     restitutions = np.array([0.7, 0.5, 0.9], np.float32)
-    many = jax.jit(jax.vmap(required_impact))(balls, wanted, restitutions)
+    many = jax.jit(jax.vmap(solve_impact))(balls, wanted, restitutions)
     normals, speeds = map(np.asarray, many)
     assert normals.dtype == speeds.dtype == np.float32
     for k in range(3):

@@ -1,4 +1,4 @@
-"""The live loop: from looks at a ball to setpoints, whatever else comes."""
+"""The live loop: from observations of a ball to setpoints, with any other packets between."""
 
 import re
 import signal
@@ -30,8 +30,8 @@ HOME, STEP = np.array([0.0, 0.0, 1.0]), 0.01
 PAGE = Path(__file__).parents[1] / "docs" / "live.md"
 
 
-def places_of(vel):
-    """Places (200, 3) [m] of a thrown ball, a look each."""
+def positions_of(vel):
+    """Return positions (200, 3) [m] of a thrown ball, one every STEP."""
     ball = pj.BallState(jnp.array([3.0, 0.1, 1.7]), jnp.asarray(vel, jnp.float32))
     thrown = pj.BallPath(ball, jnp.full(3, CATCH_DRAG), jnp.asarray(9.81))
     return np.asarray(jax.jit(jax.vmap(thrown.at))(STEP * jnp.arange(200)).pos, float)
@@ -39,12 +39,12 @@ def places_of(vel):
 
 @pytest.fixture(scope="module")
 def path():
-    return places_of([-2.9, 0.0, 4.4])
+    return positions_of([-2.9, 0.0, 4.4])
 
 
 @pytest.fixture(scope="module")
 def warm():
-    """A planner that has compiled all it calls; a deadline that no busy machine misses."""
+    """Return a planner that has compiled all programs, with a deadline that it always meets."""
     planner = LivePlanner(CatchStroke(), deadline=30.0)
     planner.warm_up()
     yield planner
@@ -52,14 +52,14 @@ def warm():
 
 
 class Throw:
-    """One throw by a sender of its own clock; the robot is where the last answer had it."""
+    """One throw; the robot is where the last answer wanted it."""
 
-    def __init__(self, planner, path, number, disturb=lambda look, data: [data], home=HOME):
+    def __init__(self, planner, path, number, disturb=lambda step, data: [data], home=HOME):
         self.planner, self.path, self.number = planner, path, number
         self.disturb, self.home = disturb, home
         planner._forget()
         self.answers, self.sequence = [], 0
-        # Answers are handed over at once: the senders' clock is ours, the packets' times run on.
+        # Answers come at once, and the clock of the sender advances by STEP a packet.
         self.now = time.perf_counter()
         planner._arrivals.__init__()
 
@@ -75,22 +75,26 @@ class Throw:
         self.sequence += 1
         return request(kind, self.sequence, self.now, self.now, tuple(values), self.number)
 
-    def fly(self, looks):
-        wanted = np.stack([self.home, 0.0 * HOME, 0.0 * HOME])
+    def fly(self, steps):
+        state = np.stack([self.home, 0.0 * HOME, 0.0 * HOME])
         random = np.random.default_rng(0)
-        for look in range(looks):
+        for step in range(steps):
             self.now += STEP
-            self.send(self.packet(ROBOT, wanted.ravel()))
-            seen = self.path[look] + random.normal(0.0, 0.003, 3)
-            for data in self.disturb(look, self.packet(BALL, seen)):
+            self.send(self.packet(ROBOT, state.ravel()))
+            observed = self.path[step] + random.normal(0.0, 0.003, 3)
+            for data in self.disturb(step, self.packet(BALL, observed)):
                 self.send(data)
-            wanted = self.answers[-1].setpoints[0, :9].astype(float).reshape(3, 3)
+            state = self.answers[-1].setpoints[0, :9].astype(float).reshape(3, 3)
         return self.answers
 
 
 def balls_of(answers):
-    """The answers to looks."""
+    """Return the answers to observations of the ball, without those to states of the robot."""
     return answers[1::2]
+
+
+def last_plan(answers):
+    return [answer for answer in answers if answer.motion is Motion.PLAN][-1]
 
 
 def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, path):
@@ -102,15 +106,17 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     first, last = motions.index(Motion.PLAN), 179 - motions[::-1].index(Motion.PLAN)
     assert 2 <= first <= 12 and set(motions[first : last + 1]) == {Motion.PLAN}
     assert set(motions[last + 1 :]) == {Motion.SAFE}  # and never planned for again
-    contact, look = answers[last].contact, np.arange(180) * STEP + answers[0].begin
-    ball = np.array([np.interp(contact, look, path[:180, k]) for k in range(3)])
-    at = np.argmin(np.abs(look - contact))
-    wanted, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
-    net = wanted + 0.2 * thrust / np.linalg.norm(thrust)
-    assert np.linalg.norm(net - ball) < 0.125 + 0.06  # the net's radius, and a look's way
-    places = np.array([answer.column("pos")[0] for answer in answers])
+    contact, times = answers[last].contact, np.arange(180) * STEP + answers[0].begin
+    ball = np.array([np.interp(contact, times, path[:180, k]) for k in range(3)])
+    at = np.argmin(np.abs(times - contact))
+    pos, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
+    net = pos + 0.2 * thrust / np.linalg.norm(thrust)
+    assert (
+        np.linalg.norm(net - ball) < 0.125 + 0.06
+    )  # the net's radius, and the ball's path in STEP
+    positions = np.array([answer.column("pos")[0] for answer in answers])
     speeds = np.array([answer.column("vel")[0] for answer in answers])
-    jumps = np.diff(places, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
+    jumps = np.diff(positions, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
     assert np.abs(jumps).max() < 0.01
     slowing = np.linalg.norm(speeds[last + 1 :], axis=1)
     assert slowing[-1] < 0.5 * slowing[0]
@@ -127,10 +133,8 @@ def test_setpoints_agree_with_each_other(warm, path):
     middle = 0.5 * STEP * (vel[1:] + vel[:-1])
     np.testing.assert_allclose(np.diff(pos, axis=0), middle, atol=2e-4)
     np.testing.assert_allclose(np.linalg.norm(answer.column("quat_wxyz"), axis=1), 1.0, atol=1e-5)
-    push = answer.column("acc") + [0.0, 0.0, 9.81]
-    np.testing.assert_allclose(
-        answer.column("thrust")[:, 0], np.linalg.norm(push, axis=1), rtol=1e-5
-    )
+    thrust = np.linalg.norm(answer.column("acc") + [0.0, 0.0, 9.81], axis=1)
+    np.testing.assert_allclose(answer.column("thrust")[:, 0], thrust, rtol=1e-5)
 
 
 def test_before_the_robot_is_known_there_are_no_setpoints_and_then_it_comes_to_rest(warm, path):
@@ -149,14 +153,14 @@ def test_before_the_robot_is_known_there_are_no_setpoints_and_then_it_comes_to_r
     assert rest.column("pos")[0, 0] > state[0]
 
 
-def test_bad_packets_are_counted_by_name_and_spoil_nothing(warm, path):
+def test_bad_packets_are_counted_by_name_without_an_effect(warm, path):
     nan, far = (np.nan, 0.0, 0.0), (3.0, 3.0, 9.0)
 
-    def disturbed(look, data):
-        """A packet with others around it, each bad in its own way."""
+    def disturb(step, data):
+        """Return a good packet and a bad one, of seven kinds in turn."""
         throw.sequence += 4
         n, now = throw.sequence - 3, throw.now
-        ways = [
+        packets = [
             [data, data],
             [data, data[:-3]],
             [b"junk", data],
@@ -165,13 +169,13 @@ def test_bad_packets_are_counted_by_name_and_spoil_nothing(warm, path):
             [request(BALL, n, 1e300, 1e300, far, 4), data],
             [data[:5] + b"\x63" + data[6:], data],
         ]
-        return ways[look % len(ways)]
+        return packets[step % len(packets)]
 
     clean = balls_of(Throw(warm, path, 4).fly(60))[-1]
     before = warm.report.faults.copy()
-    throw = Throw(warm, path, 4, disturbed)
+    throw = Throw(warm, path, 4, disturb)
     answers = throw.fly(60)
-    spoiled = [answer for answer in answers if answer.motion is Motion.PLAN][-1]
+    spoiled = last_plan(answers)
     names = {fault for fault, num in (warm.report.faults - before).items() if num}
     wanted = {Fault.DUPLICATE, Fault.CUT, Fault.STRANGE, Fault.NOT_FINITE, Fault.OTHER_CLOCK}
     assert names >= {*wanted, Fault.UNKNOWN_KIND}
@@ -180,15 +184,15 @@ def test_bad_packets_are_counted_by_name_and_spoil_nothing(warm, path):
     assert abs(spoiled.contact - offset - clean.contact) < 0.05
 
 
-def test_throws_are_caught_by_plans_that_all_have_a_way_to_rest_behind_them(warm):
-    """In the net where the ball is at the contact, after 100 looks that disagree by millimetres."""
+def test_throws_are_caught_by_plans_with_recoveries(warm):
+    """Check the ball's distance from the net at the contact, after 100 noisy observations."""
     random, before = np.random.default_rng(1), warm.report.counts.copy()
     for number in range(20, 30):
-        places = places_of(np.array([-2.9, 0.0, 4.4]) + random.normal(0.0, 0.15, 3))
-        answers = balls_of(Throw(warm, places, number).fly(100))
-        last = [answer for answer in answers if answer.motion is Motion.PLAN][-1]
+        positions = positions_of(np.array([-2.9, 0.0, 4.4]) + random.normal(0.0, 0.15, 3))
+        answers = balls_of(Throw(warm, positions, number).fly(100))
+        last = last_plan(answers)
         since = last.contact - answers[0].begin
-        ball = [np.interp(since, STEP * np.arange(200), places[:, k]) for k in range(3)]
+        ball = [np.interp(since, STEP * np.arange(200), positions[:, k]) for k in range(3)]
         assert distance_off(last, 0.2, 9.81, np.array(ball)) < 0.125
         assert since < 1.0
     for name in ("endless", "refused"):
@@ -206,38 +210,38 @@ def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm
     np.testing.assert_allclose(answer.column("pos")[0], [5.0, 5.0, 2.0], atol=1e-5)
 
 
-def test_a_plan_behind_which_there_is_no_way_to_rest_is_not_flown_on(warm, path, monkeypatch):
+def test_a_plan_without_a_recovery_is_not_flown(warm, path, monkeypatch):
     monkeypatch.setattr(live_planner, "with_recovery", lambda *a: (with_recovery(*a)[0], False))
     before = warm.report.counts["endless"]
     answers = Throw(warm, path, 8).fly(40)
     assert warm.report.counts["endless"] - before > 10 and warm._flight.plan is None
     assert answers[-2].motion is Motion.SAFE  # to a state of the robot
-    places = np.array([answer.column("pos")[0] for answer in answers])
-    assert np.linalg.norm(places - HOME, axis=1).max() < 0.02
+    positions = np.array([answer.column("pos")[0] for answer in answers])
+    assert np.linalg.norm(positions - HOME, axis=1).max() < 0.02
 
 
 @pytest.mark.parametrize("rate", [2.0, 200.0])
-def test_setpoints_join_the_way_to_rest_behind_a_plan_at_any_rate(warm, path, monkeypatch, rate):
+def test_setpoints_continue_along_the_recovery_at_any_rate(warm, path, monkeypatch, rate):
     monkeypatch.setattr(warm, "_period", 1.0 / rate)
     answer = balls_of(Throw(warm, path, 9).fly(40))[-1]
     assert answer.motion is Motion.PLAN and answer.period == pytest.approx(1.0 / rate)
     times = answer.begin + answer.period * np.arange(10)
     assert (answer.column("vel")[times > answer.contact + 4.0] == 0.0).all()
-    way = np.linalg.norm(np.diff(answer.column("pos"), axis=0), axis=1)
-    assert (way < 5.0 * answer.period).all()  # the greatest speed
+    steps = np.linalg.norm(np.diff(answer.column("pos"), axis=0), axis=1)
+    assert (steps < 5.0 * answer.period).all()  # the greatest speed
 
 
-def test_what_takes_too_long_is_answered_from_the_last_good_plan(warm, path, monkeypatch):
-    goes_on = threading.Event()
+def test_slow_planning_is_answered_from_the_last_plan(warm, path, monkeypatch):
+    released = threading.Event()
     throw, again = Throw(warm, path, 6), warm.stroke.again
     throw.fly(20)
     monkeypatch.setattr(warm, "deadline", 0.002)
-    monkeypatch.setattr(warm.stroke, "again", lambda *a: (goes_on.wait(), again(*a))[1])
+    monkeypatch.setattr(warm.stroke, "again", lambda *a: (released.wait(), again(*a))[1])
     before = warm.report.counts["busy"]
     throw.now += STEP
     answer = throw.send(throw.packet(BALL, path[20]))
     assert answer.motion is Motion.PLAN and warm.report.counts["busy"] == before + 1
-    goes_on.set()
+    released.set()
     warm._job.found.result()
 
 
@@ -246,8 +250,8 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
     warm._forget()
     warm._arrivals.__init__()
     server._socket.settimeout(0.05)
-    running = threading.Event()
-    thread = threading.Thread(target=server.run, args=(lambda: not running.is_set(),))
+    stopped = threading.Event()
+    thread = threading.Thread(target=server.run, args=(lambda: not stopped.is_set(),))
     thread.start()
     blocks = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
     script = next(block for block in blocks if "Client(" in block)
@@ -255,13 +259,13 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
     try:
         exec(script.replace("Client()", f"Client({server.port}, timeout=5.0)"), {})
     finally:
-        running.set()
+        stopped.set()
         thread.join()
         server._socket.close()
     assert "PLAN" in capsys.readouterr().out
 
 
-def test_a_packet_has_come_when_the_system_got_it(warm):
+def test_a_packet_arrives_when_the_system_receives_it(warm):
     server = Server(warm, 0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(b"here", ("127.0.0.1", server.port))
@@ -272,7 +276,7 @@ def test_a_packet_has_come_when_the_system_got_it(warm):
     assert data == b"here" and abs(received - sent) < 0.05
 
 
-def test_packets_that_are_not_ours_get_a_line_each_kind_and_no_answer(warm, capsys):
+def test_foreign_packets_get_one_warning_a_kind_and_no_answer(warm, capsys):
     server, sender = Server(warm, 0), ("127.0.0.1", 9)
     ours = request(BALL, 1, 5.0, 5.0, (0.0, 0.0, 1.0))
     for data in (b"GET / HTTP/1.1", ours[:30], b"", ours[:4] + b"\x02" + ours[5:], b"PJLV", b"x"):

@@ -1,4 +1,4 @@
-"""Packets of a live loop, and which of them count."""
+"""Packets of a live loop, and their selection."""
 
 import struct
 
@@ -62,7 +62,7 @@ def test_an_answer_comes_back_as_it_was_packed():
         (BALL_SEEN[:5] + b"\x63" + BALL_SEEN[6:], Fault.UNKNOWN_KIND),
     ],
 )
-def test_what_cannot_be_read_has_a_name(data, fault):
+def test_an_unreadable_packet_has_a_fault(data, fault):
     assert read_request(data) is fault
 
 
@@ -77,7 +77,7 @@ def test_what_cannot_be_read_has_a_name(data, fault):
         (5.0, 1.0, (0.0, 0.0, 0.0), Fault.ABSURD),  # seconds ago
     ],
 )
-def test_numbers_that_are_not_used_have_a_name(sent, measured, values, fault):
+def test_an_invalid_number_is_a_fault(sent, measured, values, fault):
     packet = read_request(request(BALL, 1, sent, measured, values))
     assert isinstance(packet, Packet) and packet.fault is fault
 
@@ -90,7 +90,7 @@ def test_no_bytes_crash_it(data):
         read_answer(prefix + data)
 
 
-# Which packets count.
+# Selection.
 
 
 def packet(sequence, sent):
@@ -98,7 +98,7 @@ def packet(sequence, sent):
 
 
 def faults(marks):
-    """The faults of packets of one sender, by sequence number, time sent and time of arrival."""
+    """Return the faults of one sender's packets (number, sending time, arrival time)."""
     arrivals = Arrivals()
     found = [arrivals.check(packet(n, sent), "a", now)[0] for n, sent, now in marks]
     return found, arrivals
@@ -137,7 +137,7 @@ def test_another_clock_is_accepted_after_a_second_without_a_used_packet():
     assert arrivals.newest == 505.2
 
 
-def test_senders_without_end_take_no_memory_without_end():
+def test_the_number_of_senders_in_memory_is_bounded():
     arrivals = Arrivals()
     for k in range(500):
         arrivals.check(packet(1, 1.0 + 1e-3 * k), k, 9.0 + 1e-3 * k)

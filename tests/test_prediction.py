@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from convergence import observed_order
 from derivatives import assert_gradient_matches_differences
+from serve import DRAG, GRAVITY, assert_close, float64, pick, serve, three_balls
 
 from planner_jax.ball.flight import BallState, drag_free_flight, rk4_step
 from planner_jax.ball.prediction import (
@@ -19,12 +20,8 @@ from planner_jax.ball.prediction import (
 )
 from planner_jax.ball.prediction_kernel import table_kernel
 
-GRAVITY, DRAG = 9.8, 0.0616
-SERVE_POS, SERVE_VEL = (4.0, 0.5, 2.0), (-6.5, 0.7, 5.5)
 HORIZON, NUM_NODES = 1.5, 13  # ten intervals of 0.15 s between time 0 and the horizon
 RESOLUTION = 0.15
-
-float64 = pytest.mark.usefixtures("float64")
 
 # Compiled once for all tests of equal shapes and dtype; "many" have a row of times.
 predict = jax.jit(functools.partial(predict_path, num_nodes=NUM_NODES))
@@ -38,16 +35,12 @@ def target_and_rate(table, time):
     return jax.jvp(lambda t: target_at(table, t), (time,), (jnp.ones_like(time),))
 
 
-def serve(dtype=np.float64):
-    return BallState(pos=np.array(SERVE_POS, dtype), vel=np.array(SERVE_VEL, dtype))
-
-
 def path(drag=DRAG, dtype=np.float64):
-    return predict(serve(dtype), dtype(HORIZON), dtype(drag), dtype(GRAVITY))
+    return predict(serve(dtype=dtype), dtype(HORIZON), dtype(drag), dtype(GRAVITY))
 
 
 def table_of(function, resolution, num_nodes=NUM_NODES):
-    """The table of a position (3,) and its velocity, given as `function(time)`."""
+    """Tabulate `function(time)`, which returns a position (3,) and its velocity."""
     times = resolution * (np.arange(num_nodes) - 1.0)
     nodes = [function(t) for t in times]
     pos, vel = (np.array(rows) for rows in zip(*nodes, strict=True))
@@ -58,10 +51,6 @@ def swing(t):
     t = t + 1.0
     pos = np.array([np.sin(t), np.cos(2.0 * t), np.exp(-t)])
     return pos, np.array([np.cos(t), -2.0 * np.sin(2.0 * t), -np.exp(-t)])
-
-
-def assert_close(a, b, **tolerance):
-    jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, **tolerance), a, b)
 
 
 # The table
@@ -210,10 +199,7 @@ def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(p
 
 @float64
 def test_batch_equals_loop():
-    balls = BallState(
-        pos=np.array([SERVE_POS, (0.0, 0.0, 0.0), (-1.0, 2.0, 0.3)]),
-        vel=np.array([SERVE_VEL, (0.0, 0.0, 0.0), (0.0, -20.0, 1.0)]),
-    )
+    balls = three_balls()
     horizons, drags = np.array([HORIZON, 0.3, 2.0]), np.array([DRAG, 0.0, 0.3])
     gravity, times = np.float64(GRAVITY), np.array([1.5, 0.4, -0.1])
     tables = jax.jit(
@@ -222,49 +208,42 @@ def test_batch_equals_loop():
     targets = jax.jit(jax.vmap(target_at))(tables, times)
     tables, targets = jax.tree.map(np.asarray, (tables, targets))
     for k in range(3):
-        pick = functools.partial(jax.tree.map, lambda x, k=k: x[k])
-        table = predict(pick(balls), horizons[k], drags[k], gravity)
-        assert_close(pick(tables), table, rtol=1e-13)
-        assert_close(pick(targets), target_and_rate(table, float(times[k]))[0], rtol=1e-13)
+        table = predict(pick(balls, k), horizons[k], drags[k], gravity)
+        assert_close(pick(tables, k), table, rtol=1e-13)
+        assert_close(pick(targets, k), target_and_rate(table, float(times[k]))[0], rtol=1e-13)
+
+
+def kernel_arguments(lanes=32):
+    """Return position, velocity, resolution, drag and gravity of random balls, lanes last."""
+    random = np.random.default_rng(5)
+    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes))
+    vel[:, 3] = 0.0  # a ball at rest
+    numbers = random.uniform(0.01, 0.1, lanes), random.uniform(0.0, 0.3, lanes)
+    return [jnp.asarray(x, jnp.float32) for x in (pos, vel, *numbers, np.full(lanes, 9.8))]
+
+
+def table_of_lane(nodes):
+    def table(pos, vel, step, drag, gravity):
+        ball = BallState(pos, vel)
+        path = predict_path(ball, step * (nodes - 3), drag, gravity, num_nodes=nodes)
+        return path.pos, path.vel
+
+    return table
 
 
 def test_the_kernel_gives_the_same_table():
-    random = np.random.default_rng(5)
-    lanes, nodes = 32, 12
-    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes)).astype(np.float32)
-    vel[:, 3] = 0.0  # a ball at rest
-    numbers = [random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))]
-    gravity = np.full(lanes, 9.8, np.float32)
-    args = [jnp.asarray(x) for x in (pos, vel, *numbers, gravity)]
+    args, nodes = kernel_arguments(), 12
     found = table_kernel(nodes, interpret=True)(jax.tree.structure(args), args)
-    table = jax.vmap(
-        lambda p, v, step, drag, g: predict_path(
-            BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes
-        ),
-        in_axes=-1,
-        out_axes=-1,
-    )(*args)
-    np.testing.assert_allclose(found[0], table.pos, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(found[1], table.vel, rtol=1e-5, atol=1e-5)
+    expected = jax.vmap(table_of_lane(nodes), in_axes=-1, out_axes=-1)(*args)
+    assert_close(tuple(found), expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow
 def test_the_kernel_gives_the_same_derivatives_of_the_table():
-    """By velocity and drag, in that order."""
-    random = np.random.default_rng(6)
-    lanes, nodes, moving = 32, 6, (1, 3)
-    pos, vel = random.uniform(-3.0, 3.0, (2, 3, lanes)).astype(np.float32)
-    step, drag = (
-        random.uniform(*ends, lanes).astype(np.float32) for ends in ((0.01, 0.1), (0, 0.3))
-    )
-    args = [jnp.asarray(x) for x in (pos, vel, step, drag, np.full(lanes, 9.8, np.float32))]
+    """By velocity and drag, in that order, of moving balls."""
+    args, nodes, moving = kernel_arguments(), 6, (1, 3)
+    args[1] = args[1].at[:, 3].set(1.0)
     found = table_kernel(nodes, moving, interpret=True)(None, args)
-
-    def table(p, v, step, drag, g):
-        path = predict_path(BallState(p, v), step * (nodes - 3), drag, g, num_nodes=nodes)
-        return path.pos, path.vel
-
-    slopes = jax.jacrev(table, argnums=moving)
-    slopes = jax.jit(jax.vmap(slopes, in_axes=-1, out_axes=-1))(*args)
-    for ours, expected in zip(found, jax.tree.leaves(slopes), strict=True):
-        np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-5)
+    slopes = jax.vmap(jax.jacrev(table_of_lane(nodes), argnums=moving), in_axes=-1, out_axes=-1)
+    expected = jax.tree.leaves(jax.jit(slopes)(*args))
+    assert_close(list(found), expected, rtol=1e-4, atol=1e-5)

@@ -1,4 +1,4 @@
-"""What is flown behind the last contact: to rest, within all limits, and judged like the rest."""
+"""Recoveries: trajectories from the last contact to standstill, of quadrotors, cars and arms."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -40,7 +40,7 @@ def hits():
 
 @pytest.fixture(scope="module")
 def hit(hits):
-    """A hit and its plan, which ends at the contact."""
+    """Return a hit and its plan, which ends at the contact."""
     return pj.take(hits, 0), pj.take(pj.plan(pj.hit.planner(), hits), 0)
 
 
@@ -56,12 +56,12 @@ def braked(hits):
 
 
 def states(path, time=None):
-    """Position to jerk (4, 3) of one trajectory at a time, or at its end."""
+    """Return position to jerk (4, 3) of a trajectory at a time, or at its end."""
     time = total_duration(path) if time is None else time
     return np.stack([evaluate(path, time, order) for order in range(4)])
 
 
-def test_a_hit_comes_to_rest_where_its_trajectory_left_off(hits, braked):
+def test_a_recovery_continues_the_trajectory_to_standstill(hits, braked):
     assert pj.solved(braked).all()
     assert pj.hit.judge(hits, braked).success.all()
     for k in range(NUM):
@@ -104,7 +104,7 @@ def test_limits_hold_behind_the_contact_too(hits, braked):
     least = 0.5 * pj.hit.judge(hits, braked).max_speed.astype(np.float32)
     slow = dataclasses.replace(hits, limits=dataclasses.replace(hits.limits, speed=least))
     still = jax.tree.map(np.array, braked)
-    still.trajectory.coeffs[:, :, 1:] = 0.0  # it hovers, and the recovery alone moves
+    still.trajectory.coeffs[:, :, 1:] = 0.0  # the plan hovers, and only the recovery moves
     verdict = pj.hit.judge(slow, still)
     ends = still.trajectory.durations.sum(axis=1)
     assert (verdict.max_speed > least).any()
@@ -161,7 +161,7 @@ def swept(tmp_path_factory):
     return sweep(tmp_path_factory.mktemp("runs") / "braked", recovery="brake")
 
 
-def test_rows_of_a_sweep_have_the_way_to_rest_that_was_judged(swept, braked):
+def test_rows_of_a_sweep_have_the_judged_recovery(swept, braked):
     out, manifest = swept
     assert manifest["parameters"]["recovery"] == "brake"
     assert manifest["summary"]["successes"] == NUM
@@ -183,7 +183,7 @@ def test_a_sweep_is_resumed_with_its_recovery_alone(swept):
         run.resume_sweep(pj.task_named("hit"), out, progress=False, recovery="home")
 
 
-def test_the_limits_of_one_case_are_looked_at_behind_the_contact_too(braked):
+def test_the_samples_of_one_plan_include_its_recovery(braked):
     plan = pj.take(braked, 0)
     assert sample_plan(plan).time[-1] > plan.stroke.time + 0.2
 
@@ -208,7 +208,7 @@ def test_another_recovery_is_refused_in_one_line():
 # Exports of single plans.
 
 
-def test_a_plan_leaves_with_a_way_to_rest_behind_what_it_was(hit, here):
+def test_an_exported_plan_has_a_recovery(hit, here):
     case, plan = hit
     _, bare = table(pj.export(plan, to="csv", out="bare.csv", recovery=None))
     _, rows = table(pj.export(plan, to="csv", out="whole.csv", case=case))
@@ -219,7 +219,7 @@ def test_a_plan_leaves_with_a_way_to_rest_behind_what_it_was(hit, here):
     np.testing.assert_allclose(home[-1, 1:4], case.head_state[0], atol=0.1)
 
 
-def test_a_plan_that_has_its_own_keeps_it_or_leaves_without_it(hit, here):
+def test_a_plan_is_exported_with_its_own_recovery_or_without_one(hit, here):
     case, plan = hit
     ended = append_recovery(case, plan, "brake")
     assert not is_rested(plan) and is_rested(ended)
@@ -249,7 +249,7 @@ def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
         pj.export(plan, to="csv", out="a.csv", case=many)
 
 
-def test_where_no_way_to_rest_keeps_the_limits_nothing_is_written(hit, here):
+def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here):
     case, plan = hit
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
     says = "^recovery must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
@@ -297,7 +297,7 @@ def test_a_file_of_plans_does_not_hold_their_limits(here, capsys):
 
 
 def driving(*walls, **settings):
-    """A car that drives straight on at 1 m/s for a second, from (1, 4), and its case."""
+    """Return the case and plan of a straight drive at 1 m/s for 1 s from (1, 4)."""
     target = TurningPath(np.float32([2.0, 4.0]), np.zeros(2, np.float32), np.float32(0.0))
     case = pj.intercept.case(
         target, start=(1.0, 4.0, 0.0), initial_speed=1.0, walls=walls, **settings
@@ -325,11 +325,11 @@ def box(left, bottom, right, top):
     return np.array([(left, bottom), (right, bottom), (right, top), (left, top)])
 
 
-def test_a_car_brakes_to_a_stand_on_its_way(here):
+def test_a_car_brakes_on_its_path(here):
     case, plan = driving()
     _, rows = table(pj.export(plan, to="csv", out="a.csv", case=case))
     assert rows[-1, 4] < 0.02 and rows[101, 0] > 1.0
-    # v^2 / 2 a behind the meeting, in so many steps as long as the plan's, of 0.25 s.
+    # The distance v^2 / (2 a) of braking, in steps of 0.25 s as in the plan.
     assert rows[-1, 1] == pytest.approx(2.0 + 0.5 * 5 * 0.25, abs=0.01)
     assert np.abs(rows[:, 5]).max() <= 1.0 and not rows[:, 6].any()
     assert not is_rested(plan)
@@ -337,7 +337,7 @@ def test_a_car_brakes_to_a_stand_on_its_way(here):
 
 
 def test_a_car_steers_past_what_stands_in_its_way_and_says_where_it_cannot():
-    beside = box(2.7, 4.06, 3.4, 4.4)  # in the straight way, not in one to the right
+    beside = box(2.7, 4.06, 3.4, 4.4)  # blocks the straight path, but not a path to the right
     case, plan = driving(beside)
     stands = append_recovery(case, plan, "brake")
     assert stands.curvature[-1] < 0.0
@@ -357,8 +357,8 @@ def test_only_quadrotors_go_home(here):
     assert not list(here.iterdir())
 
 
-def test_movers_are_where_they_are_behind_the_meeting():
-    """One that is in the car's way now is gone by then; one that comes is there."""
+def test_movers_move_during_the_recovery():
+    """Check a mover that leaves the car's path in time, and one that enters it."""
     gone = {"movers": [box(2.3, 3.9, 2.5, 4.1)], "mover_velocities": (0.0, 2.0)}
     case, plan = driving(**gone)
     straight = append_recovery(case, plan, "brake")
@@ -373,7 +373,7 @@ def test_movers_are_where_they_are_behind_the_meeting():
 
 
 def turning(rates, regime="R1"):
-    """An arm whose joints have turned at these rates [rad/s] for 0.1 s, and its case."""
+    """Return the case and plan of an arm that moves at constant rates [rad/s] for 0.1 s."""
     case = pj.block.case((3.0, 0.0, 2.0), (-6.0, 0.0, 2.0), regime=regime)
     case = jax.tree.map(np.asarray, case)
     coeffs = np.stack([case.angles, np.asarray(rates, np.float32)])[None]
@@ -396,7 +396,7 @@ def test_an_arm_brakes_with_all_joints_at_once(here):
     assert np.abs(rows[-1, 7:13]).max() < 0.1 and np.abs(rows[:, 13:]).max() <= 60.0
 
 
-def test_an_arm_that_rests_leaves_as_it_is_and_one_that_cannot_says_why(here):
+def test_an_arm_at_rest_is_exported_unchanged_and_one_that_cannot_brake_is_refused(here):
     _, plan = turning(np.zeros(6))
     assert is_rested(plan)
     pj.export(plan, to="csv", out="a.csv")

@@ -1,4 +1,4 @@
-"""The referee of blocks, on motions worked out by hand: no planner has a part in this."""
+"""The referee of blocks, on motions in closed form, without a planner."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ REST_TO_REST, FROM_REST = (0.0, 0.0, 0.0, 10.0, -15.0, 6.0), (0.0, 0.0, 1.0)
 
 
 def links(angles):
-    """Rotations and places of the links, one product after the other."""
+    """Return rotations and positions of the links, by successive products."""
     rotation, place, found = np.eye(3), np.zeros(3), []
     for k in range(6):
         place = place + rotation @ ARM.origin[k]
@@ -40,13 +40,13 @@ def links(angles):
 
 
 def shield(angles):
-    """Rotation of the shield, and the middle of its face."""
+    """Return the rotation of the shield and the middle of its face."""
     rotation, place = links(angles)[5]
     return rotation, place + rotation @ ARM.shield_centre
 
 
 def angles_for(middle, normal):
-    """Angles that bring the shield there, with the last joint near where it was."""
+    """Solve for the angles of a shield's pose, with the last joint near its home angle."""
 
     def off(angles):
         rotation, place = shield(angles)
@@ -64,9 +64,9 @@ ROTATION = shield(GOAL)[0]
 
 
 def motion(shape, end=GOAL, durations=PIECES, start=HOME):
-    """Coefficients (M, D + 1, 6) of a way from start to end, cut into pieces.
+    """Return the coefficients (M, D + 1, 6) of a motion from start to end, cut into pieces.
 
-    The shape holds coefficients of a polynomial in the share of the whole time.
+    `shape` holds the coefficients of a polynomial in time / total time.
     """
     total = sum(durations)
     shifted = np.polynomial.Polynomial(np.array(shape) / total ** np.arange(len(shape)))
@@ -81,7 +81,7 @@ def motion(shape, end=GOAL, durations=PIECES, start=HOME):
 
 
 def flatten(tree, root=""):
-    """Leaves of nested dataclasses by their dotted names."""
+    """Return the leaves of nested dataclasses by their dotted names."""
     leaves = {}
     for field in dataclasses.fields(tree):
         value, name = getattr(tree, field.name), f"{root}{field.name}"
@@ -93,7 +93,7 @@ def flatten(tree, root=""):
 
 
 def good(shape=REST_TO_REST, end=GOAL, durations=PIECES, velocity=INCOMING, at=CONTACT, **options):
-    """Leaves, with leading axis 1, of an arm that meets its ball."""
+    """Return the leaves, with leading axis 1, of an arm that blocks the ball."""
     fall = np.array([0.0, 0.0, GRAVITY])
     begin = velocity + fall * CONTACT_TIME
     pos = at - begin * CONTACT_TIME + 0.5 * fall * CONTACT_TIME**2
@@ -125,7 +125,7 @@ def assert_fails(leaves, name, *, part="", **found):
 
 
 def still(angles, **options):
-    """Leaves of an arm that stays where it is."""
+    """Return the leaves of an arm at rest."""
     leaves = good(durations=(SPAN,), **options)
     angles = np.asarray(angles, float)
     return leaves | {"plan.motion.coeffs": angles[None, None, None], "angles": angles[None]}
@@ -153,7 +153,7 @@ def test_rates_and_accelerations_are_those_of_the_fastest_joint_between_the_ends
 
 
 def test_the_shield_is_where_the_library_puts_it():
-    """Two descriptions of the same kinematics, which share no code."""
+    """Compare two implementations of the same kinematics without shared code."""
     angles = np.random.default_rng(0).uniform(ARM.lower, ARM.upper, (5, 6))
     rotations, middles = jax.jit(jax.vmap(shield_pose, in_axes=(None, 0)))(ARM, angles)
     for found, rotation, middle in zip(angles, rotations, middles, strict=True):
@@ -164,23 +164,23 @@ def test_the_shield_is_where_the_library_puts_it():
         assert verdict.height[0] == pytest.approx(0.03) and verdict.miss[0] == pytest.approx(0.04)
 
 
-def edited(edits):
-    """A good plan with other leaves, by name: a value, or a function of what it was."""
+def edit(edits):
+    """Return a good plan with some leaves replaced, by a value or by a function of the leaf."""
     leaves = good()
-    for name, edit in edits.items():
-        leaves[name][:] = edit(leaves[name]) if callable(edit) else edit
+    for name, change in edits.items():
+        leaves[name][:] = change(leaves[name]) if callable(change) else change
     return leaves
 
 
-def shifted(place, value):
-    """A function that adds a value at one place of a leaf."""
+def shift(index, value):
+    """Return a function that adds a value to one entry of a leaf."""
 
-    def edit(leaf):
+    def change(leaf):
         leaf = leaf.copy()
-        leaf[(0, *place)] += value
+        leaf[(0, *index)] += value
         return leaf
 
-    return edit
+    return change
 
 
 WAY = GOAL - HOME
@@ -190,8 +190,8 @@ TURN = Rotation.from_rotvec(0.1 * ROTATION[:, 1]).as_matrix()
 TIP = 27.0 / 4.0 * 0.4  # u (1 - u)^2 is 4 / 27 at its greatest, a third of the way
 
 
-def overshooting(**edits):
-    """Joint 6 swings by 0.4 rad and back."""
+def overshoot(**edits):
+    """Return the leaves of a motion of joint 6 by 0.4 rad and back."""
     leaves = good((0.0, TIP, -2.0 * TIP, TIP), end=HOME + np.eye(6)[5], durations=(SPAN,))
     leaves["rates"][0, 5] = TIP / SPAN
     leaves["limits.velocity"][:] = leaves["limits.acceleration"][:] = np.inf
@@ -200,8 +200,8 @@ def overshooting(**edits):
     return leaves
 
 
-def bent():
-    """The wrist folds until the shield's edge is in the forearm."""
+def fold_wrist():
+    """Return the leaves of a wrist that moves the shield into the forearm."""
     end = HOME.copy()
     end[4] = 1.9
     return good(end=end)
@@ -210,61 +210,61 @@ def bent():
 FAILURES = {
     "time: before the arm may start": (
         "time",
-        edited({"plan.contact_time": 0.07, "plan.motion.durations": 0.0}),
+        edit({"plan.contact_time": 0.07, "plan.motion.durations": 0.0}),
         {"excess": 0.03, "time": 0.07},
     ),
     "time: motion too long": (
         "time",
-        edited({"plan.contact_time": 0.9}),
+        edit({"plan.contact_time": 0.9}),
         {"excess": 0.1, "time": 0.9},
     ),
     "time: negative": (
         "time",
-        edited({"plan.motion.durations": [[-0.25, 0.6]]}),
+        edit({"plan.motion.durations": [[-0.25, 0.6]]}),
         {"excess": 0.25, "time": CONTACT_TIME},
     ),
-    "time: an hour": ("time", edited({"plan.contact_time": 3600.0}), {"excess": 3540.0}),
+    "time: an hour": ("time", edit({"plan.contact_time": 3600.0}), {"excess": 3540.0}),
     "start: angle": (
         "start",
-        edited({"angles": shifted((2,), 0.02)}),
+        edit({"angles": shift((2,), 0.02)}),
         {"excess": 0.02, "time": DELAY, "part": "joint 3"},
     ),
     "start: rate": (
         "start",
-        edited({"rates": shifted((4,), 0.3)}),
+        edit({"rates": shift((4,), 0.3)}),
         {"excess": 0.3, "part": "joint 5"},
     ),
     "continuity: angle": (
         "continuity",
-        edited({"plan.motion.coeffs": shifted((1, 0, 3), 0.01)}),
+        edit({"plan.motion.coeffs": shift((1, 0, 3), 0.01)}),
         {"excess": 0.01, "time": DELAY + PIECES[0], "part": "joint 4"},
     ),
     "continuity: rate": (
         "continuity",
-        edited({"plan.motion.coeffs": shifted((1, 1, 0), -0.1)}),
+        edit({"plan.motion.coeffs": shift((1, 1, 0), -0.1)}),
         {"excess": 0.1, "time": DELAY + PIECES[0], "part": "joint 1"},
     ),
     "position: above": (
         "position",
-        overshooting(upper=HOME[5] + 0.35),
+        overshoot(upper=HOME[5] + 0.35),
         {"excess": 0.05, "time": DELAY + SPAN / 3.0, "part": "joint 6"},
     ),
     "position: below": (
         "position",
-        overshooting(lower=HOME[5] + 0.1),
+        overshoot(lower=HOME[5] + 0.1),
         {"excess": 0.1, "part": "joint 6"},
     ),
     "velocity": (
         "velocity",
-        edited({"limits.velocity": lambda limit: 0.8 * judge(good()).velocity_share * limit}),
+        edit({"limits.velocity": lambda limit: 0.8 * judge(good()).velocity_share * limit}),
         {"excess": 0.25, "time": DELAY + 0.5 * SPAN, "part": f"joint {FASTEST + 1}"},
     ),
     "acceleration": (
         "acceleration",
-        edited({"limits.acceleration": 10.0 / np.sqrt(3.0) * abs(WAY[STEEPEST]) / SPAN**2 / 1.5}),
+        edit({"limits.acceleration": 10.0 / np.sqrt(3.0) * abs(WAY[STEEPEST]) / SPAN**2 / 1.5}),
         {"excess": 0.5, "part": f"joint {STEEPEST + 1}"},
     ),
-    "rest: asked for": (
+    "rest: required": (
         "rest",
         good(FROM_REST, regime="R3"),
         {"excess": 2.0 * abs(WAY[STEEPEST]) / SPAN, "part": f"joint {STEEPEST + 1}"},
@@ -274,7 +274,7 @@ FAILURES = {
         good(FROM_REST, regime="R1", durations=(0.2, 0.6)),
         {"excess": 2.0 * abs(WAY[STEEPEST]) / 0.8, "time": 0.9, "part": f"joint {STEEPEST + 1}"},
     ),
-    "self": ("self", bent(), {"part": "link 4 and the shield", "time": CONTACT_TIME}),
+    "self": ("self", fold_wrist(), {"part": "link 4 and the shield", "time": CONTACT_TIME}),
     "ball: beside": (
         "ball",
         good(at=CONTACT + 0.01 * ROTATION[:, 2]),
@@ -284,22 +284,22 @@ FAILURES = {
     "tilt": ("tilt", good(velocity=TURN @ INCOMING), {"excess": 0.1, "time": CONTACT_TIME}),
     "tunnel: not yet": (
         "tunnel",
-        edited({"scene.outer.upper": [[0.6, 1.0, 1.85]]}),
+        edit({"scene.outer.upper": [[0.6, 1.0, 1.85]]}),
         {"excess": 0.1 / 7.0},
     ),
     "tunnel: too late": (
         "tunnel",
-        edited({"scene.inner.upper": [[0.75, 0.55, 0.8]]}),
+        edit({"scene.inner.upper": [[0.75, 0.55, 0.8]]}),
         {"excess": 0.05 / 7.0, "time": CONTACT_TIME},
     ),
     "tunnel: through and out again": (
         "tunnel",
-        edited({"scene.inner.lower": [[0.8, 0.4, 0.6]], "scene.inner.upper": [[0.9, 0.6, 1.2]]}),
+        edit({"scene.inner.lower": [[0.8, 0.4, 0.6]], "scene.inner.upper": [[0.9, 0.6, 1.2]]}),
         {"excess": 0.2 / 7.0},
     ),
     "tunnel: never": (
         "tunnel",
-        edited({"scene.outer.lower": [[-1.0, 0.9, 0.0]]}),
+        edit({"scene.outer.lower": [[-1.0, 0.9, 0.0]]}),
         {"excess": np.inf},
     ),
 }
@@ -358,7 +358,7 @@ def test_an_arm_that_may_pass_through_must_not_stop_at_once_nor_has_to_rest():
     assert_good(leaves)
     leaves["ends_at_rest"][:] = True
     assert_fails(leaves, "rest", part=f"joint {STEEPEST + 1}")
-    # At rest before the ball comes, it waits, whether it must stand or not.
+    # An arm at rest may wait for the ball, whether the case requires rest or not.
     for regime in ("R1", "R3"):
         assert_good(good(regime=regime, durations=(0.2, 0.4)))
 
@@ -397,21 +397,21 @@ def test_a_ball_is_inside_a_box_when_it_is_found_there():
     }
     with np.errstate(invalid="ignore"):
         begin, end = times_inside(leaves, "box", 0.05)
-    told = ((begin[..., None] <= times) & (times <= end[..., None])).any(axis=0)
+    computed = ((begin[..., None] <= times) & (times <= end[..., None])).any(axis=0)
     fall = 0.5 * np.array([0.0, 0.0, 1.0]) * leaves["gravity"][:, None]
     place = leaves["ball.pos"][:, None] + leaves["ball.vel"][:, None] * times[:, None]
     place = place - fall[:, None] * times[:, None] ** 2
     box = (leaves[f"scene.box.{side}"][:, None] for side in ("lower", "upper"))
     low, high = next(box) - 0.05, next(box) + 0.05
-    seen = ((low <= place) & (place <= high)).all(axis=2)
-    np.testing.assert_array_equal(told, seen)
-    changes = np.abs(np.diff(seen.astype(int), axis=1)).sum(axis=1)
+    sampled = ((low <= place) & (place <= high)).all(axis=2)
+    np.testing.assert_array_equal(computed, sampled)
+    changes = np.abs(np.diff(sampled.astype(int), axis=1)).sum(axis=1)
     assert (changes == 4).sum() > 5 and (changes == 0).sum() > 5
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_extrema_are_the_greatest_of_many_samples(seed):
-    """Of any degree, from a line to one of order 7, through pieces that do not even join."""
+    """Check degrees 1, 3 and 7, also for pieces that do not join."""
     random = np.random.default_rng(seed)
     coeffs = random.normal(size=(1, 2, (2, 4, 8)[seed], 6))
     leaves = good(durations=(0.3, 0.6)) | {"plan.motion.coeffs": coeffs}
@@ -431,12 +431,12 @@ def test_extrema_are_the_greatest_of_many_samples(seed):
 def test_samples_are_close_in_time_and_in_angle_and_hold_both_ends(monkeypatch, durations):
     seen = {}
 
-    def watched(case, links, angles, sampled):
+    def record(case, links, angles, sampled):
         seen.update(angles=angles[:, 0, sampled[0]])
         return original(case, links, angles, sampled)
 
     original = block.clearances
-    monkeypatch.setattr(block, "clearances", watched)
+    monkeypatch.setattr(block, "clearances", record)
     judge(good(durations=durations))
     angles = seen["angles"]
     steps = np.linalg.norm(np.diff(angles), axis=0)
@@ -461,7 +461,7 @@ def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
 
 
 def gap(first, second):
-    """Distance of two solids, each a middle, the rows that span it, and a radius, by a solver."""
+    """Solve for the distance of two solids, each with a middle, rows that span it, and a radius."""
     (middle, spans, radius), (other, others, more) = first, second
     columns = np.concatenate([spans, -np.asarray(others)]).T
     found = lsq_linear(columns, other - middle, bounds=(-1.0, 1.0), method="bvls", tol=1e-14)
@@ -469,7 +469,7 @@ def gap(first, second):
 
 
 def solids_of(angles):
-    """The arm's solids by name: capsules of links and the shield."""
+    """Return the arm's solids: link, middle, spanning rows and radius of capsules and shield."""
     frames, found = links(angles), []
     for k, (first, second) in enumerate(ARM.capsule_ends):
         rotation, place = frames[ARM.capsule_link[k]]
@@ -482,7 +482,7 @@ def solids_of(angles):
 
 
 def brute_clearances(angles, scene):
-    """Least distances by kind, every pair by a solver."""
+    """Return the least distances by kind, with every pair solved for."""
     arm = solids_of(angles)
     pole = (np.array([*scene.pole[0], 0.0]), [np.array([0.0, 0.0, 5.0])], scene.pole_radius[0])
     beams = [
@@ -491,7 +491,7 @@ def brute_clearances(angles, scene):
     ]
     low, high = ARM.base_box
     base = (0.5 * (low + high), list(0.5 * np.diag(high - low)), 0.0)
-    # Of link 4 that which does not reach through the shield while the wrist is straight.
+    # The radius of link 4 at which it touches the shield while the wrist is straight.
     wrist, plate = solids_of(np.zeros(6))[5], solids_of(np.zeros(6))[8]
     thin = min(wrist[3], gap((*wrist[1:3], 0.0), plate[1:]))
     found = {
@@ -507,7 +507,7 @@ def brute_clearances(angles, scene):
         if link in (1, 2, 3):
             room = thin if link == 3 else radius
             found["self"].append(gap((middle, spans, room), arm[-1][1:]))
-    if gap(arm[-1][1:], base) < 1e-6:  # a solver knows no depth of boxes
+    if gap(arm[-1][1:], base) < 1e-6:  # the solver does not measure the depth of boxes
         del found["base"]
     return {kind: min(values) for kind, values in found.items()}
 
@@ -589,7 +589,7 @@ def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
     assert found == pytest.approx(-(0.1 + corner))
 
 
-# Batches and what is handed in --------------------------------------------------------------------
+# Batches and arguments ----------------------------------------------------------------------------
 
 
 def unequal_lanes():

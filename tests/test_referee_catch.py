@@ -1,4 +1,4 @@
-"""The referee of catch plans, on plans worked out by hand: no planner has a part in this."""
+"""The referee of catches, on plans in closed form, without a planner."""
 
 import math
 
@@ -13,13 +13,20 @@ from planner_jax.referee.catch import CatchVerdict, referee_catches
 GRAVITY, DRAG, NET_HEIGHT, NET_RADIUS = 9.81, 0.5, 0.2, 0.125
 START, FIRST, SECOND = (0.0, 0.0, 1.2), (0.6, -0.3, 1.4), (-0.4, 0.2, 1.1)
 TIMES = (1.1, 2.4)  # of the two catches
-DURATIONS = (0.4, 0.7, 0.8, 0.5, 0.0, 0.0)  # two pieces up to each catch, the third not made
+DURATIONS = (
+    0.4,
+    0.7,
+    0.8,
+    0.5,
+    0.0,
+    0.0,
+)  # two pieces up to each catch; the third target is not caught
 STEP = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])  # from 0 to 1, at rest up to jerk at both
 STEEPEST = 35.0 / 16.0  # slope of STEP, at 1/2
 
 
 def cut(path, durations, degree=7):
-    """A polynomial path, three of them, in pieces (M, degree + 1, 3), each in its own time."""
+    """Cut three polynomials, x, y and z, into pieces (M, degree + 1, 3), each in its own time."""
     coeffs = np.zeros((len(durations), degree + 1, 3))
     for piece, start in enumerate(np.cumsum(durations) - durations):
         for axis, line in enumerate(path):
@@ -29,7 +36,7 @@ def cut(path, durations, degree=7):
 
 
 def rest_to_rest(start, end, durations):
-    """Pieces from one hover to the next."""
+    """Return the pieces of a trajectory between two hovers."""
     step = STEP(Polynomial([0.0, 1.0 / sum(durations)]))
     return cut([a + (b - a) * step for a, b in zip(start, end, strict=True)], durations)
 
@@ -41,17 +48,17 @@ def hover(place, pieces):
 
 
 def drop(time):
-    """How far a ball with linear drag falls from rest: [Yu2023catch, eq. 9], with its constant."""
+    """Return the fall [m] of a ball with linear drag from rest [Yu2023catch, eq. 9]."""
     return GRAVITY * time / DRAG - GRAVITY * (1.0 - math.exp(-DRAG * time)) / DRAG**2
 
 
 def above_net(place, time):
-    """Where a ball must be dropped to fall into the net of a hovering quadrotor."""
+    """Return the position from which a ball falls into the net of a hovering quadrotor."""
     return np.array(place) + [0.0, 0.0, NET_HEIGHT + drop(time)]
 
 
 def good():
-    """Leaves, with leading axis 1: of three targets the last and the first are caught."""
+    """Return leaves, with leading axis 1, of catches of the last and the first of three targets."""
     nowhere = np.full(3, np.nan)
     leaves = {
         "coeffs": np.concatenate(
@@ -94,7 +101,7 @@ assert_good, assert_fails = checks(judge)
 
 
 def one_target(place=START, *, pos=None, vel=(0.0, 0.0, -3.0), time=1.1, drag=0.0, gravity=0.0):
-    """Leaves of a hover in which one target comes to `pos` at `time`; it flies straight on."""
+    """Return leaves of a hover and a target of constant velocity, which is at `pos` at `time`."""
     pos = np.array(place) + [0.0, 0.0, NET_HEIGHT] if pos is None else np.asarray(pos)
     leaves = good()
     return leaves | {
@@ -146,7 +153,7 @@ def test_a_piece_with_a_duration_after_the_last_catch_is_judged_too():
     leaves = good()
     leaves["durations"][0, 4] = 0.2
     assert judge(leaves).success[0]
-    leaves["coeffs"][0, 4, 1, 0] = 3.0  # it starts at 3 m/s, from rest
+    leaves["coeffs"][0, 4, 1, 0] = 3.0  # a jump from 0 to 3 m/s
     assert_fails(leaves, "continuity", time=TIMES[1])
 
 
@@ -154,7 +161,11 @@ def test_without_a_target_there_is_nothing_to_catch():
     leaves = good()
     leaves["present"][:], leaves["durations"][:] = False, 0.0
     leaves["order"][:] = [0, 1, 2]
-    leaves["coeffs"][0, 0, 2] = [0.3, 0.2, 0.1]  # the cosine of no turn is rounded to below 1
+    leaves["coeffs"][0, 0, 2] = [
+        0.3,
+        0.2,
+        0.1,
+    ]  # rounding makes the cosine of the zero angle less than 1
     verdict = judge(leaves)
     assert verdict.max_body_rate[0] == 0.0
     assert verdict.success[0] and verdict.num_caught[0] == 0
@@ -361,9 +372,9 @@ def test_a_ball_with_linear_drag_is_where_integration_puts_it(drag):
 
 
 def with_targets(leaves, targets):
-    """The leaves with targets of another class, their leaves of one target without axes."""
-    kept = {name: leaf for name, leaf in leaves.items() if not name.startswith("targets.")}
-    return kept | {f"targets.{k}": np.asarray(v, float)[None, None] for k, v in targets.items()}
+    """Return the leaves with targets of another class, built from the fields of one target."""
+    others = {name: leaf for name, leaf in leaves.items() if not name.startswith("targets.")}
+    return others | {f"targets.{k}": np.asarray(v, float)[None, None] for k, v in targets.items()}
 
 
 def test_a_harmonic_target_is_caught_where_it_swings():
@@ -374,14 +385,14 @@ def test_a_harmonic_target_is_caught_where_it_swings():
     start = np.array(START) + [0.0, 0.0, NET_HEIGHT] - 1.1 * vel - amplitude * math.sin(swing)
     path = {"pos": start, "vel": vel, "amplitude": amplitude, "rate": rate, "phase": phase}
     verdict = judge(with_targets(leaves, path))
-    way = vel + amplitude * rate * math.cos(swing)
+    end_vel = vel + amplitude * rate * math.cos(swing)
     assert verdict.net_distance[0, 0] < 1e-12
-    assert verdict.angle[0, 0] == pytest.approx(math.acos(-way[2] / np.linalg.norm(way)))
+    assert verdict.angle[0, 0] == pytest.approx(math.acos(-end_vel[2] / np.linalg.norm(end_vel)))
 
 
 @pytest.mark.parametrize("time", [0.45, 0.999, 1.1, 1.3])
 def test_a_table_is_read_by_cubic_convolution(time):
-    # The kernel reproduces quadratics: the nodes of a parabola give the parabola.
+    # The kernel reproduces quadratics, so interpolation is exact for a parabola.
     pos, vel = np.array([1.0, 0.3, 2.0]), np.array([-2.0, 0.1, 3.0])
     nodes = (np.arange(30) - 1.0)[:, None] * 0.05
     pull = [0.0, 0.0, -GRAVITY]
@@ -390,8 +401,8 @@ def test_a_table_is_read_by_cubic_convolution(time):
     leaves = one_target(end - [0.0, 0.0, NET_HEIGHT], time=time)
     verdict = judge(with_targets(leaves, table | {"resolution": 0.05}))
     assert verdict.net_distance[0, 0] < 1e-12
-    way = vel + time * np.array(pull)
-    assert verdict.angle[0, 0] == pytest.approx(math.acos(-way[2] / np.linalg.norm(way)))
+    end_vel = vel + time * np.array(pull)
+    assert verdict.angle[0, 0] == pytest.approx(math.acos(-end_vel[2] / np.linalg.norm(end_vel)))
 
 
 def test_beyond_its_table_a_target_goes_straight_on():

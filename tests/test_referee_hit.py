@@ -1,4 +1,4 @@
-"""The referee of hit plans, on plans worked out by hand: no planner has a part in this."""
+"""The referee of hits, on plans in closed form, without a planner."""
 
 import ast
 import math
@@ -37,13 +37,13 @@ def derivative_row(time, order, degree):
 
 
 def join_states(head, tail, duration):
-    """Coefficients (8, 3) of the polynomial between two states (4, 3)."""
+    """Return the coefficients (8, 3) of the polynomial between two states (4, 3)."""
     rows = [derivative_row(time, n, 7) for time in (0.0, duration) for n in range(4)]
     return np.linalg.solve(np.array(rows), np.concatenate([head, tail]))
 
 
 def cut(coeffs, durations):
-    """The same polynomial in pieces (M, D + 1, 3), each in its own time."""
+    """Cut a polynomial into pieces (M, D + 1, 3), each in its own time."""
     starts = np.cumsum(durations) - durations
     degree = len(coeffs) - 1
     shifts = [
@@ -54,7 +54,7 @@ def cut(coeffs, durations):
 
 
 def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces=NUM_PIECES):
-    """Leaves, with leading axis 1, of a volley solved backwards from its impact."""
+    """Return the leaves, with leading axis 1, of a volley solved backwards from its impact."""
     target = np.array(target)
     after = (target - CONTACT) / flight_time + [0.0, 0.0, 0.5 * GRAVITY * flight_time]
     change = after - BALL_VEL
@@ -100,7 +100,7 @@ assert_good, assert_fails = checks(judge)
 
 
 def dense(leaves, order, num=20001):
-    """Times (num,) and a derivative (num, 3) of the first lane, by plain powers."""
+    """Return times (num,) and a derivative (num, 3) of the first lane, by plain powers."""
     ends = np.cumsum(leaves["durations"][0])
     times = np.linspace(0.0, ends[-1], num)
     piece = np.minimum(np.searchsorted(ends, times, side="right"), len(ends) - 1)
@@ -113,7 +113,7 @@ def dense(leaves, order, num=20001):
 
 
 def hopf_rotations(acc):
-    """Rotation matrices (n, 3, 3) of the Hopf fibration at zero heading."""
+    """Return the rotation matrices (n, 3, 3) of the Hopf fibration at zero heading."""
     thrust = acc + [0.0, 0.0, GRAVITY]
     z = thrust / np.linalg.norm(thrust, axis=1, keepdims=True)
     a, b, c = z.T
@@ -123,7 +123,7 @@ def hopf_rotations(acc):
 
 
 def body_rates(leaves):
-    """Times and body rates [rad/s] by central differences of the attitude."""
+    """Return times and body rates [rad/s], by central differences of the attitude."""
     times, acc = dense(leaves, 2)
     attitude = hopf_rotations(acc)
     change = (attitude[2:] - attitude[:-2]) / (times[2:] - times[:-2])[:, None, None]
@@ -306,7 +306,7 @@ def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishe
 
 
 def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
-    # tau_z = 1 - 4 t with next to nothing across: no sample sees a body rate.
+    # tau_z = 1 - 4 t with almost no horizontal component: the body rate is zero at every sample.
     leaves = volley()
     coeffs = np.zeros((1, 1, 4, 3))
     coeffs[0, 0, 0, 2], coeffs[0, 0, 2, 0] = 3.0, 1e-9
@@ -317,8 +317,8 @@ def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
     assert verdict.max_body_rate[0] > 100.0
 
 
-def returned_ball(leaves):
-    """State of the ball just after the impact, from the volley's construction."""
+def state_after_impact(leaves):
+    """Return position and velocity of the ball just after the impact of a volley."""
     after = (leaves["target"][0] - CONTACT) / 1.5 + [0.0, 0.0, 0.5 * GRAVITY * 1.5]
     return CONTACT, after
 
@@ -326,11 +326,11 @@ def returned_ball(leaves):
 def test_drag_after_the_impact_shortens_the_return_as_integrated():
     leaves = volley()
 
-    def landed(_, state):
+    def height(_, state):
         return state[2]
 
-    landed.terminal, landed.direction = True, -1.0
-    path = fly(*returned_ball(leaves), 5.0, events=landed, dense_output=True)
+    height.terminal, height.direction = True, -1.0
+    path = fly(*state_after_impact(leaves), 5.0, events=height, dense_output=True)
     found = {"time": IMPACT_TIME + path.t[-1], "apart": 1e-7}
     verdict = assert_fails(leaves, "landing", **found, drag_after_impact=True)
     np.testing.assert_allclose(verdict.landing_point[0], path.y[:3, -1], atol=1e-6)
@@ -344,7 +344,7 @@ def test_drag_after_the_impact_shortens_the_return_as_integrated():
 
 def test_without_drag_both_returns_agree():
     leaves = volley()
-    # The ball comes in on another path then, so that only the return is compared.
+    # The incoming ball has another path without drag, so only the return is compared.
     leaves["drag"] = np.zeros(1)
     vacuum, air = judge(leaves), judge(leaves, drag_after_impact=True)
     np.testing.assert_allclose(air.landing_point, vacuum.landing_point, atol=1e-9)
@@ -414,11 +414,13 @@ def test_an_infinite_limit_is_no_limit():
     [(None, 0.03, True), (0.11, 0.03, True), (0.11, 0.095, True), (0.11, 0.105, False)],
 )
 def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
-    """However large the tolerance of the contact; a tenth of the radius is left at the rim."""
+    """Check that a tenth of the radius at the rim is excluded at any tolerance."""
     leaves = volley()
     after = leaves["target"][0] - CONTACT
     aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])
-    normal_free = off * aside  # across the way back, so that apex and target stay as they were
+    normal_free = (
+        off * aside
+    )  # across the return, which keeps the apex and the distance from the target
     leaves["ball.pos"] = leaves["ball.pos"] + normal_free
     leaves["target"] = leaves["target"] + normal_free
     if radius is not None:
@@ -426,7 +428,7 @@ def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
     verdict = judge(leaves, contact_tolerance=0.2)
     assert verdict.contact_error[0] == pytest.approx(off, rel=1e-3)
     assert verdict.failed_limit[0] == ("" if passes else "contact")
-    assert judge(leaves).failed_limit[0] == "contact"  # 5 mm unless more is said
+    assert judge(leaves).failed_limit[0] == "contact"  # 5 mm by default
 
 
 def test_a_small_racket_tightens_the_usual_tolerance():
@@ -454,26 +456,26 @@ def test_the_referees_import_numpy_the_standard_library_and_each_other_alone():
 def test_processes_judge_as_threads_do(monkeypatch):
     lanes = np.arange(600)
     case = {"durations": lanes[:, None].astype(np.float32), "value": lanes.astype(np.float32)}
-    in_threads = judging.judge_in_chunks(_halved, case, 256)
+    in_threads = judging.judge_in_chunks(_halve, case, 256)
     monkeypatch.setenv("NPROC", "2")
     monkeypatch.setattr(judging, "_MANY_CORES", 1)
     monkeypatch.setattr(judging, "_MANY_LANES", 1)
-    in_processes = judging.judge_in_chunks(_halved, case, 256)
+    in_processes = judging.judge_in_chunks(_halve, case, 256)
     assert workers._start_workers.cache_info().currsize == 1
     np.testing.assert_array_equal(in_processes["half"], in_threads["half"])
     with pytest.raises(ValueError, match="refused"):
         workers.map_in_processes(_refuse, [1, 2])
 
 
-@pytest.mark.parametrize(("told", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])
-def test_the_referee_keeps_as_many_cores_busy_as_nproc_says(monkeypatch, told, num):
-    monkeypatch.setenv("NPROC", told)
+@pytest.mark.parametrize(("setting", "num"), [("3", 3), ("0", 1), ("", None), ("many", None)])
+def test_nproc_sets_the_number_of_cores(monkeypatch, setting, num):
+    monkeypatch.setenv("NPROC", setting)
     assert judging.cores() == (num or usable_cores())
     monkeypatch.delenv("NPROC")
     assert judging.cores() == usable_cores()
 
 
-def _halved(case):
+def _halve(case):
     return {"half": 0.5 * case["value"]}
 
 

@@ -1,4 +1,4 @@
-"""The referee of interceptions, on plans worked out by hand: no planner has a part in this."""
+"""The referee of interceptions, on plans in closed form, without a planner."""
 
 import math
 from types import SimpleNamespace
@@ -27,12 +27,12 @@ TIME, SPEED, KNOTS = 5.0, 0.8, 11
 
 
 def square(x, y, half, sense=1):
-    """Corners of a square around (x, y)."""
+    """Return the corners of a square around (x, y)."""
     return np.array([x, y]) + half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])[::sense]
 
 
 def group(polygons=(), velocities=(), room=(3, 6)):
-    """Leaves of obstacles, with leading axis 1; what is absent holds NaN."""
+    """Return the leaves of obstacles, with leading axis 1, and NaN for absent ones."""
     centre, corners = np.full((room[0], 2), np.nan), np.full((*room, 2), np.nan)
     velocity = np.full((room[0], 2), np.nan)
     for k, polygon in enumerate(polygons):
@@ -46,9 +46,9 @@ def group(polygons=(), velocities=(), room=(3, 6)):
 
 
 def good(speed=SPEED, curvature=0.0, time=TIME, start=START, end=None, walls=(), movers=((), ())):
-    """Leaves, with leading axis 1, of a car that drives along its knots to its target.
+    """Return the leaves, with leading axis 1, of a car that drives to its target.
 
-    Without another end it drives straight on, evenly.
+    The default end is the end of a straight drive at constant speed.
     """
     start = np.asarray(start, float)
     speed, curvature = (np.broadcast_to(each, KNOTS).astype(float) for each in (speed, curvature))
@@ -203,7 +203,7 @@ def test_a_car_that_stops_too_late_is_as_deep_in_the_wall_as_it_is_late():
 
 
 def test_corners_graze_at_the_distance_of_their_diagonals():
-    """A car at 45 degrees passes the corner of a square, and stops before another one's."""
+    """Drive at 45 degrees past the corner of a square, and stop before the corner of another."""
     start = (2.0, 2.0, math.pi / 4.0)
     ahead, left = np.array([1.0, 1.0]) / math.sqrt(2.0), np.array([-1.0, 1.0]) / math.sqrt(2.0)
     beside = np.array(start[:2]) + 1.5 * ahead + (0.5 * WIDTH + 0.03) * left
@@ -218,14 +218,14 @@ def test_corners_graze_at_the_distance_of_their_diagonals():
 
 
 def test_a_mover_is_met_where_and_when_it_is():
-    """A square of side 0.4 m passes the side of a car at rest: abreast of it at 2 s."""
+    """Move a square of side 0.4 m along the side of a car at rest; it is abreast at 2 s."""
     still, way = {"speed": 0.0, "time": 4.0}, [(0.5, 0.0)]
     x, y = START[0] + MIDDLE - 1.0, START[1] + 0.5 * WIDTH + 0.2
     passing = good(**still, movers=([square(x, y + 0.05, 0.2)], way))
     assert assert_good(passing).mover_clearance[0] == pytest.approx(0.05)
     hit = good(**still, movers=([square(7.0, 1.0, 0.2), square(x, y - 0.05, 0.2)], way * 2))
     verdict = assert_fails(hit, "mover", excess=0.05, says="inside movers[1]")
-    # From 0.05 m of overlap along the car on, the way out is to the side.
+    # As soon as the overlap along the car exceeds 0.05 m, the depth is measured to the side.
     assert verdict.failed_time[0] == pytest.approx(2.0 - 0.35 / 0.5, abs=0.02)
     convoy = good(movers=([square(START[0] + FRONT + 0.3, 4.0, 0.2)], [(SPEED, 0.0)]))
     assert assert_good(convoy).mover_clearance[0] == pytest.approx(0.1)
@@ -234,7 +234,7 @@ def test_a_mover_is_met_where_and_when_it_is():
 
 
 def random_polygon(random, most=6):
-    """Corners (most, 2) of a convex polygon around the origin, the last one repeated."""
+    """Return the corners (most, 2) of a convex polygon, with the last one repeated."""
     num = random.integers(3, most + 1)
     angles = 2.0 * np.pi * (np.arange(num) + random.uniform(0.1, 0.9, num)) / num
     corners = random.uniform(0.1, 0.6) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
@@ -286,8 +286,8 @@ def test_corners_may_be_in_either_sense_and_repeated_and_absent_obstacles_hold_a
     assert assert_good(plain).wall_clearance[0] == pytest.approx(0.2 - 0.5 * WIDTH)
 
 
-def failing():
-    """Name -> leaves that fail it first, by how much, and when."""
+def failures():
+    """Return, for each limit: its name, leaves that exceed it, the excess and the time."""
     h = TIME / (KNOTS - 1)
     fast, bent, turned = good(), good(SPEED, 0.5), good()
     fast["limits.speed"][:] = 0.64
@@ -322,9 +322,9 @@ def failing():
     ]
 
 
-@pytest.mark.parametrize("k", range(len(failing())), ids=[name for name, *_ in failing()])
+@pytest.mark.parametrize("k", range(len(failures())), ids=[name for name, *_ in failures()])
 def test_every_failure_has_its_name_size_and_time(k):
-    name, leaves, excess, time = failing()[k]
+    name, leaves, excess, time = failures()[k]
     assert_fails(leaves, name, excess=excess, time=time)
 
 
@@ -347,7 +347,7 @@ def test_targets_turn_or_follow_polynomials():
     leaves |= {f"target.{k}": np.asarray(v, float)[None] for k, v in target.items()}
     assert assert_good(leaves).miss[0] < 1e-9
     other = {k: v for k, v in leaves.items() if not k.startswith("target.")}
-    # (t - 1)^2 times the velocity, from where it ends up there.
+    # (t - 1)^2 times the velocity, with the same final position.
     coeffs = np.array([path[:2] - vel * (time - 1.0) ** 2, [0.0, 0.0], vel])
     other |= {"target.coeffs": coeffs[None], "target.origin": np.ones(1)}
     assert assert_good(other).miss[0] < 1e-12
@@ -388,7 +388,7 @@ def unequal_lanes():
         good(walls=[wall, square(4.0, 4.0, 0.2)]),
         good(1.3, time=3.0, movers=([square(2.0, 4.0, 0.3), mover], [(0.0, 0.0), (0.1, 0.0)])),
         good(np.linspace(0.5, 1.2, KNOTS), np.linspace(0.0, 0.4, KNOTS)),
-        failing()[0][1],
+        failures()[0][1],
         good(),
     ]
 

@@ -1,7 +1,7 @@
-"""Which velocity takes a ball to a target in a given time, and how high it flies on the way.
+"""The velocity that takes a ball to a target in a numbers time, and the apex of its flight.
 
-Derivatives are made going forward, and reverse mode only multiplies by them: it would otherwise go
-back through every step of a flight for the slopes of a few numbers.
+Derivatives are computed in forward mode, and reverse mode only multiplies by them. Otherwise
+reverse mode would go back through every step of a flight for the derivatives of a few numbers.
 """
 
 from collections.abc import Sequence
@@ -14,23 +14,20 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 from planner_jax.core.arithmetic import reciprocal
 
-_FLIGHT_STEPS = 10  # the landing of a 2 s flight is then right to 0.2 mm
-_COARSE_STEPS = 8  # enough for slopes; fewer go astray where drag is strong
+_FLIGHT_STEPS = 10  # error of the landing of a 2 s flight: 0.2 mm
+_COARSE_STEPS = 8  # enough for derivatives; fewer diverge for strong drag
 
 Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
-    """Velocity with which a drag-free ball reaches the target after `flight_time`.
+    """Return the velocity (3,) [m/s] of a drag-free ball that reaches a target.
 
     Args:
         pos: (3,) [m].
         target: (3,) [m].
         flight_time: () [s], > 0.
         gravity: () [m/s^2], magnitude.
-
-    Returns:
-        (3,) [m/s].
     """
     return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
@@ -38,11 +35,11 @@ def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array)
 def aim_with_drag(
     pos: Array, target: Array, flight_time: Array, drag: Array, gravity: Array
 ) -> Array:
-    """Velocity with which a ball with quadratic drag reaches the target after `flight_time`.
+    """Return the velocity (3,) [m/s] of a ball with quadratic drag that reaches a target.
 
-    From the drag-free velocity two steps of Newton's method on the landing of a coarse flight,
-    and with the slopes of the last one two steps on that of a fine flight. The derivatives are
-    those of the root, by the implicit function theorem.
+    Newton's method starts from the drag-free velocity. Two steps integrate a coarse flight, and two
+    further steps integrate a fine flight with the last Jacobian. The root is differentiated by the
+    implicit function theorem.
 
     Args:
         pos: (3,) [m].
@@ -50,83 +47,80 @@ def aim_with_drag(
         flight_time: () [s], > 0.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
-
-    Returns:
-        (3,) [m/s].
     """
-    return _aimed(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
+    return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 
 
 @jax.custom_jvp
-def _aimed(way: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """`aim_with_drag` over a way (3,) [m]."""
+def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
+    """Compute `aim_with_drag` for a displacement (3,) [m]."""
 
     def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:
-            landed = _way(vel, flight_time, drag, gravity, _COARSE_STEPS)
-            return landed, landed
+            end = _displacement(vel, flight_time, drag, gravity, _COARSE_STEPS)
+            return end, end
 
         vel, _ = near
-        slope, landed = jax.jacfwd(landing, has_aux=True)(vel)
-        return vel - _solve3(slope, landed - way), slope
+        slope, end = jax.jacfwd(landing, has_aux=True)(vel)
+        return vel - _solve3(slope, end - displacement), slope
 
-    # Loops, not copies: the program that an optimiser compiles is a third the size.
-    start = aim_drag_free(jnp.zeros_like(way), way, flight_time, gravity)
+    # Loops reduce the compiled program of an optimiser to a third of its size.
+    start = aim_drag_free(jnp.zeros_like(displacement), displacement, flight_time, gravity)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
     def chord_step(_: Array, vel: Array) -> Array:
-        return vel - _solve3(slope, _way(vel, flight_time, drag, gravity) - way)
+        return vel - _solve3(slope, _displacement(vel, flight_time, drag, gravity) - displacement)
 
     return lax.fori_loop(0, 2, chord_step, vel)
 
 
-def _aimed_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
-    way, *given = primals
-    by_way, *others = tangents
-    vel = _aimed(way, *given)
-    moving = _moving(others)
-    by_vel, *slopes = jax.jacfwd(_way, (0, *(k + 1 for k in moving)))(vel, *given)
+def _aim_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
+    displacement, *numbers = primals
+    by_displacement, *others = tangents
+    vel = _aim(displacement, *numbers)
+    moving = _changing(others)
+    by_vel, *slopes = jax.jacfwd(_displacement, (0, *(k + 1 for k in moving)))(vel, *numbers)
     changes = [-slope * others[k] for k, slope in zip(moving, slopes, strict=True)]
-    if not isinstance(by_way, SymbolicZero):
-        changes.append(by_way)
+    if not isinstance(by_displacement, SymbolicZero):
+        changes.append(by_displacement)
     return vel, _solve3(by_vel, sum(changes[1:], changes[0]))
 
 
-def _moving(tangents: Sequence[Tangent]) -> list[int]:
-    """Places of the arguments that change at all."""
+def _changing(tangents: Sequence[Tangent]) -> list[int]:
+    """Return the indices of arguments with a tangent."""
     return [k for k, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
 
 
-_aimed.defjvp(_aimed_jvp, symbolic_zeros=True)
+_aim.defjvp(_aim_jvp, symbolic_zeros=True)
 
 
-def _way(
+def _displacement(
     vel: Array, flight_time: Array, drag: Array, gravity: Array, num_steps: int = _FLIGHT_STEPS
 ) -> Array:
-    """Where a ball is after a flight (3,) [m], from where it began."""
+    """Return the displacement (3,) [m] of a ball after a flight."""
     ball = BallState(pos=jnp.zeros_like(vel), vel=vel)
     return fly(ball, flight_time, drag, gravity, num_steps=num_steps)[0].pos
 
 
 def _solve3(matrix: Array, rhs: Array) -> Array:
-    """Solution of a 3 x 3 system by Cramer's rule, which `vmap` keeps free of LAPACK calls."""
+    """Solve a 3 x 3 system by Cramer's rule, which needs no LAPACK call for each lane."""
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
     bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
     return jnp.stack([jnp.sum(bc * rhs), jnp.sum(ca * rhs), jnp.sum(ab * rhs)]) / jnp.sum(a * bc)
 
 
 def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Greatest height [m] of a ball with quadratic drag within `flight_time`.
+    """Return the greatest height [m] of a ball with quadratic drag within `flight_time`.
 
-    From the last step that still rises, the rest of the climb is v_z^2 / (2 (g + K_D |v| v_z))
-    to second order in a step. A falling ball is highest now.
+    After the last step at which the ball rises, the remaining climb is approximated by
+    v_z^2 / (2 (g + 2/3 K_D |v| v_z)). A falling ball is highest at time 0.
     """
-    given = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
-    return ball.pos[2] + _climb(ball.vel, *given)
+    numbers = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
+    return ball.pos[2] + _climb(ball.vel, *numbers)
 
 
-def _climbed(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """`apex_with_drag` over where the ball is now."""
+def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
+    """Return `apex_with_drag` relative to the initial height [m]."""
     now = BallState(pos=jnp.zeros_like(vel), vel=vel)
     _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
     height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])
@@ -138,12 +132,12 @@ def _climbed(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Arr
     return reach[last]
 
 
-_climb = jax.custom_jvp(_climbed)
+_climb = jax.custom_jvp(_compute_climb)
 
 
 def _climb_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Array, Array]:
-    moving = _moving(tangents)
-    slopes = jax.jacfwd(_climbed, moving)(*primals)
+    moving = _changing(tangents)
+    slopes = jax.jacfwd(_compute_climb, moving)(*primals)
     changes = [jnp.sum(slope * tangents[k]) for k, slope in zip(moving, slopes, strict=True)]
     return _climb(*primals), sum(changes[1:], changes[0])
 

@@ -1,7 +1,7 @@
-"""The state of a ball from its observations, by an extended Kalman filter.
+"""Extended Kalman filter of a ball's state [Yu2023bat, eq. 5; Yu2023catch, Section V-A].
 
-The filter is that of [Yu2023bat, eq. 5] (from [Yu2023catch, Section V-A]). World frame, z up, SI
-units, one ball; `jax.vmap` makes many. An observation with a NaN leaves the state unchanged.
+World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many. An observation with
+a NaN leaves the state unchanged.
 """
 
 from collections.abc import Callable
@@ -20,12 +20,12 @@ Flight = Callable[[BallState, Array, Array, Array], BallState]
 
 @struct.dataclass
 class EkfModel:
-    """What the filter believes about the flight and about the sensor."""
+    """Parameters of flight and sensor."""
 
     drag: Array  # (3,) K_i [1/s] for `linear_drag_flight`, () K_D [1/m] for `rk4_step`
     gravity: Array  # () [m/s^2], magnitude
-    acceleration_density: Array  # () [m^2/s^3], of a white acceleration that the flight leaves out
-    observation_std: Array  # () or (3,) [m], of an observed position
+    acceleration_density: Array  # () [m^2/s^3], power density of accelerations not modelled
+    observation_std: Array  # () or (3,) [m], standard deviation of an observed position
 
 
 @struct.dataclass
@@ -37,21 +37,20 @@ class EkfState:
 
     @property
     def ball(self) -> BallState:
-        """The mean as a ball, leaves (..., 3)."""
+        """Mean of the belief as a ball, leaves (..., 3)."""
         return BallState(pos=self.mean[..., :3], vel=self.mean[..., 3:])
 
 
 def _congruence(A: Array, P: Array) -> Array:
-    """A P A'  at full precision on every device, symmetric to the last bit."""
+    """Return A P A' at full precision on every device, exactly symmetric."""
     full = jnp.einsum("ij,jk,lk->il", A, P, A, precision=lax.Precision.HIGHEST)
     return 0.5 * (full + full.T)
 
 
 def solve_definite(A: Array, B: Array) -> Array:
-    """The X (m, n) of  A X = B  for a symmetric positive definite A (m, m), m small.
+    """Solve A X = B for X (m, n), with a small symmetric positive definite A (m, m).
 
-    Elimination without exchanges, written out: plain arithmetic on every device, at full
-    precision, without a library call a lane.
+    Gaussian elimination without pivoting is unrolled, so that many lanes need no library calls.
     """
     U, X = list(A), list(B)
     size = len(U)
@@ -67,15 +66,15 @@ def solve_definite(A: Array, B: Array) -> Array:
 def ekf_init(
     pos: Float[Array, "3"], vel: Float[Array, "3"], *, pos_std: Array, vel_std: Array
 ) -> EkfState:
-    """The belief before the first observation.
+    """Return the belief before the first observation.
 
     Args:
         pos: (3,) [m].
         vel: (3,) [m/s].
-        pos_std: () or (3,) [m], standard deviation of each coordinate; it may be wide.
-        vel_std: () or (3,) [m/s]. In float32 keep vel_std times the time between two
-            observations below 1000 times their standard deviation: at 3000 the covariance
-            after the second observation is lost in rounding.
+        pos_std: () or (3,) [m], standard deviation of each coordinate; it may be large.
+        vel_std: () or (3,) [m/s]. In float32 keep vel_std times the time between observations
+            below 1000 times the standard deviation of an observation: at 3000 rounding destroys
+            the covariance after the second observation.
     """
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
@@ -84,12 +83,12 @@ def ekf_init(
 def ekf_predict(
     state: EkfState, duration: Array, model: EkfModel, *, flight: Flight = linear_drag_flight
 ) -> EkfState:
-    """The belief after `duration` [s] >= 0 of flight with nothing observed.
+    """Predict the belief after `duration` [s] >= 0 without an observation.
 
-    The mean flies, and the covariance becomes F P F' + Q, F the Jacobian of the flight. With
-    `linear_drag_flight` this is [Yu2023catch, eq. 10], but exact in the duration (the print moves
-    the position by v dt alone). With `rk4_step` the duration is one Runge-Kutta step. Q is the
-    integral of a white acceleration over the duration.
+    The covariance becomes F P F' + Q, with the Jacobian F of the flight and the integral Q of a
+    white acceleration over the duration. With `linear_drag_flight` this is [Yu2023catch, eq. 10],
+    except that the paper advances the position by v dt only. With `rk4_step` the duration is one
+    Runge-Kutta step.
     """
 
     def transition(mean: Array) -> Array:
@@ -105,15 +104,15 @@ def ekf_predict(
 
 
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
-    """The belief after one observed position, s + K_a (Z - H s)  [Yu2023bat, eq. 5].
+    """Update the belief with an observed position, s + K_a (Z - H s) [Yu2023bat, eq. 5].
 
-    H = [I 0]. The covariance takes Joseph's form, which stays positive definite in float32
-    also when a wide prior meets a sharp observation.
+    H = [I 0]. The covariance has Joseph's form, which stays positive definite in float32 even if a
+    wide prior meets a precise observation.
 
     Args:
-        state: the belief at the time of the observation.
-        observation: (3,) Z [m]. Where any coordinate is not finite, the belief stays as it is.
-        model: only the sensor is used.
+        state: belief at the time of the observation.
+        observation: (3,) Z [m]. If a coordinate is not finite, the belief is returned unchanged.
+        model: only `observation_std` is used.
     """
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype
@@ -121,8 +120,8 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
     P = state.covariance
     residual = jnp.where(observed, observation, state.mean[:3]) - state.mean[:3]
     K = solve_definite(P[:3, :3] + R, P[:3]).T
-    kept = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
+    rest = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
     return EkfState(
         mean=state.mean + jnp.matmul(K, residual, precision=lax.Precision.HIGHEST),
-        covariance=jnp.where(observed, _congruence(kept, P) + _congruence(K, R), P),
+        covariance=jnp.where(observed, _congruence(rest, P) + _congruence(K, R), P),
     )

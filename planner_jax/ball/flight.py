@@ -1,6 +1,6 @@
 """Ball flight with quadratic drag [Yu2023bat, eq. 2] or linear drag, and impacts on a racket.
 
-World frame, z up, SI units. Everything here is written for one ball; `jax.vmap` makes many.
+World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
 """
 
 import math
@@ -29,11 +29,11 @@ class BallState:
 
 
 def require_ball(ball: object) -> None:
-    """Raise unless an argument `ball` is one ball.
+    """Check that the argument `ball` is one ball.
 
     Raises:
-        TypeError: it is none, or holds no numbers.
-        ValueError: its vectors have another shape.
+        TypeError: it is not a `BallState`, or does not hold numbers.
+        ValueError: its vectors have another shape than (3,).
     """
     require_kind("ball", ball, BallState)
     for name in ("pos", "vel"):
@@ -43,13 +43,13 @@ def require_ball(ball: object) -> None:
 
 
 def gravity_vector(gravity: Array) -> Array:
-    """The acceleration (0, 0, -gravity) [m/s^2] of a free fall, shape (3,)."""
+    """Return the acceleration (0, 0, -gravity) [m/s^2] of free fall, shape (3,)."""
     gravity = jnp.asarray(gravity)
     return jnp.stack([jnp.zeros_like(gravity), jnp.zeros_like(gravity), -gravity])
 
 
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
-    """Acceleration  g - K_D |v| v  of a ball in flight [Yu2023bat, eq. 2].
+    """Return the acceleration g - K_D |v| v of a ball in flight [Yu2023bat, eq. 2].
 
     Args:
         vel: (3,) [m/s], or a tuple of its components.
@@ -57,12 +57,12 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
         gravity: () [m/s^2], magnitude.
 
     Returns:
-        (3,) [m/s^2], or a tuple like the velocity. The gradient is finite at rest.
+        (3,) [m/s^2], or a tuple like the velocity. The gradient is finite for zero velocity.
     """
     x, y, z = components(vel)
     speed_squared = x * x + y * y + z * z
     moving = speed_squared > 0.0
-    # The inner where keeps the gradient of sqrt finite for a ball at rest.
+    # The inner where keeps the gradient of sqrt finite for zero velocity.
     speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
     braking = -drag * speed
     acc: PyTree = (braking * x, braking * y, braking * z - gravity)
@@ -72,9 +72,9 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """The ball after one Runge-Kutta step of order 4; a negative duration [s] steps back.
+    """Advance the ball by one Runge-Kutta step of order 4; a negative duration [s] steps back.
 
-    A ball whose vectors are tuples of their components gives such a ball.
+    The vectors of the ball may be arrays, or tuples of their components.
     """
 
     def rate(state: BallState) -> BallState:
@@ -96,14 +96,14 @@ def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> B
 def fly(
     ball: BallState, duration: Array, drag: Array, gravity: Array, *, num_steps: int
 ) -> tuple[BallState, BallState]:
-    """The ball after `duration` seconds of flight with quadratic drag.
+    """Integrate the flight of a ball with quadratic drag.
 
     Args:
         ball: one ball.
         duration: () [s], of either sign.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
-        num_steps: how many equal Runge-Kutta steps.
+        num_steps: number of equal Runge-Kutta steps.
 
     Returns:
         final: the ball at the end.
@@ -124,15 +124,15 @@ def fly(
 
 
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """The ball after `duration` [s] with drag  -K_i v_i  on each axis (closed form).
+    """Return the ball after a flight with drag -K_i v_i on each axis, in closed form.
 
-    [Yu2023bat, eq. 4a] with the constant that the print lacks:
-    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K  on each axis, g signed.
+    [Yu2023bat, eq. 4a], with the constant that is missing in the paper:
+    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K on each axis, with signed g.
 
     Args:
         ball: one ball.
         duration: () [s].
-        drag: (3,) K_i [1/s], >= 0. Small K goes over into the drag-free form.
+        drag: (3,) K_i [1/s], >= 0, zero included.
         gravity: () [m/s^2], magnitude.
     """
     x = drag * duration
@@ -145,10 +145,10 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
 
 
 def _phi(x: Array) -> tuple[Array, Array]:
-    """phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
+    """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
 
-    The direct form of phi_2 cancels far above zero, so a series of thirteen terms serves up
-    to |x| = 1/2. Each branch sees an input on which its gradient is finite.
+    The direct form of phi_2 suffers from cancellation, so for |x| < 1/2 a series of thirteen terms
+    replaces it. Each branch has an input for which its gradient is finite.
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
@@ -159,7 +159,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
-    """The ball after `duration` [s] of free fall [Natarajan2024, eqs 5 to 7].
+    """Return the ball after a free fall [Natarajan2024, eqs 5 to 7].
 
     Args:
         ball: one ball.
@@ -173,18 +173,17 @@ def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallSt
 
 
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:
-    """Greatest height [m] that a drag-free ball reaches from now on.
+    """Return the greatest future height [m] of a drag-free ball [Yu2023bat, eq. 22].
 
-    v_z^2 / (2 g) + z  for a rising ball, z itself for a falling one
-    [Yu2023bat, eq. 22]; the printed equation lacks the z component.
+    It is z + v_z^2 / (2 g) for a rising ball, and z for a falling one; the paper omits z.
     """
     return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
 
 
 def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple[Array, Array]:
-    """Time at which a drag-free ball falls through a horizontal plane.
+    """Return the time at which a drag-free ball falls through a horizontal plane.
 
-    The later root t of  z + v_z t - g t^2 / 2 = height.
+    It is the later root t of z + v_z t - g t^2 / 2 = height.
 
     Args:
         ball: one ball.
@@ -192,41 +191,36 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
         gravity: () [m/s^2], magnitude, > 0.
 
     Returns:
-        time: () [s] from now; 0 where the plane is never reached.
+        time: () [s]; 0 if the ball never reaches the plane.
         reached: () bool.
     """
     discriminant = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - height)
     real = discriminant > 0.0
-    # The inner where keeps sqrt's gradient finite in lanes that the outer one drops.
+    # The inner where keeps the gradient of sqrt finite where the ball never reaches the plane.
     time = (ball.vel[2] + jnp.sqrt(jnp.where(real, discriminant, 1.0))) / gravity
     reached = real & (time > 0.0)
     return jnp.where(reached, time, 0.0), reached
 
 
 def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
-    """Ball velocity after the bounce.
+    """Return the ball's velocity v+ (3,) [m/s] after the bounce.
 
-    v+ = v- - (1 + beta) ((v- - u) . z) z . [Yu2023bat, eq. 3] prints (1 - beta); its own
-    definition of beta and its eq. 12 need the plus sign. The tangential velocity is kept.
+    v+ = v- - (1 + beta) ((v- - u) . z) z. [Yu2023bat, eq. 3] prints (1 - beta), but the paper's
+    definition of beta and its eq. 12 need the plus sign. The tangential velocity is unchanged.
 
     Args:
         ball_vel: (3,) v- [m/s].
         racket_vel: (3,) u [m/s].
         normal: (3,) z, unit normal of the racket.
         restitution: () beta, 0 to 1.
-
-    Returns:
-        (3,) v+ [m/s].
     """
     return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
 
 
-def required_impact(
-    ball_vel: Array, ball_vel_after: Array, restitution: Array
-) -> tuple[Array, Array]:
-    """Racket normal and normal speed that turn one ball velocity into another.
+def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:
+    """Return the racket's normal and normal speed for a change of the ball's velocity.
 
-    [Yu2023bat, eq. 11] (the normal points along v+ - v-; the print has it reversed) and eq. 12.
+    [Yu2023bat, eqs 11 and 12]; the normal points along v+ - v-, and is reversed in the paper.
 
     Args:
         ball_vel: (3,) v- [m/s].

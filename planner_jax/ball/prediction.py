@@ -1,7 +1,7 @@
-"""Where the ball will be: an integrated state table, smoothed by cubic convolution.
+"""Prediction of the ball: a table of integrated states, interpolated by cubic convolution.
 
-[Yu2023bat, Section III-C] (eqs 8-10): the flight is integrated once into a table of states,
-and Keys' kernel (a = -1/2) [Keys1981] reads it at any time with a continuous gradient.
+[Yu2023bat, Section III-C, eqs 8 to 10] integrates the flight once into a table. Keys' kernel
+(a = -1/2) [Keys1981] interpolates it at any time with a continuous gradient.
 """
 
 import functools
@@ -35,26 +35,26 @@ class PathTable:
     resolution: Array  # () [s], > 0
 
     def at(self, time: Array) -> BallState:
-        """State of the target at one time () [s], as `target_at`: a `TargetPath`."""
+        """Return the state of the target at one time () [s]; see `target_at`."""
         return target_at(self, time)
 
 
 def predict_path(
     ball: BallState, horizon: Array, drag: Array, gravity: Array, *, num_nodes: int
 ) -> PathTable:
-    """The table of a ball in flight with quadratic drag, one Runge-Kutta step a node.
+    """Integrate the flight of a ball with quadratic drag, one Runge-Kutta step a node.
 
     Args:
         ball: the ball at time 0.
-        horizon: () [s], the table answers times from 0 to here.
+        horizon: () [s], last time of the prediction.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
-        num_nodes: N >= 5. One node lies before time 0 and one past the horizon, because the
-            kernel reads two nodes on each side.
+        num_nodes: N >= 5. One node is before time 0 and one after the horizon, because the kernel
+            reads two nodes on each side.
 
     Raises:
-        ValueError: an argument has another shape or, unless it is a jax array, is out of its range.
-        TypeError: an argument is of another kind.
+        ValueError: an argument has a wrong shape or, unless it is a JAX array, is out of range.
+        TypeError: an argument has a wrong type.
     """
     require_size("num_nodes", num_nodes, LEAST_NODES)
     require_ball(ball)
@@ -62,19 +62,19 @@ def predict_path(
     require_number("drag", drag, NOT_NEGATIVE)
     require_number("gravity", gravity)
     resolution = horizon / (num_nodes - 3)
-    pos, vel = _integrated(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)
+    pos, vel = _node_function(num_nodes)(ball.pos, ball.vel, resolution, drag, gravity)
     return PathTable(pos=pos, vel=vel, resolution=resolution)
 
 
 @functools.cache
-def _integrated(num_nodes: int) -> Callable:
-    """Positions and velocities (N, 3) at the nodes, with a kernel for many lanes.
+def _node_function(num_nodes: int) -> Callable:
+    """Build the function of positions and velocities (N, 3) at the nodes, with a kernel for lanes.
 
-    They are differentiated forward, along with the flight, whatever JAX asks for: there are few
-    numbers to differentiate by, and nothing has to be kept for a way back.
+    It is differentiated in forward mode together with the flight, also inside reverse mode: there
+    are few inputs, and no intermediate states need to be stored.
     """
 
-    def integrated(
+    def integrate(
         pos: Array, vel: Array, resolution: Array, drag: Array, gravity: Array
     ) -> tuple[Array, Array]:
         ball = BallState(pos, vel)
@@ -94,16 +94,16 @@ def _integrated(num_nodes: int) -> Callable:
 
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
-        """Derivatives of positions, then of velocities, by some arguments."""
-        derivatives = jax.jacfwd(integrated, argnums=moving)
+        """Build the function of derivatives of positions and velocities by some arguments."""
+        derivatives = jax.jacfwd(integrate, argnums=moving)
         return with_kernel(derivatives, path, num_nodes, moving)
 
-    def moved(primals: tuple, tangents: tuple) -> tuple:
-        nodes = integrated_in_lanes(*primals)
+    def jvp(primals: tuple, tangents: tuple) -> tuple:
+        nodes = integrate_lanes(*primals)
         moving = tuple(k for k, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
         further = tuple(k for k in moving if k > 0)
         found = [jnp.zeros_like(leaf) for leaf in nodes]
-        if 0 in moving:  # the whole path moves with its first point
+        if 0 in moving:  # a displacement of the first point displaces the whole path
             found[0] = found[0] + tangents[0]
         if further:
             for k, by in enumerate(slopes(further)(*primals)):
@@ -113,23 +113,19 @@ def _integrated(num_nodes: int) -> Callable:
                     found[k] = found[k] + (jnp.sum(along, axis=-1) if of_vector else along)
         return nodes, tuple(found)
 
-    integrated_in_lanes = with_kernel(integrated, path, num_nodes, jvp=moved)
-    return integrated_in_lanes
+    integrate_lanes = with_kernel(integrate, path, num_nodes, jvp=jvp)
+    return integrate_lanes
 
 
 def horizon_of(table: PathTable) -> Array:
-    """Last time [s] that the table answers; the first is 0."""
+    """Return the last time [s] of the table; the first is 0."""
     return table.resolution * (table.pos.shape[0] - 3)
 
 
 def convolution_weights(u: Array) -> Array:
-    """Keys' weights of the four nodes around a point [Yu2023bat, eqs 8 and 10b].
+    """Return Keys' weights (4,) of the nodes around a point [Yu2023bat, eqs 8 and 10b].
 
-    Args:
-        u: () fraction of the way from the second to the third node, 0 to 1.
-
-    Returns:
-        (4,), which sum to one.
+    The point is at a fraction `u` () from 0 to 1 between the second and the third node.
     """
     far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
     near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731
@@ -137,15 +133,10 @@ def convolution_weights(u: Array) -> Array:
 
 
 def target_at(table: PathTable, time: Array) -> BallState:
-    """State of the target at one time, with a gradient in time that is continuous.
+    """Return the state of the target at one time () [s], with a continuous gradient in time.
 
-    Inside the table both position and velocity are cubic convolutions [Yu2023bat, eq. 9].
-    Outside [0, horizon] the target goes on from the end of the table at the velocity it has
-    there: defined and differentiable.
-
-    Args:
-        table: N nodes.
-        time: () [s].
+    In [0, horizon] position and velocity are cubic convolutions of the N nodes [Yu2023bat, eq. 9].
+    Outside, the target continues at the velocity at the nearer end.
     """
     require_kind("table", table, PathTable)
     require_scalar("time", time)

@@ -1,8 +1,8 @@
-"""The table of a ball in flight on many lanes as one kernel for CUDA.
+"""A CUDA kernel that integrates the flights of many balls into tables.
 
-A step needs the one before it. As operations of their own the steps of a table are some three
-hundred launches, which a small batch waits for; here a thread flies a ball to the end, and where
-derivatives are asked for, these along with it.
+Steps of a flight depend on each other. As separate operations they take about three hundred kernel
+launches, which dominate the time of a small batch. In this kernel one thread integrates one ball,
+and the requested derivatives with it.
 """
 
 import dataclasses
@@ -20,20 +20,20 @@ from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
 _THREADS = 32  # lanes of a block
-_VEL = 1  # place of the velocity among the arguments; numbers follow it
+_VEL = 1  # index of the velocity among the arguments; resolution, drag and gravity follow
 
 
 def table_kernel(
     num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
 ) -> Callable:
-    """Make the kernel of the states at the nodes of a `PathTable`.
+    """Build the kernel of the states at the nodes of a `PathTable`.
 
     Args:
         num_nodes: N.
-        moving: places among the arguments, all but the position's. With some, the kernel gives
-            derivatives by them instead of the states: those of all positions, then of all
-            velocities, each (N, 3), and by the velocity (N, 3, 3).
-        interpret: run it without a GPU, for tests.
+        moving: indices of arguments, except the position. If there are any, the kernel returns
+            derivatives by these arguments instead of states: derivatives of the positions, then of
+            the velocities, each (N, 3), or (N, 3, 3) by the velocity.
+        interpret: run without a GPU, for tests.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
@@ -53,10 +53,10 @@ def table_kernel(
 class _Direction:
     """One number by which the states are differentiated."""
 
-    result: int  # which result holds the positions' derivatives; those of velocities follow
-    index: tuple[int, ...]  # its place there, behind node and axis
-    vel: tuple[float, ...]  # (3,) what the velocity at time 0 moves by
-    numbers: tuple[float, ...]  # (3,) what resolution, drag and gravity move by
+    result: int  # index of the result for positions; results for velocities follow all of these
+    index: tuple[int, ...]  # in that result, behind node and axis
+    vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
+    numbers: tuple[float, ...]  # (3,) tangent of resolution, drag and gravity
 
 
 def _directions(moving: tuple[int, ...]) -> list[_Direction]:
@@ -75,7 +75,7 @@ def _directions(moving: tuple[int, ...]) -> list[_Direction]:
 def _call(
     num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
 ) -> Callable:
-    """Make the kernel for tables of `num_nodes` on `lanes` lanes."""
+    """Build the kernel for tables of `num_nodes` on `lanes` lanes."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if place == _VEL else (num_nodes, 3) for place in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
@@ -87,29 +87,29 @@ def _call(
         def full(values: Iterable[ArrayLike]) -> Any:  # a tuple in the place of a vector
             return tuple(zero + value for value in values)
 
-        def flown(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:
+        def advance(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:
             def step(ball: BallState, h: Array, *others: Array) -> BallState:
                 return rk4_step(ball, sign * h, *others)
 
             after, push = jax.linearize(step, ball, *numbers)
             pairs = zip(moved, directions, strict=True)
-            return after, [push(state, *full(way.numbers)) for state, way in pairs]
+            return after, [push(state, *full(each.numbers)) for state, each in pairs]
 
         def write(node: ArrayLike, ball: BallState, moved: list[BallState]) -> None:
-            ways = [(way.result, way.index) for way in directions] or [(0, ())]
-            for (result, index), state in zip(ways, moved or [ball], strict=True):
+            targets = [(each.result, each.index) for each in directions] or [(0, ())]
+            for (result, index), state in zip(targets, moved or [ball], strict=True):
                 for k in range(3):
                     out[result][node, k, *index] = state.pos[k]
                     out[result + len(out) // 2][node, k, *index] = state.vel[k]
 
-        def advance(node: Array, carry: tuple) -> tuple:
+        def write_and_advance(node: Array, carry: tuple) -> tuple:
             write(node, *carry)
-            return flown(*carry)
+            return advance(*carry)
 
         ball = BallState(full(pos[k] for k in range(3)), full(vel[k] for k in range(3)))
-        moved = [BallState(full((0.0, 0.0, 0.0)), full(way.vel)) for way in directions]
-        write(0, *flown(ball, moved, -1.0))
-        write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, advance, (ball, moved)))
+        moved = [BallState(full((0.0, 0.0, 0.0)), full(each.vel)) for each in directions]
+        write(0, *advance(ball, moved, -1.0))
+        write(num_nodes - 1, *jax.lax.fori_loop(1, num_nodes - 1, write_and_advance, (ball, moved)))
 
     inputs = [(3,), (3,), (), (), ()]
     return kernel_by_lanes(

@@ -1,4 +1,4 @@
-"""The path of a target from a table of a user's own: recorded, simulated, or sent by a tracker."""
+"""Target paths from a user's table of positions: recorded, simulated, or sent by a tracker."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +16,8 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
-MOST_NODES = 4096  # that are chosen for a path
-_CHECKED = (0.2, 0.5, 0.8)  # shares of the way between two nodes, where errors are looked for
+MOST_NODES = 4096  # of an automatic choice
+_CHECKED = (0.2, 0.5, 0.8)  # fractions between two nodes at which the error is measured
 
 
 def table_path(
@@ -29,37 +29,36 @@ def table_path(
     error: float = 1e-3,
     dtype: DTypeLike = jnp.float32,
 ) -> PathTable:
-    """The path through positions at times that need not be evenly spaced.
+    """Return the path through positions at times that need not be evenly spaced.
 
-    Between the times it is the cubic spline with continuous acceleration, or with velocities the
-    cubic Hermite spline. Of a smooth flight whose times are at most d apart, the error of the
-    position is O(d^4), and that of the velocity, the spline's derivative, O(d^3). Nothing is
-    smoothed: noisy observations should be fitted first.
+    Positions are interpolated by the cubic spline with continuous acceleration, or by the cubic
+    Hermite spline if velocities are passed. For a smooth flight with times at most d apart, the
+    error of the position is O(d^4), and the error of the velocity is O(d^3). Noisy observations
+    should be smoothed before.
 
-    Planner and referee read the spline from equal steps, by cubic convolution. By default there
-    are as many steps as bring its position to within `error`, and its velocity to within ten times
-    as much a second.
+    Planner and referee interpolate a table with equal steps by cubic convolution. By default the
+    table has enough nodes to approximate the spline's position to `error`, and its velocity to ten
+    times `error` per second.
 
     Args:
-        times: (K,) [s], rising, K >= 2; time 0 is when planning begins, and lies within them.
-            After the last one the target goes on at the velocity that it has there. NumPy, as the
-            shape of the program follows from them.
-        positions: (..., K, 3) [m]; the axes in front are those of the leaves that come back, such
-            as (N,) for the targets of one catch. May be differentiated by.
-        velocities: likewise [m/s].
-        nodes: of the table, >= 5. To be given where positions are traced, and where tables of
-            several batches are to share a compiled program.
-        error: [m], > 0, from the spline, where `nodes` are not given.
+        times: (K,) [s], rising, K >= 2, NumPy. Planning starts at time 0, which must be within the
+            times. After the last one the target keeps its velocity.
+        positions: (..., K, 3) [m]; leading axes are leading axes of the result, such as (N,) for
+            the targets of one catch. The path is differentiable by positions.
+        velocities: (..., K, 3) [m/s].
+        nodes: number of nodes, >= 5. Required if positions are traced; pass it also if several
+            batches of tables should share a compiled program.
+        error: [m], > 0, of the table, if `nodes` is not passed.
         dtype: of every leaf.
 
     Raises:
-        ValueError: the times do not rise or leave out time 0, a shape does not fit, or the path
+        ValueError: the times do not rise or exclude time 0, a shape does not fit, or the path
             needs more than `MOST_NODES`.
-        TypeError: an argument holds no numbers, or `dtype` is not that of floating ones.
+        TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
-    dtype, times = floating(dtype), _checked_times(times)
-    given = [("positions", positions), ("velocities", velocities)]
-    values = [_checked(name, value, times.size) for name, value in given if value is not None]
+    dtype, times = floating(dtype), _check_times(times)
+    named = [("positions", positions), ("velocities", velocities)]
+    values = [_check_values(name, value, times.size) for name, value in named if value is not None]
     if len(values) == 2 and np.shape(values[0]) != np.shape(values[1]):
         rule = f"the shape {np.shape(values[0])} of positions"
         raise ArgumentError("velocities", rule, np.shape(values[1]), verb="have")
@@ -68,11 +67,11 @@ def table_path(
     require_size("nodes", nodes, 5)
     resolution = times[-1] / (nodes - 3)
     at = (np.arange(nodes) - 1) * resolution
-    pos, vel = (jnp.asarray(_read(times, values, at, order), dtype) for order in (0, 1))
+    pos, vel = (jnp.asarray(_evaluate(times, values, at, order), dtype) for order in (0, 1))
     return PathTable(pos, vel, jnp.full(pos.shape[:-2], resolution, dtype))
 
 
-def _checked_times(times: ArrayLike) -> np.ndarray:
+def _check_times(times: ArrayLike) -> np.ndarray:
     if isinstance(times, Tracer):
         raise ArgumentError("times", "known when a program is compiled", shown="traced ones")
     shape = shape_of("times", times)
@@ -89,8 +88,8 @@ def _checked_times(times: ArrayLike) -> np.ndarray:
     return times
 
 
-def _checked(name: str, value: ArrayLike, num: int) -> Numbers:
-    """Values (..., K, 3), in float64 if they are not traced."""
+def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
+    """Check values (..., K, 3); return them in float64 if they are not traced."""
     if shape_of(name, value)[-2:] != (num, 3):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):
@@ -101,8 +100,8 @@ def _checked(name: str, value: ArrayLike, num: int) -> Numbers:
     return value
 
 
-def _read(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Derivative (..., T, 3) of the spline at times (T,): linear in the values."""
+def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
+    """Evaluate a derivative (..., T, 3) of the spline at times (T,), linearly in the values."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]
@@ -120,7 +119,7 @@ def _read(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
-    """A power of two of nodes with which the table is as near to the spline as it has to be."""
+    """Return the least power of two of nodes whose table approximates the spline to `error`."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "given where positions are traced", shown="none")
     require_number("error", error, POSITIVE)
@@ -130,11 +129,11 @@ def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
         at = (np.arange(nodes) - 1) * resolution
         worst = 0.0
         for order, allowed in ((0, error), (1, 10.0 * error)):
-            table = _read(times, values, at, order)
+            table = _evaluate(times, values, at, order)
             for share in _CHECKED:
                 weights = np.asarray(convolution_weights(jnp.asarray(share)))
                 read = sum(weights[k] * table[..., k : nodes - 3 + k, :] for k in range(4))
-                exact = _read(times, values, at[1:-2] + share * resolution, order)
+                exact = _evaluate(times, values, at[1:-2] + share * resolution, order)
                 worst = max(worst, np.abs(read - exact).max(initial=0.0) / allowed)
         if worst <= 1.0:
             return nodes

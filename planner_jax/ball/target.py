@@ -1,8 +1,8 @@
-"""Paths of targets: anything that says where it is, and how fast, at a time.
+"""Paths of targets: position and velocity as functions of time.
 
 A target path is a pytree with a method `at(time)`, differentiable in time and in every leaf, that
-gives a `BallState`, or the position alone. The ones here cover the papers' targets; a user's own
-class serves as well.
+returns a `BallState` or a position. The classes of this module cover the targets of the papers;
+users may write their own.
 """
 
 from typing import ClassVar, Protocol, runtime_checkable
@@ -18,17 +18,17 @@ from planner_jax.core.rules import NOT_NEGATIVE, Field, Table
 
 @runtime_checkable
 class TargetPath(Protocol):
-    """What a planner needs to know about a target."""
+    """The path of a target."""
 
     def at(self, time: Array) -> BallState | Array:
-        """Position (3,) [m], or position and velocity [m/s], at one time () [s]."""
+        """Return position (3,) [m], or position and velocity [m/s], at one time () [s]."""
         ...
 
 
 def state_at(path: TargetPath, time: Array) -> BallState:
-    """Position and velocity of a target at one time () [s].
+    """Return position and velocity of a target at one time () [s].
 
-    Where its class says only the position, the velocity is the derivative by the time.
+    If `at` returns only the position, its derivative is the velocity.
     """
     state = path.at(time)
     if isinstance(state, BallState):
@@ -41,7 +41,7 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 class BallPath:
     """A ball with linear drag on each axis ([Yu2023catch, eq. 9], with its constant).
 
-    Without drag it is a parabola, without drag and gravity a straight line: the targets of
+    Without drag the path is a parabola, and without drag and gravity a straight line, as in
     [Yu2023catch, Section VII-B a, c, d].
     """
 
@@ -57,13 +57,13 @@ class BallPath:
     gravity: Array  # () [m/s^2], magnitude
 
     def at(self, time: Array) -> BallState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+        """Return position [m] and velocity [m/s] at one time () [s]."""
         return linear_drag_flight(self.ball, time, self.drag, self.gravity)
 
 
 @struct.dataclass
 class HarmonicPath:
-    """A target that drifts and swings: p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
+    """A target that drifts and oscillates, p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
 
     rules: ClassVar[Table] = (
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),
@@ -77,7 +77,7 @@ class HarmonicPath:
     phase: Array  # () phi [rad]
 
     def at(self, time: Array) -> BallState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
+        """Return position [m] and velocity [m/s] at one time () [s]."""
         angle = self.rate * time + self.phase
         return BallState(
             pos=self.pos + self.vel * time + self.amplitude * jnp.sin(angle),

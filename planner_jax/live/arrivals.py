@@ -1,8 +1,8 @@
-"""Which packets are used: in order, once, and by one clock.
+"""Selection of packets: each is used once, in order, and by one clock of the senders.
 
-All senders share a clock, which may differ from ours by any amount. A packet whose time of sending
-disagrees with earlier packets is not used, unless none has been used for a second: then the
-senders' clock was set anew, and all that was known by the old one is forgotten.
+All senders share a clock, with any offset to the clock of this process. A packet whose sending time
+disagrees with earlier packets is ignored. If no packet was used for a second, the senders' clock is
+taken to be reset, and earlier times are forgotten.
 """
 
 import math
@@ -10,25 +10,25 @@ from collections.abc import Hashable
 
 from planner_jax.live.packets import Fault, Packet
 
-LATE = 0.02  # [s], delay beyond the least delay from which on a packet counts as late
-_APART = 1.0  # [s], disagreement from which on a time is by another clock
+LATE = 0.02  # [s] above the least delay, from which a packet counts as late
+_APART = 1.0  # [s], disagreement from which a time is of another clock
 _SILENCE = 1.0  # [s] without a used packet, after which another clock is accepted
-_DRIFT = 1e-4  # of one clock against the other
-_SENDERS = 32  # that are remembered
+_DRIFT = 1e-4  # greatest relative drift between the clocks
+_SENDERS = 32  # greatest number of senders in memory
 
 
 class Arrivals:
-    """The packets of all senders."""
+    """State of the selection, over the packets of all senders."""
 
     def __init__(self) -> None:
-        self.newest = -math.inf  # [s], senders' clock, latest time of sending
-        self.was_late = False  # the last packet
-        self._least = math.nan  # [s], our clock minus the senders', of the quickest packet
-        self._used = -math.inf  # [s], our clock, when a packet was used last
-        self._senders: dict[Hashable, tuple[float, int]] = {}  # time and number of their newest
+        self.newest = -math.inf  # [s], latest sending time, by the senders' clock
+        self.was_late = False  # the last packet was late
+        self._least = math.nan  # [s], least difference of arrival time and sending time
+        self._used = -math.inf  # [s], arrival of the last used packet
+        self._senders: dict[Hashable, tuple[float, int]] = {}  # newest sending time and number
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Return the fault of a packet that came now [s], and whether the clock was set anew."""
+        """Return the fault of a packet that arrives `now` [s], and whether the clock was reset."""
         self.was_late = False
         if packet.fault:
             return packet.fault, False

@@ -1,4 +1,4 @@
-"""The client of a live loop in Python; docs/live.md describes its packets for other languages."""
+"""Client of a live loop in Python; docs/live.md describes the packets for other languages."""
 
 import socket
 import time
@@ -12,7 +12,7 @@ from planner_jax.live.settings import PORT
 
 
 class Client:
-    """Sends measurements, and waits for setpoints; the end of its block closes its socket.
+    """Sends measurements, and waits for setpoints; a `with` block closes its socket.
 
     Args:
         port: of the loop.
@@ -27,12 +27,12 @@ class Client:
     def ball(
         self, pos: Sequence[float], *, measured: float | None = None, number: int = 0
     ) -> Answer | None:
-        """Send the position of a ball; return the answer, or None if none comes in time.
+        """Send the position of a ball; return the answer, or None after the timeout.
 
         Args:
             pos: (3,) [m].
             measured: [s], time of the observation by `time.monotonic()`; by default now.
-            number: of the ball, from 0 to 65535; another number is another ball.
+            number: identifies the ball, from 0 to 65535.
         """
         return self._send(BALL, measured, pos, number)
 
@@ -44,7 +44,7 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's position [m], velocity [m/s] and acceleration [m/s^2]; as `ball`."""
+        """Send the robot's position [m], velocity [m/s], acceleration [m/s^2]; see `ball`."""
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

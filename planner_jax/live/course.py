@@ -1,4 +1,4 @@
-"""The course of the robot: a plan and the recovery trajectory behind it, or the latter alone."""
+"""The robot's course: a plan and its recovery trajectory, or a recovery trajectory alone."""
 
 from typing import Any
 
@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from planner_jax.core.protocol import is_solved
 from planner_jax.live.packets import FIELDS
-from planner_jax.optimise.settings import Round
-from planner_jax.planning.programs import call_packed, solve_cases
+from planner_jax.planning.programs import solve_one
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.recovery.planner import RecoveryPlanner
 from planner_jax.robot.quadrotor import QuadrotorLimits, setpoint_at
@@ -23,14 +22,14 @@ _REST = RecoveryPlanner()
 
 @struct.dataclass
 class Course:
-    """A trajectory that ends at standstill, and stays there. NumPy leaves."""
+    """A trajectory that ends at standstill, where the robot then stays. NumPy leaves."""
 
     path: PiecewisePolynomial  # M pieces of a plan, then the pieces of the recovery trajectory
     gravity: Array  # () [m/s^2]
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Return the course of a plan's trajectory, whose recovery trajectory is not planned yet."""
+    """Return the course of a plan whose recovery trajectory is not planned yet."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -38,27 +37,27 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan the recovery trajectory from the end of a trajectory of M pieces, NumPy leaves.
+    """Plan the recovery from the end of a trajectory of M pieces, with NumPy leaves.
 
-    Returns the course of both, and whether the recovery trajectory keeps the limits.
+    Returns the course of both, and whether the recovery keeps the limits.
     """
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
-    rest: RecoveryPlan = call_packed(_recover, _REST.rounds[0], _REST, case)
+    rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])
     return Course(_join(path, rest.trajectory), gravity), bool(is_solved(rest.status))
 
 
 def recovery_from(
     state: Float[np.ndarray, "4 3"], pieces: int, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan the recovery trajectory from a state, behind M pieces that take no time."""
+    """Plan the recovery from a state, behind M pieces of zero duration."""
     path = _stand_still(pieces, state[0])
     path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])
     return with_recovery(path, gravity, limits)
 
 
 def _stand_still(pieces: int, pos: np.ndarray) -> PiecewisePolynomial:
-    """Return pieces that take no time."""
+    """Return pieces of zero duration at a position (3,)."""
     coeffs: Any = np.zeros((pieces, 8, 3), np.float32)
     durations: Any = np.zeros(pieces, np.float32)
     coeffs[:, 0] = pos
@@ -66,25 +65,20 @@ def _stand_still(pieces: int, pos: np.ndarray) -> PiecewisePolynomial:
 
 
 def _join(path: PiecewisePolynomial, other: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Join two trajectories on the host."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), path, other)
-
-
-def _recover(attempt: Round, planner: RecoveryPlanner, case: RecoveryCase) -> RecoveryPlan:
-    return solve_cases(planner, case, attempt)
 
 
 @struct.dataclass
 class Query:
-    """A course, and the time of its first setpoint."""
+    """A course, and the times of setpoints."""
 
     course: Course
-    elapsed: Array  # () [s], since the course began
+    elapsed: Array  # () [s], from the start of the course to the first setpoint
     period: Array  # () [s], between setpoints
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Return K setpoints of a course, the columns of `packets.FIELDS`; pure."""
+    """Sample K setpoints of a course, with the columns of `packets.FIELDS`; pure."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)
@@ -102,7 +96,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk of a course some time [s] after its start, on the host."""
+    """Return position to jerk at a time [s] after the start of a course, on the host."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:
@@ -111,5 +105,5 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 
 
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk of a trajectory at a time [s], on the host."""
+    """Return position to jerk at a time [s] of a trajectory, on the host."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)

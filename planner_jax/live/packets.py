@@ -1,7 +1,7 @@
 """The packets of a live loop: little-endian, packed, with a version; `docs/live.md` has the table.
 
-A request is a header and, by its kind, the body of a ball that was seen or of a robot's state. An
-answer is a header, which repeats that of the request, what the answer is, and K setpoints.
+A request is a header and a body, either an observation of a ball or a state of the robot. An answer
+is a header, which repeats ball, number and time of the request, a description, and K setpoints.
 """
 
 import dataclasses
@@ -13,13 +13,13 @@ import numpy as np
 
 MAGIC, VERSION = b"PJLV", 1
 BALL, ROBOT, ANSWER = 1, 2, 129
-MOST_SETPOINTS = 17  # that an Ethernet frame takes
-LONGEST = 2048  # bytes that are read of a packet
-FARTHEST = 1e4  # greatest size of any coordinate, in SI units
-OLDEST = 1.0  # [s], greatest age of what was measured
+MOST_SETPOINTS = 17  # fit an Ethernet frame
+LONGEST = 2048  # [bytes], read from a packet
+FARTHEST = 1e4  # greatest magnitude of a value, in SI units
+OLDEST = 1.0  # [s], greatest age of a measurement
 
 _HEADER = struct.Struct("<4sBBHId")  # magic, version, kind, ball, sequence, time sent
-_MEASURED = struct.Struct("<d")  # when
+_MEASURED = struct.Struct("<d")  # time of the measurement
 _VALUES = {BALL: struct.Struct("<3d"), ROBOT: struct.Struct("<9d")}
 _SIZES = {kind: _HEADER.size + 8 + body.size for kind, body in _VALUES.items()}
 _ANSWERED = struct.Struct("<BBBxddd")  # motion, fault, K, time of the first, period, contact
@@ -28,7 +28,7 @@ WIDTH = sum(FIELDS.values())
 
 
 class Fault(enum.IntEnum):
-    """What is wrong with a packet; what has one is not used."""
+    """The fault of a packet, which is then not used."""
 
     NONE = 0
     STRANGE = 1
@@ -45,11 +45,11 @@ class Fault(enum.IntEnum):
 
     @property
     def words(self) -> str:
-        """As the report names it."""
+        """Name of the fault in the report."""
         return self.name.lower().replace("_", " ")
 
 
-# Those without a header that could be answered, and what a packet does that has one.
+# Faults without a readable header, so without an answer, and the predicate of the warning.
 SILENT = {
     Fault.STRANGE: f"does not begin with {MAGIC.decode()}",
     Fault.CUT: "has another length than its kind",
@@ -59,41 +59,41 @@ SILENT = {
 
 
 class Motion(enum.IntEnum):
-    """What the setpoints of an answer belong to."""
+    """The trajectory of the setpoints in an answer."""
 
-    NONE = 0  # there are none, as no state of the robot has come yet
-    SAFE = 1  # to rest, or at rest
-    PLAN = 2  # a plan, with the way to rest behind its end
+    NONE = 0  # no setpoints, since no state of the robot has arrived
+    SAFE = 1  # a recovery trajectory, or standstill
+    PLAN = 2  # a plan, with its recovery trajectory
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Packet:
-    """A request that could be read."""
+    """A readable request."""
 
     kind: int  # BALL or ROBOT
-    ball: int  # number of the ball; another number is another ball
+    ball: int  # number of the ball
     sequence: int
     sent: float  # [s], by the sender's clock
     measured: float  # [s], by the sender's clock
-    values: tuple[float, ...]  # position (3), of a robot velocity (3) and acceleration (3), too
+    values: tuple[float, ...]  # position (3); for a robot also velocity (3), acceleration (3)
     fault: Fault = Fault.NONE
 
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """What comes back for a request; the K setpoints are `period` apart."""
+    """The answer to a request, with K setpoints."""
 
     sequence: int  # of the request
     sent: float  # [s], of the request
     motion: Motion
     fault: Fault  # of the request
-    begin: float  # [s], sender's clock, of the first setpoint
-    period: float  # [s]
-    contact: float  # [s], sender's clock, when the plan meets the ball; NaN without a plan
+    begin: float  # [s], sender's clock, time of the first setpoint
+    period: float  # [s], between setpoints
+    contact: float  # [s], sender's clock, time of the contact with the ball; NaN without a plan
     setpoints: np.ndarray  # (K, 20), the columns of `FIELDS`
 
     def column(self, name: str) -> np.ndarray:
-        """A field of all setpoints, (K, N), such as "pos" or "quat_wxyz"."""
+        """Return a field of all setpoints, (K, N), such as "pos" or "quat_wxyz"."""
         names = list(FIELDS)
         before = sum(FIELDS[each] for each in names[: names.index(name)])
         return self.setpoints[:, before : before + FIELDS[name]]
@@ -102,13 +102,13 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """The packet of a ball that was seen, or of a robot's state."""
+    """Return the packet of an observed ball, or of a robot's state."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 
 
 def read_request(data: bytes) -> Packet | Fault:
-    """What a packet holds, maybe with a fault, or the fault by which it could not be read."""
+    """Return the content of a packet, or the fault of an unreadable one."""
     if data[:4] != MAGIC:
         return Fault.STRANGE
     if len(data) < _HEADER.size:
@@ -139,14 +139,14 @@ def answer(
 ) -> bytes:
     """Return the packet of an answer with setpoints (K, 20) float32.
 
-    `times` [s] are of the first setpoint, from one to the next, and of the contact.
+    `times` are `begin`, `period` and `contact` of `Answer` [s].
     """
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 
 
 def read_answer(data: bytes) -> Answer | None:
-    """What an answer holds; None of anything else."""
+    """Return the content of an answer, or None for any other packet."""
     first = _HEADER.size + _ANSWERED.size
     if len(data) < first or data[:4] != MAGIC:
         return None

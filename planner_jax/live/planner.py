@@ -1,9 +1,8 @@
-"""The live loop without its socket: packets in, setpoints out.
+"""The live loop without its socket: from packets to setpoints.
 
-There is always a course: first the recovery trajectory from the robot's first state, and then
-plans, each with a recovery trajectory behind it. An answer holds the setpoints of the course that
-are due. A plan is searched for in a thread of its own, for which an answer waits a share of the
-deadline.
+The robot always follows a course: at first the recovery trajectory from its first state, then plans
+with recovery trajectories. An answer holds the next setpoints of the course. Planning runs in a
+thread of its own, and an answer waits for its result for a share of the deadline.
 """
 
 import concurrent.futures
@@ -46,14 +45,14 @@ from planner_jax.live.strokes import CaseT, PlanT, Stroke
 from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # share of the deadline for which an answer waits for a plan
-_ASTRAY = 0.5  # [m], between robot and course, from which on the course starts anew
-_JOIN = (0.02, 0.2)  # [m, m/s], largest distance of a late plan from the course
+_ASTRAY = 0.5  # [m], distance between robot and course above which a new course starts
+_JOIN = (0.02, 0.2)  # [m, m/s], greatest difference between a late plan and the course
 _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Flight(Generic[PlanT]):
-    """A course, and its plan, if any. Times are by the senders' clock."""
+    """A course and its plan, if any. Times are of the senders' clock."""
 
     course: Course
     start: float  # [s]
@@ -76,11 +75,11 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     Args:
         stroke: the task, such as `HitStroke()`.
-        rate: of the setpoints in an answer [Hz].
-        horizon: K, the number of setpoints in an answer.
+        rate: [Hz], of the setpoints in an answer.
+        horizon: K, number of setpoints in an answer.
         deadline: [s], from a packet to its answer.
         noise: [m], standard deviation of an observed coordinate of a ball.
-        known: [m/s], standard deviation of the ball's velocity at which planning starts.
+        known: [m/s], standard deviation of the ball's velocity below which planning starts.
     """
 
     def __init__(
@@ -109,13 +108,13 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _forget(self) -> None:
         """Forget robot and ball."""
         self._flight: _Flight[PlanT] | None = None
-        self._before: _Flight[PlanT] | None = None  # flown on if the flight cannot recover
+        self._before: _Flight[PlanT] | None = None  # continued if the flight has no recovery
         self._job: _Job[PlanT] | None = None
-        self._done = -1  # number of the last ball that was met
+        self._done = -1  # number of the last ball of a completed contact
         self._sight.forget()
 
     def close(self) -> None:
-        """End the thread that plans."""
+        """End the planning thread."""
         self._worker.shutdown(cancel_futures=True)
         self.report.end()
 
@@ -148,7 +147,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             report.counts["clocks"] += 1
             self._forget()
         report.stages["read"].add(time.perf_counter() - received)
-        due = self._arrivals.newest  # even if the packet itself was overtaken
+        due = self._arrivals.newest  # also if a newer packet has arrived before this one
         if fault is Fault.NONE:
             use = self._use_ball if packet.kind == BALL else self._use_robot
             fault = use(packet, due, received)
@@ -159,11 +158,11 @@ class LivePlanner(Generic[CaseT, PlanT]):
             report.counts["late"] += self._arrivals.was_late
         else:
             report.faults[fault] += 1
-        with report.stages["setpoints"].timed():
+        with report.stages["setpoints"].measure():
             return self._pack(packet, fault, due)
 
     def sent(self, data: bytes, received: float) -> None:
-        """Count the answer to a packet, and do what was left until it was sent."""
+        """Count an answer that was sent, and then plan the recovery if it is missing."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
@@ -199,7 +198,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         before = self._sight.number
-        with self.report.stages["estimate"].timed():
+        with self.report.stages["estimate"].measure():
             ball, fault = self._sight.see(packet.ball, packet.values, packet.measured, due)
         self.report.counts["balls"] += self._sight.number != before
         self._collect(due)
@@ -226,15 +225,15 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Search for a flight that starts when it is due; in the thread that plans."""
+        """Search for a flight that starts at time `due`, in the planning thread."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
-            with stages["again"].timed():
+            with stages["again"].measure():
                 plan = self.stroke.again(flight.plan, elapsed, ball)
             if is_solved(plan.status):
                 return self._flight_of(plan, number, due)
             self.report.counts["refused"] += 1
-        with stages["first"].timed():
+        with stages["first"].measure():
             plan = self.stroke.first(ball, state_of(flight.course, elapsed))
         if is_solved(plan.status):
             return self._flight_of(plan, number, due)
@@ -246,7 +245,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
-        """Fly the plan that the thread has found, if it can still be joined."""
+        """Switch to the plan that the thread has found, if it is close to the course."""
         flight, job = self._flight, self._job
         if flight is not None and flight.plan is not None and due >= flight.contact:
             self._done = flight.ball
@@ -266,14 +265,14 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery behind the plan that is flown; without one, fly on as before.
+        """Plan the recovery of the current plan; without one, return to the previous course.
 
-        This is left until an answer has been sent, or needs it.
+        This is deferred until an answer has been sent or needs it.
         """
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return
-        with self.report.stages["rest"].timed():
+        with self.report.stages["rest"].measure():
             path = flight.plan.trajectory
             course, is_within = with_recovery(path, self._gravity, self._limits)
         self.report.counts["endless"] += not is_within
@@ -296,7 +295,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return answer(packet, fault, motion, times, self._setpoints(flight, due))
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
-        """Return the setpoints (K, 20) from a time on."""
+        """Return the setpoints (K, 20) from time `due`."""
         times: Any = np.float32(due - flight.start), np.float32(self._period)
         query = Query(flight.course, *times)
         return call_packed(setpoints_of, self._num, None, query)

@@ -1,4 +1,4 @@
-"""Counts and times of a live loop, in memory that does not grow."""
+"""Counts and times of a live loop, in constant memory."""
 
 import collections
 import contextlib
@@ -13,13 +13,13 @@ from planner_jax.host.machine import format_size, resident_memory
 from planner_jax.live.packets import Fault
 
 _SHORTEST = 1e-6  # [s]
-_STEP = 0.01  # relative, of the classes of times
+_STEP = 0.01  # relative width of a bin of times
 _CLASSES = math.ceil(math.log(100.0 / _SHORTEST) / _STEP)
-_COMPILING = "/jax/core/compile/"  # of JAX's own events
+_COMPILING = "/jax/core/compile/"  # prefix of JAX's events
 
 
 class Latencies:
-    """Times [s] in classes 1 % wide, from 1 us to 100 s."""
+    """Histogram of times [s], with bins 1 % wide from 1 us to 100 s."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_CLASSES, np.int64)
@@ -32,14 +32,14 @@ class Latencies:
         self.num, self.longest = self.num + 1, max(self.longest, seconds)
 
     @contextlib.contextmanager
-    def timed(self) -> Iterator[None]:
-        """Count the time of a block."""
+    def measure(self) -> Iterator[None]:
+        """Count the time of a `with` block."""
         start = time.perf_counter()
         yield
         self.add(time.perf_counter() - start)
 
     def quantile(self, share: float) -> float:
-        """Return the time [s] below which a share of the times lies, to 1 %; NaN without any."""
+        """Return a quantile of the times [s], to 1 %; NaN without times."""
         if not self.num:
             return math.nan
         index = int(np.searchsorted(np.cumsum(self._counts), share * self.num))
@@ -47,7 +47,7 @@ class Latencies:
 
 
 class Report:
-    """Counts by name, times by stage, memory, and programs that were compiled after the start."""
+    """Counts by name, times by stage, memory, and the number of compilations after the start."""
 
     STAGES = {
         "read": "packet read and checked",
@@ -65,17 +65,17 @@ class Report:
         self.counts: collections.Counter[str] = collections.Counter()
         self.faults: collections.Counter[Fault] = collections.Counter()
         self.stages = {name: Latencies() for name in self.STAGES}
-        self.tracking = 0.0  # [m], greatest distance of robot and course
+        self.tracking = 0.0  # [m], greatest distance between robot and course
         self.compiled = 0
         self._memory: int | None = None
 
     def begin(self) -> None:
-        """Start to count compiled programs, and note the memory."""
+        """Start to count compilations, and record the memory."""
         self._memory = resident_memory()
         jax.monitoring.register_event_duration_secs_listener(self._count_compiled)
 
     def end(self) -> None:
-        """Stop to count compiled programs."""
+        """Stop counting compilations."""
         jax.monitoring.unregister_event_duration_listener(self._count_compiled)
 
     def _count_compiled(self, event: str, duration_secs: float, **_: str | int) -> None:

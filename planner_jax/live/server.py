@@ -1,4 +1,4 @@
-"""The socket of a live loop: UDP on localhost, one process, one robot."""
+"""The UDP socket of a live loop on localhost, for one robot."""
 
 import contextlib
 import socket
@@ -13,8 +13,8 @@ from planner_jax.live.packets import LONGEST, SILENT, Fault, read_request
 from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
-_LISTENED = 0.25  # [s] without a packet, after which the server asks whether to stop
-# Option of a socket by which Linux reports when a packet came, [s] and [ns] of its clock.
+_LISTENED = 0.25  # [s] without a packet, after which the server checks whether to stop
+# Socket option SO_TIMESTAMPNS of Linux, and its format: arrival of a packet in [s] and [ns].
 _STAMPS, _STAMP = 35, struct.Struct("@ll")
 
 
@@ -22,8 +22,8 @@ class Server:
     """A socket whose packets a planner answers.
 
     Args:
-        planner: that answers.
-        port: 0 takes a free one.
+        planner: answers the packets.
+        port: 0 for a free one.
 
     Raises:
         OSError: the port is not available; `filename` names the port.
@@ -43,7 +43,7 @@ class Server:
         self.port: int = self._socket.getsockname()[1]
 
     def warm_up(self) -> None:
-        """Compile all programs, and drop the packets that came meanwhile."""
+        """Compile all programs, and drop packets that arrive meanwhile."""
         self.planner.warm_up()
         self._socket.setblocking(False)
         with contextlib.suppress(BlockingIOError):
@@ -51,16 +51,16 @@ class Server:
                 self._socket.recv(LONGEST)
         self._socket.settimeout(_LISTENED)
 
-    def run(self, goes_on: Callable[[], bool]) -> None:
-        """Answer while `goes_on()`, which is called after every packet, and where none come."""
-        while goes_on():
+    def run(self, is_running: Callable[[], bool]) -> None:
+        """Answer packets while `is_running()`, checked after every packet and every timeout."""
+        while is_running():
             with contextlib.suppress(TimeoutError):
                 self._answer(*self._receive())
 
     def _receive(self) -> tuple[bytes, tuple[str, int], float]:
-        """Return the next packet, its sender, and when it came, by `time.perf_counter()`.
+        """Return the next packet, its sender, and its arrival time by `time.perf_counter()`.
 
-        It may have come a while ago, during another answer.
+        The packet may have arrived earlier than this call, during another answer.
         """
         data, others, _, sender = self._socket.recvmsg(LONGEST, socket.CMSG_SPACE(_STAMP.size))
         now, received = time.time(), time.perf_counter()
@@ -83,7 +83,7 @@ class Server:
         self.planner.sent(data, received)
 
     def _warn(self, data: bytes, sender: tuple[str, int]) -> None:
-        """Print what is wrong with a packet that gets no answer, once for each fault."""
+        """Print the fault of a packet without an answer, once for each fault."""
         fault = read_request(data)
         assert isinstance(fault, Fault)
         if fault in self._reported:
@@ -103,8 +103,8 @@ class Server:
 
 
 def compute_in_place() -> None:
-    """Let a CPU compute in the calling thread; to be called before JAX's first use of it.
+    """Let JAX compute on the CPU in the calling thread; call this before any computation.
 
-    Passing a call to a thread of JAX takes as long as the smaller calls themselves.
+    Dispatching a small computation to another thread takes longer than the computation.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -1,4 +1,4 @@
-"""Settings of `planner-jax serve`, checked before anything is compiled; imports no JAX."""
+"""Settings of `planner-jax serve`, checked before JAX is imported."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -16,11 +16,7 @@ PORT = 5560
 
 @dataclasses.dataclass(frozen=True)
 class ServeSettings:
-    """Settings of all tasks.
-
-    Raises:
-        ArgumentError: a value breaks its rule.
-    """
+    """Settings of any task; an invalid value raises `ArgumentError`."""
 
     port: int = option(PORT, "N", "UDP port of this machine, 0 takes a free one")
     rate: float = option(100.0, "HZ", "of the setpoints in an answer")

@@ -1,4 +1,4 @@
-"""A Kalman filter of one ball, which rejects outliers and starts anew for another ball."""
+"""A Kalman filter of one ball, which rejects outliers and is reset for another ball."""
 
 import math
 from typing import Any
@@ -22,21 +22,21 @@ from planner_jax.live.packets import Fault
 from planner_jax.planning.programs import call_packed
 
 _SPREAD = 15.0  # [m/s], standard deviation of the velocity at the first observation
-_DENSITY = 0.01  # [m^2/s^3], of accelerations that the model of the flight omits
-_GATE = 5.0  # standard deviations, beyond which an observation is an outlier
-_OTHERS = 5  # outliers in a row are another ball
-_FORGOTTEN = 0.3  # [s] without an observation, after which the ball is another one
-_LEAST = 3  # observations, before which the velocity is unknown
+_DENSITY = 0.01  # [m^2/s^3], power density of accelerations that the flight model omits
+_GATE = 5.0  # standard deviations from the prediction, above which an observation is an outlier
+_OTHERS = 5  # consecutive outliers that count as another ball
+_FORGOTTEN = 0.3  # [s] without an observation, after which the next one is of another ball
+_LEAST = 3  # observations that a known velocity needs
 
 
 @struct.dataclass
 class Observation:
-    """Input of one step of the filter. Times count from the belief."""
+    """Input of one step of the filter."""
 
     belief: EkfState
-    since: Array  # () [s], of the observation
+    since: Array  # () [s], from the belief to the observation
     pos: Array  # (3,) [m]
-    ahead: Array  # () [s], from the observation to the time of the prediction
+    ahead: Array  # () [s], from the observation to the prediction
 
 
 @struct.dataclass
@@ -50,7 +50,7 @@ class Estimate:
 
 
 def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
-    """Update the belief by an observation, and predict the ball; pure."""
+    """Update the belief with an observation, and predict the ball; pure."""
     belief = ekf_predict(seen.belief, seen.since, model, flight=flight)
     away = seen.pos - belief.mean[:3]
     noise = jnp.diag(jnp.ones(3, away.dtype) * model.observation_std**2)
@@ -66,8 +66,8 @@ class Sight:
     """The estimate of one ball.
 
     Args:
-        flight: of the ball.
-        drag: as the flight takes it.
+        flight: function that predicts the ball.
+        drag: argument of `flight`.
         gravity: [m/s^2].
         noise: [m], standard deviation of an observed coordinate.
     """
@@ -87,13 +87,13 @@ class Sight:
         self._num = self._outliers = 0
 
     def is_known(self, spread: float) -> bool:
-        """Return whether the velocity is known to a standard deviation [m/s]."""
+        """Test whether the standard deviation of the velocity is at most `spread` [m/s]."""
         return self._num >= _LEAST and self.spread <= spread
 
     def see(
         self, number: int, pos: tuple[float, ...], measured: float, until: float
     ) -> tuple[BallState | None, Fault]:
-        """Use an observation; return the predicted ball, and the fault of the observation.
+        """Update the estimate; return the predicted ball, and the fault of the observation.
 
         Args:
             number: of the ball.

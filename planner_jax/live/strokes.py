@@ -1,7 +1,6 @@
-"""The tasks of a live loop: one hit, or one catch, of the observed ball.
+"""The tasks of a live loop: to hit or to catch the observed ball.
 
-Each plan is one compiled call. Of every search there is one round alone, since the next search
-starts where it ended.
+A plan is one compiled call of a single optimisation round: the next call continues from its result.
 """
 
 import abc
@@ -43,10 +42,10 @@ CATCH_DRAG = 0.5  # [1/s], of the suite `throws`
 TARGET = (3.0, 0.0, 0.0)  # [m], landing position of a hit ball
 _BISECTIONS = 24
 _LONGEST = 4.0  # [s], latest time of a catch
-# Share of the robot's limits that a plan may use. Behind a plan that uses them whole there is
-# often no recovery trajectory within the limits, so that the plan cannot be flown.
+# Share of the robot's limits that a plan may use. A plan that uses them fully often has no recovery
+# trajectory within the limits, and cannot be flown.
 _SHARE = 0.97
-# The step lengths of the re-planners.
+# Round of the re-planners.
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
@@ -56,7 +55,7 @@ PlanT = TypeVar("PlanT", HitPlan, CatchPlan)
 class Stroke(abc.ABC, Generic[CaseT, PlanT]):
     """A task of a live loop. Cases and plans have NumPy leaves."""
 
-    shortest: ClassVar[float]  # [s], least time to the contact at which is planned again
+    shortest: ClassVar[float]  # [s] before the contact, when re-planning ends
 
     def __init__(
         self,
@@ -71,7 +70,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners
-        self._solve_first, self._solve_again = solvers  # of a round, a planner and its case
+        self._solve_first, self._solve_again = solvers  # functions of round, planner and case
         self.pieces = self._planner.num_pieces  # of a plan's trajectory
 
     def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
@@ -80,7 +79,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
-        """Plan again some time [s] into a plan, from where the plan has the robot."""
+        """Plan again from the state of the robot in a plan, some time [s] after its start."""
         since: Any = np.float32(elapsed)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)
@@ -95,7 +94,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return position to jerk (4, 3) of a robot that flies its plan."""
+    """Return position to jerk (4, 3) of the previous plan at the elapsed time."""
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
@@ -141,10 +140,10 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return when the ball falls below the reach of an upright net (1,) [s]; 0 if it has."""
+    """Return the time (1,) [s] until the ball is too low for an upright net; 0 if it is."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
-    # Before its apex a ball may be below that height.
+    # The bisection starts at the apex, since a rising ball may be below that height.
     start = jnp.maximum(path.ball.vel[2], 0.0) / path.gravity
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -157,7 +156,7 @@ def _time_left(case: CatchCase) -> Array:
 
 
 def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchPlan:
-    """Plan a catch at the time at which the ball can first be caught."""
+    """Plan a catch at the earliest time at which the ball can be caught."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
     return solve_cases(planner, case.with_choice(choice), attempt)
@@ -176,7 +175,7 @@ def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Catc
 
 
 class CatchStroke(Stroke[CatchCase, CatchPlan]):
-    """One catch of the ball, which may be caught until it is too low for the net.
+    """One catch of the ball, before it is too low for the net.
 
     Args:
         robot: with a net.

@@ -1,4 +1,4 @@
-"""Recovery trajectories behind a plan that has been made already, of any robot."""
+"""Recovery trajectories for an existing plan of any robot."""
 
 import dataclasses
 
@@ -18,12 +18,12 @@ from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
-_ARM_AT_REST = 0.01  # [rad/s], fastest joint of an arm that stands
-_NODES = 40  # intervals of a piece, at which the exceeded limit is looked for
+_ARM_AT_REST = 0.01  # [rad/s], fastest joint of an arm at standstill
+_NODES = 40  # intervals of a piece, in the search for the exceeded limit
 
 
 def is_rested(found: Plan) -> bool:
-    """Return whether one plan ends at standstill, by itself or by its recovery trajectory."""
+    """Test whether a plan ends at standstill, by itself or by its recovery trajectory."""
     if isinstance(found, QuadrotorPlan):
         return found.recovery is not None
     if isinstance(found, ArmPlan):
@@ -36,8 +36,8 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
     """Return one plan that ends at standstill.
 
     Args:
-        case: of the plan, with its limits and obstacles; one case.
-        found: the plan of a quadrotor, a car or an arm, which stays as it is up to its end.
+        case: one case, whose limits and obstacles the recovery respects.
+        found: plan of a quadrotor, a car or an arm for this case; it is kept up to its end.
         to: "brake", or of a quadrotor "home"; see `with_recovery.add_recovery`.
 
     Returns:

@@ -1,7 +1,7 @@
-"""How cars and arms brake behind the end of a plan.
+"""Braking of cars and arms from the end of a plan to standstill.
 
-Of a few ways to brake that keep the limits of the robot by construction, the first one is taken
-that touches nothing, by the distances that planners compute, too.
+A few candidate motions keep the robot's limits by construction. The first one without a collision
+is selected, by the distance functions of the planners.
 """
 
 import dataclasses
@@ -24,30 +24,30 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 PlanT = TypeVar("PlanT", CarPlan, ArmPlan)
 
 _SPARE = 0.98  # share of each limit that is used
-_SAMPLES = 400  # at which distances are computed
-_GAP = 1e-3  # [m], kept from everything, as something may be nearer between two samples
-# Shares of a car's greatest deceleration; and of its greatest curvature, to the left, beside the
-# curvature at the meeting.
-_DECELERATIONS = (1.0, 0.7, 0.4)
+_SAMPLES = 400  # of the distances
+_GAP = 1e-3  # [m], least distance at a sample, since it may be smaller between samples
+_DECELERATIONS = (1.0, 0.7, 0.4)  # shares of a car's greatest deceleration
+# Shares of a car's greatest curvature, positive to the left. The plan's last curvature is another
+# candidate.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
-_USUAL = 1.0  # [m/s^2] and [1/m], where there is no limit
-_SLOWER = (1.5, 2.0, 3.0)  # times the shortest duration in which all joints stop at once
+_USUAL = 1.0  # [m/s^2] and [1/m], for a limit that is infinite
+_SLOWER = (1.5, 2.0, 3.0)  # multiples of the shortest duration in which all joints can stop
 
 
 def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
-    """Return a plan of a car that goes on until the car stands.
+    """Extend a plan of a car until the car is at standstill.
 
     Args:
         case: with limits, body, map and obstacles; one case.
         plan: of the case.
 
     Raises:
-        NoRecovery: every way to brake touches something.
+        NoRecovery: every candidate collides.
     """
     why = ""
     knots = (jnp.asarray(plan.speed), jnp.asarray(plan.curvature))
     begin = pose_at(jnp.asarray(plan.start), plan.time, *knots, plan.time)
-    for speed, curvature in _car_ways(case, plan):
+    for speed, curvature in _car_candidates(case, plan):
         time = float(plan.time) / (len(plan.speed) - 1) * (len(speed) - 1)
         problem = _car_problem(case, begin, float(plan.time), time, speed, curvature)
         if not problem:
@@ -62,8 +62,8 @@ def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
     raise NoRecovery(why)
 
 
-def _car_ways(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield speeds and curvatures (n + 1,) at the plan's last knot, and at knots behind it."""
+def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield speeds and curvatures (n + 1,) at the plan's last knot and at n further knots."""
     limits = case.limits
     step = float(plan.time) / (len(plan.speed) - 1)
     first, bend = float(plan.speed[-1]), float(plan.curvature[-1])
@@ -72,12 +72,12 @@ def _car_ways(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndar
         for limit in (limits.acceleration, limits.curvature)
     )
     targets = [bend, *(_SPARE * share * sharpest for share in _CURVATURES)]
-    # The steering angle turns fastest where the path is straight.
+    # d(delta)/d(kappa) = L / (1 + (L kappa)^2) is greatest for zero curvature.
     turn = _SPARE * float(limits.steering_rate) / float(case.body.wheelbase) * step
     for share in _DECELERATIONS:
         num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)
         speed = first * np.linspace(1.0, 0.0, num + 1)
-        # No tighter than the lateral acceleration allows at the speed before.
+        # The lateral acceleration bounds the curvature, at the speed of the preceding knot.
         before = np.maximum(speed[:-1] ** 2, 1e-9)
         most = np.maximum(_SPARE * float(limits.lateral_acceleration) / before, abs(bend))
         for target in targets:
@@ -91,15 +91,15 @@ def _car_ways(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, np.ndar
 def _car_problem(
     case: PyTree, begin: Array, since: float, time: float, speed: np.ndarray, curvature: np.ndarray
 ) -> str:
-    """Return what a car touches that brakes from a pose (3,) on; "" if it touches nothing.
+    """Describe the collision of a car that brakes from a pose (3,), or return "".
 
     Args:
-        case: as for `brake_car`.
-        begin: where the plan ends.
-        since: [s], the duration of the plan.
-        time: [s], that braking takes.
-        speed: at knots, as of `CarPlan`.
-        curvature: at the same knots.
+        case: see `brake_car`.
+        begin: (3,), pose at the end of the plan.
+        since: [s], duration of the plan.
+        time: [s], duration of braking.
+        speed: (n + 1,) [m/s], at knots.
+        curvature: (n + 1,) [1/m], at knots.
     """
     times = np.linspace(0.0, time, _SAMPLES)
     poses = np.asarray(_poses(begin, time, jnp.asarray(speed), jnp.asarray(curvature), times))
@@ -127,21 +127,23 @@ _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 
 
 def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
-    """Return a plan of an arm that goes on until the arm stands.
+    """Extend a plan of an arm until the arm is at standstill.
 
-    Its joints brake evenly, all at once or each alone.
+    Each joint has a constant deceleration. The joints stop together, or each as soon as it can.
 
     Args:
         case: a `BlockCase`, of one case.
         plan: of the case.
 
     Raises:
-        NoRecovery: with every way to brake a joint leaves its range, or the arm touches something.
+        NoRecovery: in every candidate a joint leaves its range, or the arm collides.
     """
     coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
     state = states_at(plan.motion, np.asarray(durations.sum()))
     why = ""
-    for pieces, times in _arm_ways(state[0], state[1], np.asarray(case.limits.acceleration, float)):
+    for pieces, times in _arm_candidates(
+        state[0], state[1], np.asarray(case.limits.acceleration, float)
+    ):
         problem = _arm_problem(case, pieces, times)
         if not problem:
             size = max(coeffs.shape[1], 3)
@@ -155,14 +157,14 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
     raise NoRecovery(why)
 
 
-def _arm_ways(
+def _arm_candidates(
     angles: np.ndarray, rates: np.ndarray, most: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield coefficients (M, 3, 6) and durations (M,) of motions to standstill.
 
     Args:
         angles: (6,) [rad], at the start of the motions.
-        rates: (6,) [rad/s], at the start.
+        rates: (6,) [rad/s], at the start of the motions.
         most: (6,) [rad/s^2], greatest accelerations.
     """
     alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
@@ -173,14 +175,14 @@ def _arm_ways(
         pieces = []
         for begin in begins:
             past = np.minimum(begin, ends)
-            share = 1.0 - past / ends  # of the first rate, that is left
+            share = 1.0 - past / ends  # of the initial rate
             reached = angles + 0.5 * rates * past * (1.0 + share)
             pieces.append([reached, rates * share, np.where(share > 0.0, -0.5 * rates / ends, 0.0)])
         yield np.array(pieces), times - begins
 
 
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
-    """Return what is wrong with a motion, coefficients (M, 3, 6) and durations (M,); or ""."""
+    """Describe the fault of a motion, coefficients (M, 3, 6) and durations (M,), or return ""."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
     angles = (first + tau * (second + tau * third)).reshape(-1, 6)
@@ -189,10 +191,12 @@ def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
     if beyond[joint] > 0.0:
         return f"position: joint {joint + 1} is {beyond[joint]:.3g} rad beyond its limit"
     gap = float(np.min(case.clearances(jnp.asarray(angles, jnp.float32))))
-    return "" if gap >= _GAP else f"clearance: the arm is {gap:.3g} m from what it must not touch"
+    return (
+        "" if gap >= _GAP else f"clearance: the arm is {gap:.3g} m from an obstacle or from itself"
+    )
 
 
 def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
-    """Return a plan of a class with the fields of a plan, some of them changed."""
+    """Return a plan of class `kind` with the fields of `plan`, some of them replaced."""
     values = {field.name: vars(plan)[field.name] for field in dataclasses.fields(kind)}
     return kind(**{**values, **fields})

@@ -1,4 +1,4 @@
-"""A recovery to plan: the state at the end of a plan, and where the quadrotor may rest."""
+"""Case and plan of a recovery: a quadrotor's trajectory from the end of a plan to standstill."""
 
 from typing import ClassVar
 
@@ -15,7 +15,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class RecoveryCase:
-    """One case. Every number is a leaf."""
+    """One recovery to plan, or a batch. Every number is a leaf."""
 
     rules: ClassVar[Table] = (
         Field("head_state", (4, 3)),
@@ -24,10 +24,10 @@ class RecoveryCase:
     )
 
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
-    home: Array  # (3,) [m], where it comes to rest if it returns
+    home: Array  # (3,) [m], position of standstill for a planner with `to="home"`
     gravity: Array  # () [m/s^2], magnitude
     limits: QuadrotorLimits
-    extras: tuple[Extra, ...] = ()  # limits and costs of the user's own, see `cost.extras`
+    extras: tuple[Extra, ...] = ()  # limits and costs of the user, see `cost.extras`
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -37,11 +37,11 @@ class RecoveryCase:
 
 @struct.dataclass
 class RecoveryPlan(QuadrotorPlan):
-    """One way to rest, or a batch of them with a leading axis on every leaf."""
+    """One recovery trajectory, or a batch with a leading axis on every leaf."""
 
 
 def end_state(path: PiecewisePolynomial) -> Array:
-    """Position to jerk (4, 3) where a trajectory ends; pieces that take no time do not count."""
+    """Return position to jerk (4, 3) at the end of the last piece with a positive duration."""
     last = jnp.max(jnp.where(path.durations > 0.0, jnp.arange(path.durations.size), 0))
     piece = PiecewisePolynomial(path.coeffs[last][None], path.durations[last][None])
     return jnp.stack([evaluate(piece, path.durations[last], order) for order in range(4)])

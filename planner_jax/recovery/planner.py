@@ -1,4 +1,4 @@
-"""Trajectories from any state to standstill, within all limits of a flight."""
+"""Planner of a quadrotor's trajectories from any state to standstill, within all limits."""
 
 import dataclasses
 
@@ -16,9 +16,9 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_ABOVE_GROUND = 0.2  # [m], of a guessed place of standstill
-# Starting points, best first: duration [s] beside the time for the distance at half the greatest
-# speed, and how far along the path of even braking the quadrotor comes to rest.
+_ABOVE_GROUND = 0.2  # [m] above the least height, lowest guess of the position of standstill
+# Starting points, best first: base duration [s], to which the time for the distance at half the
+# greatest speed is added, and the distance as a share of the distance of uniform braking.
 _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3), (4.0, 1.0)])
 
 
@@ -35,8 +35,8 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     """Minimum-snap trajectories to standstill, of free duration.
 
     Decision variables, n = 3 (M - 1) + 4, in units of `scale`: whitened waypoint offsets, log
-    duration, and the position of standstill; with `to` home that is the case's and its variables do
-    nothing.
+    duration, and the position of standstill. With `to="home"` the position is the case's `home`,
+    and its variables have no effect.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of the smoothed
     hinges of the limits, and of the case's extras.
@@ -49,8 +49,8 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     guess_table = _GUESSES
     decode_nodes = (40, 40)
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
-    to: str = "brake"  # wherever it may be, or "home"
-    # The plan before it may end right at its limits: then the margin has to give.
+    to: str = "brake"  # to standstill anywhere, or "home"
+    # The preceding plan may end at its limits, so later rounds reduce the margin.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),
@@ -71,21 +71,21 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         return RestContext(case)
 
     def guess_ends(self, context: RestContext, num: int) -> Array:
-        """Return a few durations and places of standstill, (num, 1, 4)."""
+        """Return guesses of log duration and position of standstill, (num, 1, 4)."""
         case = context.case
         pos, vel = case.head_state[0], case.head_state[1]
-        beside, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]
+        base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]
         low = jnp.minimum(case.limits.min_height + _ABOVE_GROUND, pos[2] + 1.0)
-        place = pos + 0.5 * share * beside * vel
-        place = place.at[:, 2].max(low)
+        end = pos + 0.5 * share * base * vel
+        end = end.at[:, 2].max(low)
         if self.to == "home":
-            place = jnp.broadcast_to(case.home, place.shape)
-        way = jnp.sqrt(jnp.sum((place - pos) ** 2, axis=1, keepdims=True))
-        duration = beside + way / (0.5 * case.limits.speed)
-        return jnp.concatenate([jnp.log(duration), place - pos], axis=1)[:, None]
+            end = jnp.broadcast_to(case.home, end.shape)
+        distance = jnp.sqrt(jnp.sum((end - pos) ** 2, axis=1, keepdims=True))
+        duration = base + distance / (0.5 * case.limits.speed)
+        return jnp.concatenate([jnp.log(duration), end - pos], axis=1)[:, None]
 
     def meet(self, natural: Array, context: RestContext) -> ChainEnds:
-        """Return the standstill that the variables (1, 4) describe; nothing can exceed there."""
+        """Return duration and final state for the variables (1, 4); no limit applies at the end."""
         case, duration = context.case, jnp.exp(natural[:, 0])
         at_rest = case.head_state[:1] + natural[:, 1:] if self.to == "brake" else case.home[None]
         return ChainEnds(

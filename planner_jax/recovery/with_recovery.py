@@ -1,4 +1,4 @@
-"""A planner whose plans go on to rest behind their last contact."""
+"""A planner that appends a recovery trajectory to each plan of a quadrotor."""
 
 import dataclasses
 from collections.abc import Callable
@@ -16,16 +16,16 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.recovery.planner import RecoveryPlanner
 
-# Where a plan ends so fast that nothing keeps the speed limit behind it, the plan is made again
-# for these shares of the limit.
+# Shares of the speed limit for which a plan is searched again if no recovery from its end exists.
 _SLOWER = (0.8, 0.65, 0.5)
 
 
 @struct.dataclass
 class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
-    """A composite planner: a quadrotor's planner, and one that goes on from its plans to rest.
+    """A planner of a quadrotor's task, followed by a planner of recovery trajectories.
 
-    A plan whose recovery breaks a limit is not solved. It is then made again with less speed.
+    A plan whose recovery exceeds a limit is searched again with a lower speed limit, and is not
+    solved if no recovery is found.
     """
 
     rest: RecoveryPlanner
@@ -33,30 +33,30 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Raise `TypeError`: a recovery follows from its plan, and minimises for itself."""
+        """Raise `TypeError`: plan and recovery are separate minimisations, without a gradient."""
         raise TypeError(
             "plans with a recovery have no gradient, as plan and recovery are minimised one after "
             "the other: leave `recovery` out"
         )
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """The plans of one case or of a batch, with their recoveries."""
+        """Return the plans of one case or of a batch, with their recoveries."""
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)
         if not drive.is_pure:
             cases = jax.tree.map(np.asarray, cases)
-        plans, left = self._ended(drive, cases, 1.0)
+        plans, left = self._plan_at(1.0, drive, cases)
         if not drive.is_pure:
             plans = jax.tree.map(np.array, plans)
         for factor in _SLOWER:
-            slower = lambda some, factor=factor: self._ended(drive, some, factor)[0]  # noqa: E731
+            slower = lambda some, factor=factor: self._plan_at(factor, drive, some)[0]  # noqa: E731
             plans = drive.plan_again(slower, cases, plans, left)
             left = left & ~is_solved(plans.status)
         return plans
 
-    def _ended(self, drive: Drive, cases: PyTree, factor: float) -> tuple[PyTree, PyTree]:
-        """Plans (B,) for a share of the speed limit, and which of them only lack a recovery."""
+    def _plan_at(self, factor: float, drive: Drive, cases: PyTree) -> tuple[PyTree, PyTree]:
+        """Plan with a share of the speed limit; return plans, and which only lack a recovery."""
         limits = cases.limits
         slower = dataclasses.replace(
             limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
@@ -66,7 +66,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         xp: ModuleType = jnp if drive.is_pure else np
         whole, rests = is_solved(plans.status), is_solved(recoveries.status)
         lacking = whole & ~rests
-        ended = dataclasses.replace(
+        plans = dataclasses.replace(
             plans,
             recovery=recoveries.trajectory,
             violation=xp.where(
@@ -75,11 +75,14 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
             iterations=plans.iterations + recoveries.iterations,
             status=xp.where(lacking, Status.INFEASIBLE, plans.status).astype(np.int32),
         )
-        return ended, lacking
+        return plans, lacking
 
 
 def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
-    """What is left to plan behind plans (B,) of a quadrotor's cases (B,): leaves of their kind."""
+    """Return the cases of the recoveries from the ends of plans (B,).
+
+    Leaves are NumPy arrays if the plans' leaves are.
+    """
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)
@@ -101,10 +104,10 @@ def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPla
     Args:
         planner: of plans with the trajectory of a quadrotor.
         recovery: "brake" for the cheapest trajectory to standstill anywhere; "home" for the
-            trajectory back to where the case begins.
+            trajectory back to the position at which the case starts.
 
     Raises:
-        ValueError: `recovery` is something else.
+        ValueError: `recovery` is neither.
     """
     require_one_of(RECOVERIES, "recovery", recovery)
     return RecoveringPlanner(planner, RecoveryPlanner(to=recovery))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
-from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, required_impact
+from planner_jax.ball.flight import BallState, drag_free_fall_time, fly, solve_impact
 from planner_jax.ball.prediction import target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.hit.decoupled import aim_at_angle, solve_decoupled_hit
@@ -210,7 +210,7 @@ class BatHit(OptimisedPlanner):
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
-        normal, _ = required_impact(ball.vel, after, case.restitution)
+        normal, _ = solve_impact(ball.vel, after, case.restitution)
         thrust = self.first_thrust_z * case.gravity / jnp.maximum(normal[2], 0.2) * normal
         speeds = jnp.asarray(self.first_racket_vel_yz, dtype)
         terminal = jnp.concatenate([jnp.log(time)[None], speeds, thrust[::2]])

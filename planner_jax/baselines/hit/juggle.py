@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from planner_jax.ball.flight import required_impact
+from planner_jax.ball.flight import solve_impact
 from planner_jax.ball.prediction import PathTable, target_at
 from planner_jax.baselines.hit.common import largest_violation, make_impact, motion_excess
 from planner_jax.baselines.parts.minimum_jerk import minimum_jerk_after_ramp
@@ -132,7 +132,7 @@ class JuggleHit(Planner):
         flight_time = rise / gravity + fall
         across = (case.target - ball.pos)[:2] / flight_time
         after = jnp.concatenate([across, rise[None]])
-        normal, normal_speed = required_impact(ball.vel, after, case.restitution)
+        normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
         upright = jnp.maximum(normal[2], _LEAST_UPRIGHT)
         fixed = jnp.asarray(self.racket_vel_xy, rise.dtype)
         vel_z = (normal_speed - jnp.sum(fixed * normal[:2])) / upright

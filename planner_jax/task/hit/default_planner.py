@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from planner_jax.ball.aim import aim_drag_free, aim_with_drag, apex_with_drag
-from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, required_impact
+from planner_jax.ball.flight import BallState, drag_free_apex, gravity_vector, solve_impact
 from planner_jax.ball.prediction import LEAST_NODES, target_at
 from planner_jax.core.choices import require_size
 from planner_jax.cost.quadrotor import Measure
@@ -290,7 +290,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         else:
             after = aim_drag_free(ball.pos, case.target, flight_time, case.gravity)
             apex = drag_free_apex(BallState(ball.pos, after), case.gravity)
-        normal, normal_speed = required_impact(ball.vel, after, case.restitution)
+        normal, normal_speed = solve_impact(ball.vel, after, case.restitution)
         across_x, across_y = tangent_basis(normal)
         tail_state = jnp.stack(
             [
