@@ -120,8 +120,8 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
     P = state.covariance
     residual = jnp.where(observed, observation, state.mean[:3]) - state.mean[:3]
     K = solve_definite(P[:3, :3] + R, P[:3]).T
-    rest = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
+    factor = jnp.eye(6, dtype=dtype) - jnp.pad(K, ((0, 0), (0, 3)))  # I - K H
     return EkfState(
         mean=state.mean + jnp.matmul(K, residual, precision=lax.Precision.HIGHEST),
-        covariance=jnp.where(observed, _congruence(rest, P) + _congruence(K, R), P),
+        covariance=jnp.where(observed, _congruence(factor, P) + _congruence(K, R), P),
     )

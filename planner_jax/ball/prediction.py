@@ -107,9 +107,9 @@ def _node_function(num_nodes: int) -> Callable:
             found[0] = found[0] + tangents[0]
         if further:
             for k, by in enumerate(slopes(further)(*primals)):
-                for place, slope in zip(further, by, strict=True):
-                    along = slope * tangents[place]
-                    of_vector = tangents[place].ndim > 0
+                for argument, slope in zip(further, by, strict=True):
+                    along = slope * tangents[argument]
+                    of_vector = tangents[argument].ndim > 0
                     found[k] = found[k] + (jnp.sum(along, axis=-1) if of_vector else along)
         return nodes, tuple(found)
 

@@ -63,11 +63,11 @@ def _directions(moving: tuple[int, ...]) -> list[_Direction]:
     still = (0.0, 0.0, 0.0)
     units = [tuple(float(j == k) for j in range(3)) for k in range(3)]
     directions = []
-    for result, place in enumerate(moving):
-        if place == _VEL:
+    for result, argument in enumerate(moving):
+        if argument == _VEL:
             directions += [_Direction(result, (k,), unit, still) for k, unit in enumerate(units)]
         else:
-            directions.append(_Direction(result, (), still, units[place - _VEL - 1]))
+            directions.append(_Direction(result, (), still, units[argument - _VEL - 1]))
     return directions
 
 
@@ -77,14 +77,14 @@ def _call(
 ) -> Callable:
     """Build the kernel for tables of `num_nodes` on `lanes` lanes."""
     directions = _directions(moving)
-    shapes = [(num_nodes, 3, 3) if place == _VEL else (num_nodes, 3) for place in moving]
+    shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
 
     def body(pos, vel, resolution, drag, gravity, *out):
         numbers = resolution[...], drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple in the place of a vector
+        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple instead of an array
             return tuple(zero + value for value in values)
 
         def advance(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:

@@ -121,7 +121,7 @@ def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: in
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
     """Return the least power of two of nodes whose table approximates the spline to `error`."""
     if any(isinstance(value, Tracer) for value in values):
-        raise ArgumentError("nodes", "given where positions are traced", shown="none")
+        raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)
     nodes, worst = 16, np.inf
     while nodes <= MOST_NODES:

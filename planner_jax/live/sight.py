@@ -110,8 +110,8 @@ class Sight:
             return None, Fault.NONE
         if measured <= self._time:
             return None, Fault.STALE
-        given = measured - self._time, pos, max(until - measured, 0.0)
-        numbers: Any = [np.asarray(x, np.float32) for x in given]
+        times_and_pos = measured - self._time, pos, max(until - measured, 0.0)
+        numbers: Any = [np.asarray(x, np.float32) for x in times_and_pos]
         seen = Observation(belief, *numbers)
         found: Estimate = call_packed(_filter, self._flight, self._model, seen)
         if found.is_outlier:

@@ -28,7 +28,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     solved if no recovery is found.
     """
 
-    rest: RecoveryPlanner
+    recovery_planner: RecoveryPlanner
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
@@ -62,10 +62,10 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
             limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
         )
         plans, _ = drive(self.planner, dataclasses.replace(cases, limits=slower))
-        recoveries, _ = drive(self.rest, recovery_cases(cases, plans))
+        recoveries, _ = drive(self.recovery_planner, recovery_cases(cases, plans))
         xp: ModuleType = jnp if drive.is_pure else np
-        whole, rests = is_solved(plans.status), is_solved(recoveries.status)
-        lacking = whole & ~rests
+        whole, recovers = is_solved(plans.status), is_solved(recoveries.status)
+        lacking = whole & ~recovers
         plans = dataclasses.replace(
             plans,
             recovery=recoveries.trajectory,

@@ -126,26 +126,26 @@ class _Pair:
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
     """Return rotations (3, 3, B, S) of links 1 to 6 and positions (3, B, S) [m] of their joints."""
-    turn, place = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
-    turns, places = [], []
+    turn, position = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
+    turns, positions = [], []
     for k in range(6):
         origin, quaternion, axis = (
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
-        place = place + rotate(turn, origin)
+        position = position + rotate(turn, origin)
         # The fixed rotation of the joint's frame, then Rodrigues' formula about the joint's axis.
         cos, sin = np.cos(angles[k]), np.sin(angles[k])
         own, along = _rotation(quaternion), axis[:, None] * axis[None]
         still = _product(own, along)
         turn = _product(turn, still + cos * (own - still) + sin * _product(own, _cross(axis)))
         turns.append(turn)
-        places.append(place)
-    return turns, places
+        positions.append(position)
+    return turns, positions
 
 
-def shield_middle(case: dict, turns: list, places: list) -> np.ndarray:
+def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
     """Return the middle (3, B, S) [m] of the shield's face, whose outward normal is link 6's x."""
-    return places[5] + rotate(turns[5], case["arm.shield_centre"].T[..., None])
+    return positions[5] + rotate(turns[5], case["arm.shield_centre"].T[..., None])
 
 
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
@@ -188,18 +188,18 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
 def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule], _Box]:
     """Return the arm's capsules and its shield at angles (6, B, S)."""
-    turns, places = links_of(case, angles)
+    turns, positions = links_of(case, angles)
     capsules = []
     for k, link in enumerate(links):
         first, second = case["arm.capsule_ends"][:, k].transpose(1, 2, 0)[..., None]
         if link != _BASE:
-            first, second = (places[link] + rotate(turns[link], end) for end in (first, second))
+            first, second = (positions[link] + rotate(turns[link], end) for end in (first, second))
         name = "the base" if link == _BASE else f"link {link + 1}"
         radius = case["arm.capsule_radius"][:, k, None]
         capsules.append(_Capsule(name, link, first, second, radius))
     wide = case["arm.shield_half"][:, None]
     half = np.stack([np.full_like(wide, 0.5 * THICKNESS), wide, wide])
-    middle = shield_middle(case, turns, places) - 0.5 * THICKNESS * turns[5][:, 0]
+    middle = shield_middle(case, turns, positions) - 0.5 * THICKNESS * turns[5][:, 0]
     return capsules, _Box("the shield", middle, turns[5], half)
 
 
@@ -217,8 +217,8 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
         if each.link == 3:
             bare = dataclasses.replace(unbent, radius=np.zeros((num_lanes, 1)))
             here = np.arange(num_lanes), np.zeros(num_lanes, int)
-            room = _distance(bare.at(*here), shield.at(*here))[:, None]
-            each = dataclasses.replace(each, radius=np.minimum(each.radius, room))
+            gap = _distance(bare.at(*here), shield.at(*here))[:, None]
+            each = dataclasses.replace(each, radius=np.minimum(each.radius, gap))
         if 1 <= each.link <= 3:
             beside.append(each)
     return beside
@@ -290,9 +290,9 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK
     compute((bounds <= upper) & np.isfinite(bounds) & ~first)
-    place = distances.argmin(axis=1)
-    which, sample = np.divmod(place, num_samples)
-    return distances[lanes, place], sample, np.array([pair.name for pair in pairs])[which]
+    index = distances.argmin(axis=1)
+    which, sample = np.divmod(index, num_samples)
+    return distances[lanes, index], sample, np.array([pair.name for pair in pairs])[which]
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:

@@ -35,8 +35,8 @@ _SENTENCES = {
     "position": "{failed_part} is {excess:.3g} rad beyond its limit at {time:.3f} s",
     "velocity": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
     "acceleration": "{failed_part} is {excess:.2%} above its limit at {time:.3f} s",
-    "rest": "{failed_part} turns at {excess:.3g} rad/s when the motion ends, at {time:.3f} s; an "
-    "arm that is to stand, or ends before the contact, must be at rest there",
+    "rest": "{failed_part} turns at {excess:.3g} rad/s when the motion ends, at {time:.3f} s; the "
+    "arm must be at standstill there if the case requires it or the contact is later",
     "floor": "{failed_part} is {excess:.3g} m below the floor at {time:.3f} s",
     "pole": "{failed_part} is {excess:.3g} m inside the pole at {time:.3f} s",
     "rig": "{failed_part} is {excess:.3g} m inside a beam of the rig at {time:.3f} s",
@@ -281,8 +281,8 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
         np.stack([derivative(motion.coeffs, times, order) for order in range(2)])
         for times in (np.zeros_like(motion.durations), motion.durations)
     )
-    given = np.stack([case["angles"].T, case["rates"].T])[..., None]
-    jumps = np.abs(begin - np.concatenate([given, end[..., :-1]], axis=3))
+    initial = np.stack([case["angles"].T, case["rates"].T])[..., None]
+    jumps = np.abs(begin - np.concatenate([initial, end[..., :-1]], axis=3))
     is_first = np.arange(jumps.shape[3]) == 0
     test("start", np.where(is_first, jumps, 0.0), motion.starts, relative)
     test("continuity", np.where(is_first, 0.0, jumps), motion.starts, relative)
@@ -366,10 +366,10 @@ def _sample(
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
     """Measure the ball relative to the shield at angles (6, B); test ball, tilt and tunnel."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
-    place = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
-    turns, places = links_of(case, angles[..., None])
-    turn, middle = turns[5][..., 0], shield_middle(case, turns, places)[..., 0]
-    height, *beside = rotate_back(turn, place - middle)
+    ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
+    turns, positions = links_of(case, angles[..., None])
+    turn, middle = turns[5][..., 0], shield_middle(case, turns, positions)[..., 0]
+    height, *beside = rotate_back(turn, ball - middle)
     toward, *across = rotate_back(turn, fall * time - case["ball.vel"].T)
     miss, tilt = np.hypot(*beside), np.arctan2(np.hypot(*across), toward)
     is_off = np.abs(height) > contact

@@ -44,15 +44,15 @@ _ORDER_OF_MOTION = (
 )
 _SENTENCES = {
     "not finite": "the plan or its case is not finite",
-    "order": "{excess:.0f} wrong, the first at {time:.3f} s; every target that is caught must have "
-    "one place, before the others",
+    "order": "{excess:.0f} wrong entries, the first at {time:.3f} s; caught targets must be named "
+    "once, before the others",
     "catch time": "off by {excess:.3g} s at {time:.3f} s; catches must be at rising positive "
     "times, where their pieces end, and not after the target's horizon",
     **{name: MOTION_SENTENCES[name] for name in _ORDER_OF_MOTION},
     "net": "the target is {excess:.2%} outside the hoop's radius at {time:.3f} s",
     "net plane": "the target is {excess:.3g} m off the hoop's plane at {time:.3f} s",
-    "angle": "{excess:.2%} above its limit between the net's axis and the target's way back at "
-    "{time:.3f} s",
+    "angle": "{excess:.2%} above its limit between the net's axis and minus the target's velocity "
+    "at {time:.3f} s",
 }
 LIMITS = tuple(_SENTENCES)
 
@@ -259,9 +259,9 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)
-    place = np.nan_to_num(inside / resolution)
-    first = np.clip(np.floor(place), 0, last - 1)
-    u = (place - first)[..., None]
+    position = np.nan_to_num(inside / resolution)
+    first = np.clip(np.floor(position), 0, last - 1)
+    u = (position - first)[..., None]
 
     def read(nodes: np.ndarray) -> np.ndarray:
         window = first.astype(np.int64)[..., None, None] + np.arange(4)[:, None]

@@ -106,19 +106,19 @@ def _separation(corners, normals, pose, half) -> np.ndarray:
         x, y = vectors[..., 0], vectors[..., 1]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=2)
 
-    place, out = rotate(corners - pose[:, None, :2]), rotate(normals)
-    height = (out * place).sum(axis=2)
+    points, out = rotate(corners - pose[:, None, :2]), rotate(normals)
+    height = (out * points).sum(axis=2)
     beyond = -height - (np.abs(out) * half[:, None]).sum(axis=2)
     beyond = np.where(out.any(axis=2), beyond, -np.inf).max(axis=1)
-    beside = np.maximum(place.min(axis=1), -place.max(axis=1)) - half
+    beside = np.maximum(points.min(axis=1), -points.max(axis=1)) - half
     gap = np.maximum(beyond, beside.max(axis=1))
     free = np.flatnonzero(gap > 0.0)
-    place, half = place[free], half[free]
-    nearest = (np.maximum(np.abs(place) - half[:, None], 0.0) ** 2).sum(axis=2).min(axis=1)
-    edge = np.roll(place, -1, axis=1) - place
+    points, half = points[free], half[free]
+    nearest = (np.maximum(np.abs(points) - half[:, None], 0.0) ** 2).sum(axis=2).min(axis=1)
+    edge = np.roll(points, -1, axis=1) - points
     square = np.maximum((edge**2).sum(axis=2), _SLACK**2)
     for signs in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)):
-        away = (half * signs)[:, None] - place
+        away = (half * signs)[:, None] - points
         share = np.clip((away * edge).sum(axis=2) / square, 0.0, 1.0)
         away = away - share[..., None] * edge
         nearest = np.minimum(nearest, (away**2).sum(axis=2).min(axis=1))

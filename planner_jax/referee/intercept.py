@@ -41,7 +41,7 @@ _SENTENCES = {
     "wall": "the body is {excess:.3g} m inside walls[{nearest_wall}] at {time:.3f} s",
     "mover": "the body is {excess:.3g} m inside movers[{nearest_mover}] at {time:.3f} s",
     "meeting": "the body's middle is {excess:.3g} m from the target at {time:.3f} s",
-    "heading": "the heading is {excess:.3g} rad off the one asked for at {time:.3f} s",
+    "heading": "the heading is {excess:.3g} rad off the required one at {time:.3f} s",
 }
 LIMITS = tuple(_SENTENCES)
 # May be infinite, besides the limits of the car.
@@ -188,23 +188,23 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
 
 def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
     """Return positions (B, 2) [m] of targets of the known classes at times (B,) [s]."""
-    given, batch = getattr(target, "__dict__", {}), times.shape
+    fields, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
-        value = check_leaf(f"target.{name}", given[name], batch + trailing)
+        value = check_leaf(f"target.{name}", fields[name], batch + trailing)
         return value.astype(np.float64)
 
-    if given.keys() >= {"path", "begin"}:
-        return target_positions_of(given["path"], leaf("begin") + times)
-    if "turn_rate" in given:
+    if fields.keys() >= {"path", "begin"}:
+        return target_positions_of(fields["path"], leaf("begin") + times)
+    if "turn_rate" in fields:
         # The chord of an arc is arc length x sinc(angle / 2), rotated by angle / 2.
         half = 0.5 * leaf("turn_rate") * times
         (x, y), chord = leaf("vel", 2).T, times * np.sinc(half / np.pi)
         cos, sin = np.cos(half), np.sin(half)
         direction = np.stack([cos * x - sin * y, sin * x + cos * y], axis=1)
         return leaf("pos", 2) + chord[:, None] * direction
-    if "coeffs" in given:
-        shape = np.shape(given["coeffs"])
+    if "coeffs" in fields:
+        shape = np.shape(fields["coeffs"])
         if len(shape) != 3:
             raise ValueError(f"target.coeffs must be ({len(times)}, n + 1, 2), got {shape}")
         powers = (times - leaf("origin"))[:, None] ** np.arange(shape[1])

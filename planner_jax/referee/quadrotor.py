@@ -36,8 +36,8 @@ class Pieces:
 
     def of(self, lanes: slice) -> "Pieces":
         """Return the pieces of some lanes."""
-        rest = (part[lanes] for part in (self.durations, self.starts, self.flown))
-        return Pieces(self.coeffs[:, lanes], *rest)
+        others = (part[lanes] for part in (self.durations, self.starts, self.flown))
+        return Pieces(self.coeffs[:, lanes], *others)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:

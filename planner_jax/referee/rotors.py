@@ -45,8 +45,8 @@ def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray,
     found = []
     for rows, sign in ((thrusts.min(axis=-1), 1.0), (thrusts.max(axis=-1), -1.0)):
         signed = np.where(np.isnan(rows), -np.inf, sign * rows).reshape(len(rows), -1)
-        place = signed.argmin(axis=1)
-        found += [sign * signed[lanes, place], at[lanes, place]]
+        index = signed.argmin(axis=1)
+        found += [sign * signed[lanes, index], at[lanes, index]]
     return tuple(found)
 
 

@@ -33,10 +33,10 @@ def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return distances (...) [m] of points from segments, whose length may be zero."""
-    way, away = second - first, point - first
-    square = dot(way, way)
-    share = np.clip(_ratio(dot(away, way), square), 0.0, 1.0)
-    return length(away - share * way)
+    span, away = second - first, point - first
+    square = dot(span, span)
+    share = np.clip(_ratio(dot(away, span), square), 0.0, 1.0)
+    return length(away - share * span)
 
 
 def between_segments(
@@ -47,13 +47,13 @@ def between_segments(
     The parameters of the nearest points of both lines are clipped to [0, 1] one after the other
     (Ericson, Real-Time Collision Detection, Section 5.1.9).
     """
-    way, other, away = second - first, fourth - third, first - third
-    a, b, c = dot(way, way), dot(way, other), dot(other, other)
-    d, e = dot(way, away), dot(other, away)
+    span, other, away = second - first, fourth - third, first - third
+    a, b, c = dot(span, span), dot(span, other), dot(other, other)
+    d, e = dot(span, away), dot(other, away)
     share = np.clip(_ratio(b * e - c * d, a * c - b * b), 0.0, 1.0)
     along = np.clip(_ratio(b * share + e, c), 0.0, 1.0)
     share = np.clip(_ratio(b * along - d, a), 0.0, 1.0)
-    return length(away + share * way - along * other)
+    return length(away + share * span - along * other)
 
 
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
@@ -64,18 +64,18 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
     last break with a negative slope and the first with a positive one. Ends and half edges are
     (3, ...).
     """
-    way = second - first
+    span = second - first
 
     def beyond(share: np.ndarray) -> list:
         """Return the vector from the box to the point of the segment at `share`."""
-        places = (first[k] + share * way[k] for k in range(3))
-        return [place - np.clip(place, -half[k], half[k]) for k, place in enumerate(places)]
+        point = [first[k] + share * span[k] for k in range(3)]
+        return [x - np.clip(x, -half[k], half[k]) for k, x in enumerate(point)]
 
-    low, high = np.zeros(way.shape[1:]), np.ones(way.shape[1:])
-    crossings = [(sign * half[k] - first[k], way[k]) for k in range(3) for sign in (-1.0, 1.0)]
+    low, high = np.zeros(span.shape[1:]), np.ones(span.shape[1:])
+    crossings = [(sign * half[k] - first[k], span[k]) for k in range(3) for sign in (-1.0, 1.0)]
     below, above = np.zeros_like(low), np.zeros_like(low)
     for share in (low, high, *(np.clip(_ratio(*crossing), 0.0, 1.0) for crossing in crossings)):
-        slope = dot(beyond(share), way)
+        slope = dot(beyond(share), span)
         later, earlier = (slope <= 0.0) & (share >= low), (slope >= 0.0) & (share <= high)
         low, below = np.where(later, share, low), np.where(later, slope, below)
         high, above = np.where(earlier, share, high), np.where(earlier, slope, above)
@@ -124,8 +124,8 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
         for k, first, second in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0))
     ]
-    starts, ways = np.stack(starts, axis=1), np.repeat(2.0 * edges, 4, axis=1)  # (3, 12, P)
-    return segment_to_box(starts, starts + ways, other[:, None]).min(axis=0)
+    starts, spans = np.stack(starts, axis=1), np.repeat(2.0 * edges, 4, axis=1)  # (3, 12, P)
+    return segment_to_box(starts, starts + spans, other[:, None]).min(axis=0)
 
 
 def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
