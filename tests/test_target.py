@@ -1,15 +1,23 @@
-"""Paths of targets in space: positions, velocities and derivatives."""
+"""Paths of targets in space: balls, swings, tables of positions, and classes of the user."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from derivatives import assert_gradient_matches_differences
+from flax import struct
+from jax import Array
 from scipy.integrate import solve_ivp
+from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath, HarmonicPath
+from planner_jax.optimise.planner import pending
+from planner_jax.task.catch.plan import CatchPlan
+from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
+HORIZON = 2.0
 GRAVITY = 9.81
 POS, VEL = np.array([3.0, -0.2, 2.5]), np.array([-2.5, 0.3, 4.0])
 TIMES = np.array([0.0, 0.02, 0.3, 0.9, 1.6])
@@ -21,21 +29,12 @@ def ball_path(drag):
 
 
 def harmonic_path():
-    swing = jnp.array([0.0, 0.3, 0.8])
-    return HarmonicPath(
-        jnp.asarray(POS), jnp.asarray(VEL), swing, jnp.asarray(2.1), jnp.asarray(0.7)
-    )
+    return HarmonicPath(*map(jnp.asarray, (POS, VEL, [0.0, 0.3, 0.8], 2.1, 0.7)))
 
 
 @jax.jit
 def states(path, times):
     return jax.vmap(path.at)(times)
-
-
-@jax.jit
-def derivative(path, time):
-    """Return the derivative of the position by time."""
-    return jax.jvp(lambda t: path.at(t).pos, (time,), (jnp.ones_like(time),))[1]
 
 
 def test_a_ball_obeys_its_equation_of_motion(float64):
@@ -77,11 +76,8 @@ PATHS = {
 @pytest.mark.parametrize("name", PATHS)
 def test_the_velocity_is_the_derivative_of_the_position(float64, name):
     path = PATHS[name]()
-    found = states(path, TIMES)
-    ahead, behind = states(path, TIMES + 1e-5), states(path, TIMES - 1e-5)
-    np.testing.assert_allclose(found.vel, (ahead.pos - behind.pos) / 2e-5, rtol=1e-6, atol=1e-8)
-    for vel, time in zip(found.vel, TIMES, strict=True):
-        np.testing.assert_allclose(derivative(path, time), vel, rtol=1e-12, atol=1e-12)
+    by_time = jax.jit(jax.vmap(jax.jacfwd(lambda time: path.at(time).pos)))(TIMES)
+    np.testing.assert_allclose(by_time, states(path, TIMES).vel, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["no drag", "harmonic"])
@@ -96,3 +92,139 @@ def test_a_case_can_be_made_inside_a_compiled_function():
     path = BallPath(ball, drag=jnp.zeros((1, 3)), gravity=jnp.full(1, 9.81))
     scale = jax.jit(lambda speed: pj.catch.case(path, np.ones(1), speed=3.0).limits.speed * speed)
     assert scale(2.0) == 6.0
+
+
+# Tables of positions, and classes of the user
+
+
+def swing(times, order=0):
+    """Return positions (K, 3) of a smooth target, or their derivatives."""
+    phase = np.array([0.0, 0.7, 1.9]) + 0.5 * order * np.pi
+    return 1.3**order * np.sin(1.3 * np.asarray(times)[:, None] + phase)
+
+
+def uneven(num):
+    """Return times from before 0 to the horizon, every second step half as long."""
+    steps = np.where(np.arange(num - 1) % 2, 1.0, 2.0)
+    return np.append(0.0, np.cumsum(steps)) / steps.sum() * (HORIZON + 0.1) - 0.1
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["positions", "with velocities"])
+def test_the_table_equals_the_spline_within_its_error(given, float64):
+    times, at = uneven(17), np.linspace(0.0, HORIZON, 301)
+    values = [swing(times)] + [swing(times, 1)] * given
+    spline = CubicHermiteSpline(times, *values) if given else CubicSpline(times, *values)
+    for error in (1e-3, 1e-5):
+        table = pj.table_path(times, *values, error=error, dtype=jnp.float64)
+        found = states(table, at)
+        assert np.abs(found.pos - spline(at)).max() <= error
+        assert np.abs(found.vel - spline(at, 1)).max() <= 10.0 * error
+
+
+def test_errors_are_of_fourth_and_third_order(float64):
+    at = np.linspace(0.0, HORIZON, 301)
+    errors = []
+    for num in (9, 17, 33):
+        found = states(pj.table_path(uneven(num), swing(uneven(num)), nodes=4000, dtype=float), at)
+        errors.append([np.abs(found.pos - swing(at)).max(), np.abs(found.vel - swing(at, 1)).max()])
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert (orders[:, 0] > 3.5).all() and (orders[:, 1] > 2.5).all(), orders
+
+
+def test_leading_axes_become_axes_of_the_leaves_and_of_a_case():
+    times = np.linspace(0.0, HORIZON, 12)
+    positions = swing(times) + np.arange(6.0).reshape(2, 3, 1, 1) + [0.0, 0.0, 3.0]
+    table = pj.table_path(times, positions)
+    assert table.pos.shape[:2] == table.resolution.shape == (2, 3)
+    cases = pj.catch.case(table, np.full((2, 3), HORIZON))
+    assert cases.batch_shape == (2,) and cases.num_targets == 3
+
+
+def test_the_path_can_be_differentiated_by_its_positions(float64):
+    times = uneven(8)
+
+    def value(positions):
+        table = pj.table_path(times, positions, nodes=24, dtype=jnp.float64)
+        state = table.at(jnp.asarray(0.77))
+        return jnp.sum(jnp.sin(state.pos) + jnp.cos(state.vel))
+
+    assert_gradient_matches_differences(value, swing(times), step=1e-6, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (dict(times=[0.0, 0.5, 0.5, 1.0]), "times must be finite and rise, got a step of 0 s"),
+        (dict(times=[0.1, 0.5, 0.7, 1.0]), "times must begin at 0, .* got 0.1 to 1 s"),
+        (dict(times=np.zeros((2, 4))), r"times must have the shape \(K,\) .* got \(2, 4\)"),
+        (dict(positions=np.zeros((3, 3))), r"positions must have .* 4, 3\), got \(3, 3\)"),
+        (dict(positions=np.full((4, 3), np.nan)), "positions must be finite, got nan"),
+        (dict(velocities=np.zeros((2, 4, 3))), r"velocities must have .* got \(2, 4, 3\)"),
+        (dict(nodes=4), "nodes must be >= 5, got 4"),
+        (dict(error=0.0), "error must be finite and > 0, got 0"),
+        (dict(positions=1e9 * np.eye(4)[:, :3]), "error must be >= .* got 0.001"),
+    ],
+)
+def test_a_malformed_table_is_rejected_in_one_line(change, message):
+    table = dict(times=[0.0, 0.2, 0.6, 1.0], positions=np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=f"^{message}"):
+        pj.table_path(**table | change)
+
+
+@struct.dataclass
+class Falling:
+    """A parabola whose class returns positions only."""
+
+    start: BallState
+    gravity: Array  # () [m/s^2]
+
+    def at(self, time):
+        fall = jnp.array([0.0, 0.0, -0.5]) * self.gravity * time**2
+        return self.start.pos + self.start.vel * time + fall
+
+
+@struct.dataclass
+class Lying(Falling):
+    """The same path with a wrong velocity."""
+
+    def at(self, time):
+        return BallState(super().at(time), jnp.zeros(3))
+
+
+@pytest.mark.parametrize("own", [Falling, Lying])
+def test_the_referee_uses_only_the_positions_of_a_class_of_the_user(own):
+    """Catches of a random motion are measured as for the library's own class."""
+    rng = np.random.default_rng(3)
+    start = BallState(rng.normal(size=(2, 2, 3)), rng.normal(size=(2, 2, 3)))
+    gravity = np.full((2, 2), 9.81)
+    known = pj.BallPath(start, np.zeros((2, 2, 3)), gravity)
+    cases = jax.tree.map(np.asarray, pj.catch.case(known, np.full((2, 2), 1.5)))
+    zero = np.zeros(2, np.float32)
+    plans = CatchPlan(
+        trajectory=PiecewisePolynomial(rng.normal(size=(2, 4, 8, 3)), np.full((2, 4), 0.3)),
+        gravity=cases.gravity,
+        order=np.array([[0, 1], [1, 0]]),
+        decided_times=np.zeros((2, 2)),
+        times=np.array([[0.6, 1.2]] * 2),
+        **pending(zero) | {"status": zero.astype(int), "iterations": zero.astype(int)},
+    )
+    exact = pj.catch.judge(cases.replace(targets=known), plans)
+    found = pj.catch.judge(cases.replace(targets=own(start, gravity)), plans)
+    np.testing.assert_allclose(found.net_distance, exact.net_distance, rtol=1e-9)
+    np.testing.assert_allclose(found.angle, exact.angle, atol=1e-7)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["table", "own"])
+def test_targets_of_the_user_are_caught_and_judged(kind):
+    start = BallState(np.float32([[1.5, 0.3, 2.5]]), np.float32([[-1.2, 0.1, 2.0]]))
+    own = Falling(start, np.full(1, 9.81, np.float32))
+    times = np.linspace(-0.1, 1.2, 40)[:, None]
+    thrown = start.pos + start.vel * times + np.array([0.0, 0.0, -4.905]) * times**2
+    targets = own if kind == "own" else pj.table_path(times[:, 0], thrown[None])
+    case = pj.catch.case(targets, np.ones(1))
+    found = pj.plan(pj.catch.planner("exact"), case)
+    verdict = pj.catch.judge(case, found)
+    assert verdict.success, verdict.sentence()
+    truth = pj.catch.judge(case.replace(targets=own), found)
+    np.testing.assert_allclose(truth.net_distance, verdict.net_distance, atol=1e-3)
