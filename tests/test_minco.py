@@ -22,7 +22,7 @@ from planner_jax.trajectory.proportional_minco import (
 NODES = 5  # sampling intervals of each piece
 PIECE_DURATION = np.array(0.45)  # mean
 
-float64 = pytest.mark.usefixtures("float64")
+pytestmark = pytest.mark.usefixtures("float64")
 every_order = pytest.mark.parametrize("order", (2, 3, 4))
 every_size = pytest.mark.parametrize(
     ("order", "pieces"), [(4, 1), (4, 2), (4, 5), (4, 8), (2, 1), (2, 3), (3, 1), (3, 3)]
@@ -156,7 +156,6 @@ def energy(coeffs, durations):
 # The trajectory
 
 
-@float64
 @every_size
 def test_the_trajectory_solves_the_dense_quadratic_program_and_its_pieces_join(order, pieces):
     """Pieces join up to the derivative 2s - 2; the program demands only derivatives below s.
@@ -179,7 +178,6 @@ def test_the_trajectory_solves_the_dense_quadratic_program_and_its_pieces_join(o
             np.testing.assert_allclose(end[:-1], waypoints, atol=1e-11)
 
 
-@float64
 @every_order
 def test_a_polynomial_of_degree_s_minus_1_costs_nothing_and_is_reproduced(order):
     durations = draw_problem(order, 3)[-1]
@@ -192,7 +190,6 @@ def test_a_polynomial_of_degree_s_minus_1_costs_nothing_and_is_reproduced(order)
     np.testing.assert_allclose(trajectory.coeffs[:, order:], 0.0, atol=1e-8)
 
 
-@float64
 @every_order
 def test_stretched_time_divides_the_derivatives_by_its_powers(order):
     head, tail, waypoints, durations = draw_problem(order, 3)
@@ -203,7 +200,7 @@ def test_stretched_time_divides_the_derivatives_by_its_powers(order):
     np.testing.assert_allclose(slow.coeffs, expected, atol=1e-11 * np.abs(expected).max())
 
 
-def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre(float64):
+def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
     """Six pieces of 0.3 s to 1.2 s, waypoints a metre apart."""
     single = interpolate(*draw_problem(4, 6, dtype=np.float32))
     assert single.coeffs.dtype == np.float32
@@ -225,7 +222,6 @@ def weigh_energy_and_coefficients(maps, point):
     return snap_energy(trajectory, maps.order) + weights @ trajectory.coeffs.ravel()
 
 
-@float64
 @pytest.mark.parametrize(("order", "pieces"), [(2, 2), (4, 1), (4, 4)])
 def test_the_gradient_in_boundary_offsets_and_duration_matches_finite_differences(order, pieces):
     point = *draw_rows(order, pieces), PIECE_DURATION, 1.0
@@ -233,7 +229,6 @@ def test_the_gradient_in_boundary_offsets_and_duration_matches_finite_difference
     assert_gradient_matches_differences(function, point, rtol=1e-6)
 
 
-@float64
 def test_the_energy_gradient_in_a_waypoint_is_twice_the_jump_of_the_derivative_2s_minus_1():
     """Integrate by parts; the other derivatives at the joint are optimal and do not contribute."""
     maps, (rows, offsets) = maps_of(4, 4), draw_rows(4, 4)
@@ -244,14 +239,12 @@ def test_the_energy_gradient_in_a_waypoint_is_twice_the_jump_of_the_derivative_2
     np.testing.assert_allclose(gradient, 2.0 * (start[1:] - end[:-1]), rtol=1e-8)
 
 
-@float64
 def test_boundary_rows_are_derivatives_in_the_mean_time_of_a_piece():
     head, tail, _, _ = draw_problem(4, 1)
     rows = jax.jit(boundary_rows)(head, tail, PIECE_DURATION)
     np.testing.assert_allclose(rows, rows_of(head, tail), rtol=1e-14)
 
 
-@float64
 @pytest.mark.parametrize(("order", "pieces"), [(4, 1), (4, 2), (4, 5), (3, 3), (2, 3)])
 def test_the_energy_formula_is_the_energy_of_the_trajectory(order, pieces):
     trajectory, _, formula = solve_drawn(order, pieces)
@@ -270,7 +263,6 @@ def test_the_least_energy_is_the_same_in_a_frame_in_uniform_motion_far_away(orde
     np.testing.assert_allclose(far_away, at_rest, rtol=1e-9)
 
 
-@float64
 @every_order
 def test_zero_offsets_have_the_least_energy_over_all_waypoints(order):
     """The trajectory is then the one polynomial of degree 2s - 1 between the ends."""
@@ -336,7 +328,6 @@ def test_a_unit_of_offsets_moves_the_waypoints_by_at_most_a_unit(pieces):
     assert np.linalg.norm(moves, 2) == pytest.approx(1.0, rel=1e-9)
 
 
-@float64
 @pytest.mark.parametrize(("order", "pieces"), [(3, 3), (4, 1)])
 def test_samples_are_the_values_of_the_trajectory(order, pieces):
     trajectory, motion, _ = solve_drawn(order, pieces)
@@ -355,7 +346,6 @@ def test_samples_are_the_values_of_the_trajectory(order, pieces):
         np.testing.assert_allclose(samples, values, atol=1e-10 * np.abs(values).max())
 
 
-@float64
 def test_a_batch_of_trajectories_equals_a_loop():
     rows, offsets = draw_rows(4, 5)
     many = [(rows, offsets, 0.45), (3.0 * rows, -offsets, 0.2), (rows[::-1], 0.0 * offsets, 1.0)]
@@ -368,7 +358,7 @@ def test_a_batch_of_trajectories_equals_a_loop():
             np.testing.assert_allclose(many_leaf[k], leaf, atol=1e-12 * np.abs(leaf).max())
 
 
-def test_samples_and_energy_in_float32_are_right_to_a_millionth(float64):
+def test_samples_and_energy_in_float32_are_right_to_a_millionth():
     """Relative to the largest value of each kind."""
     single, double = (solve_drawn(4, 5, dtype) for dtype in (np.float32, np.float64))
     for leaf, exact in zip(*(jax.tree.leaves(x[1:]) for x in (single, double)), strict=True):
