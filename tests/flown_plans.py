@@ -1,4 +1,4 @@
-"""Plans that nobody has to make, one of each robot, and files of plans as they are read."""
+"""Synthetic plans of each robot, which need no planner, and readers of exported files."""
 
 import io
 
@@ -21,7 +21,7 @@ SOLVED = {
 
 
 def pieces(num, powers, axes, seed=0, duration=0.2):
-    """A smooth curve in so many pieces, which do not join."""
+    """Return `num` smooth pieces, which do not join."""
     draw = np.random.default_rng(seed)
     coeffs = 6.0 * draw.normal(size=(num, powers, axes)) / 2.0 ** np.arange(powers)[:, None]
     durations = np.full(num, duration) + 0.01 * np.arange(num)
@@ -52,25 +52,25 @@ def arm():
 PLANS = {"quadrotor": quadrotor(), "car": car(), "arm": arm()}
 
 
-def as_it_is(plan, **how):
-    """A plan in a file without a way to rest: that of plans which nobody made keeps no limits."""
-    return pj.export(plan, recovery=None, **how)
+def export_plan(plan, **options):
+    """Export a plan without a recovery trajectory: a synthetic plan has no case with limits."""
+    return pj.export(plan, recovery=None, **options)
 
 
 def table(path):
-    """Header, and rows in float64, of a file of comma-separated values."""
+    """Return the header, and the rows in float64, of a file of comma-separated values."""
     header, *rows = path.read_text().splitlines()
     return header.split(","), np.array([row.split(",") for row in rows], float)
 
 
 def bag(path):
-    """Profile of an MCAP file, and schema, channel, record and message of each message."""
+    """Return the profile of an MCAP file, and schema, channel, record and message of each."""
     reader = make_reader(io.BytesIO(path.read_bytes()), decoder_factories=[DecoderFactory()])
     return reader.get_header().profile, list(reader.iter_decoded_messages())
 
 
 def matrices(quat_wxyz):
-    """Body to world (K, 3, 3) of unit quaternions (K, 4), by the book."""
+    """Return the rotations (K, 3, 3), body to world, of unit quaternions (K, 4)."""
     w, x, y, z = np.asarray(quat_wxyz, float).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],

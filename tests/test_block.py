@@ -20,7 +20,7 @@ from planner_jax.sweep.block.settings import REGIMES as SWEPT
 from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search, rank_poses
 from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at, polynomial, profiles, sums
+from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_weights
 from planner_jax.task.block.scene import entry_time, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
 
@@ -76,7 +76,7 @@ def test_steps_add_up_to_the_integral_of_rates():
     fine = np.linspace(0.0, 1.0, 70001)
     values = np.interp(fine, np.linspace(0.0, 1.0, 8), rates)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1])) / 70000])
-    first, steps = sums(7, shares)
+    first, steps = step_weights(7, shares)
     found = first * rates[0] + steps @ rates[1:]
     np.testing.assert_allclose(found, np.interp(shares, fine, integral), atol=1e-8)
 
@@ -101,7 +101,7 @@ def test_polynomials_are_the_same_motion(float64):
 @pytest.mark.parametrize("ends_at_rest", [True, False])
 def test_profiles_turn_by_one(ends_at_rest):
     shapes = profiles(10, ends_at_rest)
-    assert shapes @ sums(10, (1.0,))[1][0] == pytest.approx(np.ones(len(shapes)))
+    assert shapes @ step_weights(10, (1.0,))[1][0] == pytest.approx(np.ones(len(shapes)))
     assert np.all((shapes[:, -1] == 0.0) == ends_at_rest)
 
 
@@ -160,13 +160,13 @@ def test_end_poses_meet_the_ball(float64):
     case = throw(dtype=jnp.float64)
 
     @jax.jit
-    def found(case):
+    def solve(case):
         flight = flight_of(case)
         poses = end_poses(case, flight, 10, 6)
         of_pose = jax.vmap(lambda q, t: contact_terms(case, flight, q, t, SMALL.weights)[2])
         return poses, of_pose(poses.angles, poses.time)
 
-    poses, excess = found(case)
+    poses, excess = solve(case)
     there = np.isfinite(poses.effort)
     assert there.sum() > 10 and (excess[there] < 0.0).all()
     np.testing.assert_allclose(poses.angles[:, 5], case.angles[5])

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 from cflib.crazyflie.mem.trajectory_memory import Poly4D
-from flown_plans import PLANS, arm, as_it_is, bag, car, matrices, quadrotor, table
+from flown_plans import PLANS, arm, bag, car, export_plan, matrices, quadrotor, table
 
 import planner_jax as pj
 from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName, install_line
@@ -27,7 +27,7 @@ def xyz(vector):
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_table_has_units_every_number_bit_for_bit_and_100_rows_a_second(tmp_path, robot):
     plan = PLANS[robot]
-    header, rows = table(as_it_is(plan, to="csv", out=tmp_path / "a.csv", rate=RATE))
+    header, rows = table(export_plan(plan, to="csv", out=tmp_path / "a.csv", rate=RATE))
     found = setpoints_of(plan, RATE)
     blocks = [np.asarray(leaf).reshape(len(rows), -1) for leaf in vars(found).values()]
     np.testing.assert_array_equal(rows[:, 0], found.time)
@@ -36,13 +36,13 @@ def test_a_table_has_units_every_number_bit_for_bit_and_100_rows_a_second(tmp_pa
     assert header[0] == "time [s]"
     last = {"quadrotor": "thrust [m/s^2]", "car": "yaw_rate [rad/s]", "arm": "ddq6 [rad/s^2]"}
     assert header[-1] == last[robot]
-    _, rows = table(as_it_is(plan, to="csv", out=tmp_path / "b.csv"))
+    _, rows = table(export_plan(plan, to="csv", out=tmp_path / "b.csv"))
     np.testing.assert_allclose(np.diff(rows[:, 0]), 0.01)
 
 
 @pytest.mark.parametrize("robot", PLANS)
 def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
-    path = as_it_is(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    path = export_plan(PLANS[robot], to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     profile, [(schema, channel, record, message)] = bag(path)
     kind = "JointTrajectory" if robot == "arm" else "MultiDOFJointTrajectory"
     assert (profile, schema.encoding, channel.message_encoding) == ("ros2", "ros2msg", "cdr")
@@ -55,7 +55,7 @@ def test_a_bag_holds_one_trajectory_as_rosbag2_has_them(tmp_path, robot):
 
 def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_path):
     plan = quadrotor()
-    path = as_it_is(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    path = export_plan(plan, to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     points, found = bag(path)[1][0][3].points, setpoints_of(plan, RATE)
     turns = [p.transforms[0].rotation for p in points]
     for name, read, expected in [
@@ -71,7 +71,7 @@ def test_a_quadrotor_in_a_bag_is_as_it_is_sampled_and_turns_in_the_world(tmp_pat
 
 
 def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
-    path = as_it_is(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
+    path = export_plan(car(), to="ros2", out=tmp_path / "a.mcap", rate=1000.0)
     points, found = bag(path)[1][0][3].points, setpoints_of(car(), 1000.0)
     places = np.array([xyz(p.transforms[0].translation) for p in points])
     velocity = np.array([xyz(p.velocities[0].linear) for p in points])
@@ -90,7 +90,7 @@ def test_a_car_in_a_bag_moves_in_the_plane_along_its_heading(tmp_path):
 
 
 def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
-    path = as_it_is(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
+    path = export_plan(arm(), to="ros2", out=tmp_path / "a.mcap", rate=RATE)
     message, found = bag(path)[1][0][3], setpoints_of(arm(), RATE)
     assert message.joint_names == [f"joint_{k}" for k in range(1, 7)]
     points = message.points
@@ -124,7 +124,7 @@ def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, 
 @pytest.mark.parametrize("powers", [6, 8])
 def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
     plan = quadrotor(num=5, powers=powers)
-    header, rows = table(as_it_is(plan, to="crazyflie", out=tmp_path / "a.csv"))
+    header, rows = table(export_plan(plan, to="crazyflie", out=tmp_path / "a.csv"))
     rows = rows.astype(np.float32)
     assert header[:3] == ["duration", "x^0", "x^1"] and header[9] == "y^0" and len(header) == 33
     np.testing.assert_array_equal(rows, poly4d(plan))
@@ -132,7 +132,7 @@ def test_pieces_are_packed_as_by_the_crazyflies_own_library(tmp_path, powers):
     for duration, *coeffs in rows.tolist():
         axes = [Poly4D.Poly(coeffs[8 * k : 8 * k + 8]) for k in range(4)]
         packed += Poly4D(duration, *axes).pack()
-    path = as_it_is(plan, to="crazyflie", out=tmp_path / "a.bin")
+    path = export_plan(plan, to="crazyflie", out=tmp_path / "a.bin")
     assert path.read_bytes() == packed and len(packed) == 5 * 132
 
 
@@ -165,7 +165,7 @@ def test_a_higher_degree_and_more_pieces_than_fit_are_refused():
 
 
 def export_file(tmp_path, plan=None, name="a.csv", **how):
-    return as_it_is(plan or quadrotor(), out=tmp_path / name, **{"to": "csv", **how})
+    return export_plan(plan or quadrotor(), out=tmp_path / name, **{"to": "csv", **how})
 
 
 BATCH = jax.tree.map(lambda leaf: np.stack([leaf] * 3), quadrotor())

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from flown_plans import PLANS, as_it_is, quadrotor
+from flown_plans import PLANS, export_plan, quadrotor
 
 import planner_jax as pj
 from planner_jax.cli.main import main
@@ -47,7 +47,7 @@ def batch(robot):
     return plans.replace(status=np.array([0, 1, 2], np.int32))
 
 
-def written_run(folder, task="hit", *, finished=True):
+def write_run(folder, task="hit", *, finished=True):
     """Write a run with the columns that determine a plan, for plans without a planner."""
     robot, columns = TASKS[task]
     plans = batch(robot)
@@ -82,7 +82,7 @@ def assert_same(one, other):
 
 @pytest.mark.parametrize("task", TASKS)
 def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, task):
-    run, plans = written_run(tmp_path / "run", task), batch(TASKS[task][0])
+    run, plans = write_run(tmp_path / "run", task), batch(TASKS[task][0])
     for row in range(NUM):
         plan, sentence = read_plan(run, row)
         assert_same(plan, pj.take(plans, row))
@@ -90,14 +90,14 @@ def test_a_row_is_read_back_bit_for_bit_with_what_the_referee_says(tmp_path, tas
 
 
 def test_a_row_that_is_not_there_and_a_run_that_is_not_finished_or_damaged_or_of_flights(tmp_path):
-    run = written_run(tmp_path / "run")
+    run = write_run(tmp_path / "run")
     for row in (-1, 3, None):
         shown = "nothing" if row is None else row
         with pytest.raises(ArgumentError, match=f"^row must be from 0 to 2, got {shown}$"):
             read_plan(run, row)
     with pytest.raises(ArgumentError, match="^RUN must be finished, got .*; resume it first$"):
-        read_plan(written_run(tmp_path / "half", finished=False), 0)
-    run = written_run(tmp_path / "damaged")
+        read_plan(write_run(tmp_path / "half", finished=False), 0)
+    run = write_run(tmp_path / "damaged")
     (part,) = run.plans.files()
     content = bytearray(part.read_bytes())
     content[len(content) // 2] ^= 0xFF
@@ -143,8 +143,8 @@ def test_fields_of_a_task_are_left_out_and_files_of_something_else_are_refused(t
 def here(tmp_path, monkeypatch):
     """A working folder with a run, a saved batch and a saved plan."""
     monkeypatch.chdir(tmp_path)
-    written_run(tmp_path / "run")
-    written_run(tmp_path / "arms", "block")
+    write_run(tmp_path / "run")
+    write_run(tmp_path / "arms", "block")
     batch("quadrotor").save("three.npz")
     quadrotor().save("one.npz")
     return tmp_path
@@ -179,7 +179,7 @@ def test_a_plan_is_written_and_its_file_is_named(capsys, here, words, name):
 
 def test_a_row_is_written_as_pj_export_writes_it_and_a_plan_that_fails_with_a_warning(capsys, here):
     assert run_export(capsys, "run --row 0 --to px4 --out a.csv --rate 25")[0] == 0
-    as_it_is(pj.take(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
+    export_plan(pj.take(batch("quadrotor"), 0), to="px4", out="b.csv", rate=25.0)
     assert (here / "a.csv").read_bytes() == (here / "b.csv").read_bytes()
     warning = "planner-jax: warning: row 1 fails the referee: plan 1 is too fast\n"
     assert run_export(capsys, "run --row 1 --to csv") == (0, "run-1-csv.csv\n", warning)

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 import pytest
-from flown_plans import as_it_is, bag, matrices, quadrotor, table
+from flown_plans import bag, export_plan, matrices, quadrotor, table
 from pymavlink import mavutil
 from pymavlink.dialects.v20 import common
 
@@ -70,7 +70,7 @@ def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():
 
 
 def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
-    header, rows = table(as_it_is(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
+    header, rows = table(export_plan(quadrotor(), to="px4", out=tmp_path / "a.csv", rate=RATE))
     fields = trajectory_setpoints(quadrotor(), RATE)
     assert header[:5] == ["timestamp", "position[0]", "position[1]", "position[2]", "velocity[0]"]
     assert header[-2:] == ["yaw", "yawspeed"] and len(header) == 15
@@ -79,7 +79,7 @@ def test_a_table_of_px4_has_the_columns_of_its_message(tmp_path):
 
 
 def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
-    path = as_it_is(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
+    path = export_plan(quadrotor(), to="px4", out=tmp_path / "a.mcap", rate=RATE)
     profile, found = bag(path)
     fields = trajectory_setpoints(quadrotor(), RATE)
     assert profile == "ros2" and found[0][0].name == "px4_msgs/msg/TrajectorySetpoint"
@@ -108,7 +108,7 @@ def assert_are_setpoints(read, fields):
 
 @pytest.mark.parametrize("rate", [RATE, 1000.0])
 def test_a_telemetry_log_is_read_by_pymavlink(tmp_path, rate):
-    path = as_it_is(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
+    path = export_plan(quadrotor(), to="px4", out=tmp_path / "a.tlog", rate=rate)
     fields = trajectory_setpoints(quadrotor(), rate)
     log = mavutil.mavlink_connection(str(path), dialect="common")
     read = []

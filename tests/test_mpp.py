@@ -74,14 +74,14 @@ def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws, thro
 
 def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
     @jax.jit
-    def tried(case):
+    def try_candidates(case):
         context = order_targets(case)
         times, _ = MPP.times(context)
         ball = jax.tree.map(lambda leaf: leaf[0], targets_at(context.targets, times))
         return MPP.candidates(case.head_state, ball, times[0], case)
 
     for lane in (0, 7):
-        candidates = tried(take(throws, lane))
+        candidates = try_candidates(take(throws, lane))
         assert candidates.cost.shape == (81,)
         costs, coeffs = np.asarray(candidates.cost), throw_plans.trajectory.coeffs[lane, :2]
         np.testing.assert_allclose(throw_plans.cost[lane], costs.min(), rtol=1e-4)

@@ -58,7 +58,7 @@ def errors(fits, truth):
     return beliefs, stds, jax.vmap(error_across, (0, None))(beliefs, truth)
 
 
-def seen(num, rng, std=STD):
+def draw_positions(num, rng, std=STD):
     """Return noisy positions (num, NUM, 3) of one flight."""
     places = np.asarray(paths(BALL, TIMES, GRAVITY).pos)
     return (places + std * rng.normal(size=(num, *places.shape))).astype(np.float32)
@@ -89,7 +89,7 @@ def test_the_covariance_is_that_of_many_fits():
     rng = np.random.default_rng(0)
     num = 4000
     weights = np.full(num, np.float32(STD**-2))
-    fits = fit_many(np.tile(TIMES, (num, 1)), seen(num, rng), weights, GRAVITY)
+    fits = fit_many(np.tile(TIMES, (num, 1)), draw_positions(num, rng), weights, GRAVITY)
     truth = drag_free_flight(BALL, AHEAD, GRAVITY)
     beliefs, stds, off = errors(fits, truth)
     off_mean = np.asarray(beliefs.mean) - np.concatenate([truth.pos, truth.vel])
@@ -103,7 +103,7 @@ def test_the_covariance_is_that_of_many_fits():
 
 def test_the_estimate_is_that_of_polynomials():
     """With equal weights each axis is a line, z without the fall [Natarajan2024, eq. 8]."""
-    places = seen(1, np.random.default_rng(1))[0]
+    places = draw_positions(1, np.random.default_rng(1))[0]
     there = believed(fit_one(TIMES, places, 1.0, GRAVITY), 0.0, GRAVITY)
     fallen = places.astype(float)
     fallen[:, 2] += 0.5 * GRAVITY * TIMES**2
@@ -112,7 +112,7 @@ def test_the_estimate_is_that_of_polynomials():
 
 
 def test_what_is_not_seen_leaves_no_trace():
-    places, weights = seen(1, np.random.default_rng(2))[0], np.ones(NUM, np.float32)
+    places, weights = draw_positions(1, np.random.default_rng(2))[0], np.ones(NUM, np.float32)
     keep = np.delete(np.arange(NUM), [3, 8, 12])
     alone = fit_one(TIMES[keep], places[keep], weights[keep], GRAVITY)
     places[3], places[8, 1], weights[12] = np.nan, np.inf, 0.0
@@ -125,7 +125,7 @@ def test_what_is_not_seen_leaves_no_trace():
 def test_a_batch_is_its_lanes_one_by_one():
     """Check very different observations, and a ball that is never seen."""
     rng = np.random.default_rng(3)
-    places = seen(4, rng)
+    places = draw_positions(4, rng)
     places[1, 5:] = np.nan
     places[2] = np.nan
     weights = rng.uniform(1.0, 50.0, (4, NUM)).astype(np.float32)
@@ -139,7 +139,7 @@ def test_a_batch_is_its_lanes_one_by_one():
 
 
 def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():
-    places = seen(1, np.random.default_rng(4))[0]
+    places = draw_positions(1, np.random.default_rng(4))[0]
     never, once = np.full_like(places, np.nan), np.full_like(places, np.nan)
     once[7] = places[7]
     for given, status in ((never, Sight.NEVER_SEEN), (once, Sight.SEEN_ONCE)):
@@ -151,7 +151,7 @@ def test_a_ball_that_is_not_seen_at_two_times_has_a_status_and_a_sentence():
 
 
 def test_the_fit_is_what_a_kalman_filter_with_a_wide_prior_comes_to(float64):
-    places = jnp.asarray(seen(1, np.random.default_rng(5))[0], jnp.float64)
+    places = jnp.asarray(draw_positions(1, np.random.default_rng(5))[0], jnp.float64)
     model = EkfModel(jnp.zeros(3), jnp.asarray(GRAVITY), jnp.asarray(0.0), jnp.asarray(STD))
     state = ekf_init(places[0], jnp.zeros(3), pos_std=jnp.asarray(1e3), vel_std=jnp.asarray(1e4))
 
@@ -167,7 +167,7 @@ def test_the_fit_is_what_a_kalman_filter_with_a_wide_prior_comes_to(float64):
 
 
 def test_gradients_of_a_fit_are_finite_with_and_without_a_ball():
-    places = seen(1, np.random.default_rng(6))[0]
+    places = draw_positions(1, np.random.default_rng(6))[0]
     places[3] = np.nan
 
     def across(places):

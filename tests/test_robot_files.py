@@ -17,9 +17,9 @@ from planner_jax.core.errors import ArgumentError, UnknownName
 from planner_jax.robot.quadrotor_file import (
     UNITS,
     RobotError,
-    as_yaml,
     model_of,
-    numbers_in,
+    parse_numbers,
+    to_yaml,
 )
 from planner_jax.robot.quadrotor_models import MODELS, ready_robot
 from planner_jax.runs.settings import settings_to_resume
@@ -51,7 +51,7 @@ LIMITS = pj.FlightLimits(speed=5.0, body_rate=5.0)
 def test_quantities_are_read_in_si_units_of_which_each_kind_has_the_first(text, kind, found):
     assert next(iter(UNITS[kind].values())) == 1
     span = isinstance(text, str) and " to " in text
-    numbers = numbers_in(text, kind, np.size(found), span=span)
+    numbers = parse_numbers(text, kind, np.size(found), span=span)
     np.testing.assert_allclose(numbers, np.atleast_1d(found), rtol=1e-15)
 
 
@@ -77,9 +77,9 @@ def test_keywords_go_before_the_file():
 @pytest.mark.parametrize("robot", [*MODELS.values(), pj.read_robot(MINE)], ids=lambda r: r.name)
 def test_a_robot_is_the_same_after_yaml_and_after_a_manifest(robot, tmp_path):
     place = tmp_path / "robot.yaml"
-    place.write_text(as_yaml(robot))
+    place.write_text(to_yaml(robot))
     assert pj.read_robot(place) == robot
-    assert as_yaml(pj.read_robot(place)) == place.read_text()
+    assert to_yaml(pj.read_robot(place)) == place.read_text()
     assert model_of(json.loads(json.dumps(dataclasses.asdict(robot)))) == robot
 
 
@@ -89,7 +89,7 @@ def test_positions_of_rotors_may_be_pairs_of_numbers_pairs_as_text_or_one_text()
         assert pj.read_robot(MINE, rotors={"places": places}).rotors.places == pairs
 
 
-def changed(**fields):
+def change_fields(**fields):
     """Return the text of a file with some fields replaced; None removes a field."""
     description = copy.deepcopy(FIELDS)
     for name, value in fields.items():
@@ -150,7 +150,7 @@ def bad_fields():
     for field, value, rule in (row.split(" | ") for row in BAD.strip().splitlines()):
         for word, text in WORDS.items():
             rule = rule.replace(word, text)
-        yield changed(**{field.replace(".", "__"): yaml.safe_load(value)}), rule
+        yield change_fields(**{field.replace(".", "__"): yaml.safe_load(value)}), rule
     yield "- 1", "must be fields with values, got [1]"
     yield "", "must be fields with values, got None"
 
@@ -278,7 +278,7 @@ def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
     words, rule, capsys, tmp_path, monkeypatch
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "bad.yaml").write_text(changed(mass="800 gg"))
+    (tmp_path / "bad.yaml").write_text(change_fields(mass="800 gg"))
     assert main([word.replace("BAD", "bad.yaml") for word in words]) == 2
     error = capsys.readouterr().err
     assert re.match(f"planner-jax: error: {rule}", error) and error.count("\n") == 1
@@ -295,7 +295,7 @@ def test_a_run_holds_the_whole_robot_whatever_becomes_of_its_file(kind):
 
 
 def test_a_run_is_not_resumed_with_another_robot(tmp_path):
-    (tmp_path / "other.yaml").write_text(changed(rotors__lag="20 ms"))
+    (tmp_path / "other.yaml").write_text(change_fields(rotors__lag="20 ms"))
     parameters = json.loads(json.dumps(HitSettings(robot=str(MINE)).parameters()))
     again = settings_to_resume(HitSettings, parameters, {"robot": str(MINE)})
     assert again.robot == pj.read_robot(MINE)

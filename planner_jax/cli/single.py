@@ -189,11 +189,11 @@ def _serve(settings: ServeSettings) -> None:
 
 def robots(options: Options) -> None:
     """Print the known robots, or one of them as YAML."""
-    from planner_jax.robot.quadrotor_file import RobotError, as_yaml
-    from planner_jax.robot.quadrotor_models import listing, robot_named
+    from planner_jax.robot.quadrotor_file import RobotError, to_yaml
+    from planner_jax.robot.quadrotor_models import format_models, robot_named
 
     name = options["robot"]
     try:
-        print(listing() if name is None else as_yaml(robot_named(name)), end="")
+        print(format_models() if name is None else to_yaml(robot_named(name)), end="")
     except RobotError as error:
         raise ArgumentError("NAME", f"a sound robot: {error}", shown="") from None

@@ -41,7 +41,7 @@ class Arm:
 
 @struct.dataclass
 class ArmLimits:
-    """Limits on the magnitudes of joint rates; `Arm` holds the position limits."""
+    """Limits on magnitudes of joint velocities and accelerations; `Arm` has the position limits."""
 
     velocity: Array  # (6,) [rad/s]
     acceleration: Array  # (6,) [rad/s^2]

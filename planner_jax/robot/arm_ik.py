@@ -171,7 +171,7 @@ def _turn_about(axis: int, angle: Array) -> Array:
     return jnp.stack(about_y if axis == 1 else about_z).reshape(3, 3)
 
 
-def misfit(arm: Arm) -> str | None:
+def explain_misfit(arm: Arm) -> str | None:
     """Return why the closed form does not apply to an arm with NumPy leaves; None if it does."""
     rotation, position = Rotation.identity(), np.zeros(3)
     axes, positions = np.zeros((6, 3)), np.zeros((6, 3))

@@ -23,7 +23,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError
 from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import Arm
-from planner_jax.robot.arm_ik import misfit
+from planner_jax.robot.arm_ik import explain_misfit
 
 # Elements that are ignored: in the file, and in a body.
 _AROUND = {"option", "visual", "statistic", "size", "asset", "actuator", "sensor", "contact"}
@@ -98,7 +98,7 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
     }
     arrays = {name: host_leaf(leaf, dtype) for name, leaf in leaves.items()}
     arm = Arm(**arrays, capsule_link=tuple(k for k, _, _ in shapes))
-    reason = misfit(arm)
+    reason = explain_misfit(arm)
     if reason is not None:
         raise ValueError(f"inverse kinematics has no closed form for this arm: {reason}")
     return arm

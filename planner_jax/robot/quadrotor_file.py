@@ -35,7 +35,7 @@ from planner_jax.robot.quadrotor_model import (
     QuadrotorModel,
     Rotors,
     Tool,
-    cross,
+    place_in_cross,
 )
 
 STANDARD_GRAVITY = "9.80665"  # [m/s^2], exact by definition
@@ -169,7 +169,7 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     if "diagonal" in rotors:
         if "places" in rotors:
             raise RobotError(f"{place}: rotors must have diagonal or places, not both")
-        rotors["places"] = cross(rotors.pop("diagonal"))
+        rotors["places"] = place_in_cross(rotors.pop("diagonal"))
     if kind not in (NET, RACKET):
         hint = suggestion(kind, (NET, RACKET))
         raise RobotError(f"{place}: tool.kind must be {NET} or {RACKET}, got {kind!r}{hint}")
@@ -185,12 +185,12 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
         raise RobotError(f"{place}: {error}") from None
 
 
-def as_yaml(model: QuadrotorModel) -> str:
+def to_yaml(model: QuadrotorModel) -> str:
     """Format a quadrotor as YAML; `read_robot` restores it to the last digit."""
     plain: dict[str, Value] = dataclasses.asdict(model)
     rotors = plain["rotors"]
     diagonal = round(2.0 * float(max(abs(x) for x in rotors["places"][0])) * 2.0**0.5, 12)
-    if cross(diagonal) == rotors["places"]:
+    if place_in_cross(diagonal) == rotors["places"]:
         del rotors["places"]
         plain["rotors"] = {"diagonal": diagonal, **rotors}
     shown = {name: _add_unit(plain[name], kind) for name, kind in _FIELDS[""].items()}
@@ -326,13 +326,13 @@ def _to_numbers(value: Value, quantity: _Quantity) -> Value:
     if is_pairs and isinstance(value, list | tuple):
         pairs = (pair if isinstance(pair, list | tuple) else [pair] for pair in value)
         value = [each for pair in pairs for each in pair]
-    numbers = numbers_in(value, quantity.kind, quantity.count, span=quantity.span)
+    numbers = parse_numbers(value, quantity.kind, quantity.count, span=quantity.span)
     if is_pairs:
         return tuple(zip(numbers[::2], numbers[1::2], strict=True))
     return numbers[0] if quantity.count == 1 else numbers
 
 
-def numbers_in(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
+def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
     """Return the numbers of a value in SI units.
 
     Args:

@@ -96,7 +96,7 @@ class Rotors:
         return self.mixer[:, 0]
 
 
-def cross(diagonal: float) -> tuple[tuple[float, float], ...]:
+def place_in_cross(diagonal: float) -> tuple[tuple[float, float], ...]:
     """Return positions of four rotors at 45, 135, 225 and 315 degrees, `diagonal` [m] apart."""
     half = 0.5 * diagonal * math.sqrt(0.5)
     return ((half, half), (-half, half), (-half, -half), (half, -half))
@@ -207,7 +207,7 @@ PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
     mass=1.2,
     inertia=(0.005, 0.005, 0.009),
-    rotors=Rotors(cross(0.33), max_thrust=11.8),
+    rotors=Rotors(place_in_cross(0.33), max_thrust=11.8),
     tool=Tool(NET, height=0.2, radius=0.125),
     limits=FlightLimits(
         speed=5.0, body_rate=5.0, thrust=(0.3 * GRAVITY, 2.5 * GRAVITY), rotor_share=None

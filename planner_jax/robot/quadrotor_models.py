@@ -19,7 +19,7 @@ from planner_jax.robot.quadrotor_model import (
     QuadrotorModel,
     Rotors,
     Tool,
-    cross,
+    place_in_cross,
 )
 
 # Mass and diagonal: the manufacturer's data sheet (27 g; 92 mm from motor to motor). Inertia, drag
@@ -29,7 +29,9 @@ CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
     inertia=(16.57e-6, 16.66e-6, 29.26e-6),
-    rotors=Rotors(cross(0.092), max_thrust=0.16, torque_ratio=0.00596, lag=0.03, radius=0.0225),
+    rotors=Rotors(
+        place_in_cross(0.092), max_thrust=0.16, torque_ratio=0.00596, lag=0.03, radius=0.0225
+    ),
     tool=Tool(NET, height=0.05, radius=0.06),
     limits=FlightLimits(speed=3.0, body_rate=8.0),
     source="Crazyflie 2.x: Bitcraze data sheet (mass, diagonal), Foerster 2015 (inertia, thrust, "
@@ -44,7 +46,9 @@ RACER = QuadrotorModel(
     name="racer",
     mass=0.87,
     inertia=(0.0038, 0.0038, 0.007),
-    rotors=Rotors(cross(0.33), max_thrust=8.75, torque_ratio=0.016, lag=0.03, radius=0.076),
+    rotors=Rotors(
+        place_in_cross(0.33), max_thrust=8.75, torque_ratio=0.016, lag=0.03, radius=0.076
+    ),
     tool=Tool(RACKET, height=0.06, radius=0.11),
     limits=FlightLimits(speed=8.0, body_rate=8.0),
     source="Kaufmann et al., Nature 620, 2023 (mass, thrust); 330 mm, inertia, drag torque, lag, "
@@ -127,7 +131,7 @@ def robot_named(word: str) -> QuadrotorModel:
         raise UnknownName("robot", "a file that can be read", shown=f"{word!r} ({why})") from None
 
 
-def listing() -> str:
+def format_models() -> str:
     """Return a table of the quadrotors by name: a heading, and a line for each."""
     rows = [_summarise(model) for model in MODELS.values()]
     columns = [[heading, *(row[heading] for row in rows)] for heading in rows[0]]

@@ -62,7 +62,7 @@ from planner_jax.task.block.motion import (
     joint_terms,
     polynomial,
     speed_up,
-    sums,
+    step_weights,
 )
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
@@ -358,7 +358,7 @@ class OnlineBlock(Planner):
         push = jnp.matmul(row_slopes.T, rows, precision=_HIGHEST)
         grams = jnp.concatenate([grams, gram[None]])
         pushes = jnp.concatenate([pushes, push[None]])
-        of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, shares))
+        of_first, of_steps = (jnp.asarray(each, dtype) for each in step_weights(pieces, shares))
         chosen = jnp.append(worst, self.samples - 1)
         lift, drift = of_steps[chosen], of_first[chosen][:, None] * case.rates  # (W + 1, K), (., 6)
         gradient, curvature = _lift_to_unknowns(lift, drift, grams, pushes, joints)

@@ -10,7 +10,7 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm import product, shield_jacobian, shield_pose
 from planner_jax.robot.arm_ik import inverse_kinematics
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.motion import Weights, profiles, sums
+from planner_jax.task.block.motion import Weights, profiles, step_weights
 from planner_jax.task.block.scene import entry_time
 
 _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
@@ -107,7 +107,7 @@ def end_poses(
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
     """Return the angles (..., 6) [rad] at which joints stop if they brake in the first piece."""
-    of_first = sums(pieces, (1.0,))[0][0]
+    of_first = step_weights(pieces, (1.0,))[0][0]
     return case.angles + of_first * duration[..., None] * case.rates
 
 

@@ -30,7 +30,7 @@ class Weights:
 
 
 @functools.cache
-def sums(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return the weights with which steps sum up to angles at shares of the duration.
 
     Returns:
@@ -52,7 +52,7 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 
     The motion has steps (K, 6) [rad]; `first` (6,) [rad] are the first rates times the duration.
     """
-    of_first, of_steps = sums(steps.shape[0], shares)
+    of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
     return start + jnp.asarray(of_first, steps.dtype)[:, None] * first + turned
 
@@ -78,7 +78,7 @@ def joint_terms(
     """
     pieces, dtype = steps.shape[0], steps.dtype
     knots = tuple(np.arange(1, pieces + 1) / pieces)
-    of_first, of_steps = (jnp.asarray(each, dtype) for each in sums(pieces, knots))
+    of_first, of_steps = (jnp.asarray(each, dtype) for each in step_weights(pieces, knots))
     rise = jnp.asarray(np.eye(pieces) - np.eye(pieces, k=-1), dtype)
     rates = steps / duration
     rises = steps - jnp.concatenate([first[None], steps[:-1]])

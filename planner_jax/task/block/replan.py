@@ -52,9 +52,9 @@ class WarmBlock(Planner):
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
         """Return the plan of one case."""
         case, planner = task.case, self.planner
-        return planner.refine(case, flight_of(case), self.rest(task), attempt.solver)
+        return planner.refine(case, flight_of(case), self.encode_remainder(task), attempt.solver)
 
-    def rest(self, task: Replanning) -> Array:
+    def encode_remainder(self, task: Replanning) -> Array:
         """Return the unknowns (n,) of the remainder of the previous motion until the contact.
 
         The contact is moved to the time at which the newly estimated ball is nearest to the

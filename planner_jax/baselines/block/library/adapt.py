@@ -32,7 +32,7 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
-from planner_jax.task.block.motion import angles_at, profiles, sums
+from planner_jax.task.block.motion import angles_at, profiles, step_weights
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 from planner_jax.task.block.scene import Box
 
@@ -133,7 +133,7 @@ class AdaptBlock(Planner):
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
-        total = jnp.asarray(sums(pieces, (1.0,))[1][0], dtype)
+        total = jnp.asarray(step_weights(pieces, (1.0,))[1][0], dtype)
         ends = case.angles + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
         # The branch nearest to the stored end, modulo full turns.

@@ -34,7 +34,7 @@ from planner_jax.task.block.case import STRICT, BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.default_planner import OnlineBlock, read_learned_starts
 from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
-from planner_jax.task.block.motion import angles_at, bump_steps, sums
+from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 
 # Tolerance of a stored pose relative to the nominal ball, [m] and [rad]: the paper allows "a small
 # tolerance". If no pose is within it, a shield that blocks a part of the tunnel is better than no
@@ -170,7 +170,7 @@ class PairPlanner(Planner):
         roll = jnp.arctan2(jnp.sum(rotation[:, 1] * frame[:, 2]), cosine)
         roll = roll - 0.5 * jnp.pi * jnp.round(roll / (0.5 * jnp.pi))
         by_angles = product(shield_jacobian(case.arm, angles)[3:].T, rotation[:, 0])
-        of_steps = jnp.asarray(sums(online.pieces, (1.0,))[1][0], point.dtype)
+        of_steps = jnp.asarray(step_weights(online.pieces, (1.0,))[1][0], point.dtype)
         held = jnp.where(case.ends_at_rest, 0.0, of_steps[-1])
         slope = jnp.append((of_steps.at[-1].set(held)[:, None] * by_angles).reshape(-1), 0.0)
         weight = jnp.where(pair.is_coarse, 0.0, online.weights.tilt**2)
