@@ -21,29 +21,20 @@ MPP = MppCatch()
 
 @pytest.fixture(scope="module")
 def throws():
-    """Throws of two suites, half of them hard; two further targets of each case are absent."""
+    """Throws of two suites, half of them hard, with two absent targets each, and their plans."""
     suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
-    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
+    cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
+    return cases, plan(MPP, cases)
 
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Two throws and one absent target; the order of the first two cases is reversed."""
+    """Two throws and an absent target each, the first two in reversed order, and their plans."""
     cases = draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
     cases = dataclasses.replace(cases, order=order.astype(np.int32))
-    return jax.tree.map(np.asarray, cases)
-
-
-@pytest.fixture(scope="module")
-def throw_plans(throws):
-    return plan(MPP, throws)
-
-
-@pytest.fixture(scope="module")
-def pair_plans(pairs):
-    return plan(MPP, pairs)
+    return jax.tree.map(np.asarray, cases), plan(MPP, cases)
 
 
 def heights(cases, plans):
@@ -52,27 +43,31 @@ def heights(cases, plans):
     return np.asarray(jax.jit(jax.vmap(targets_at))(ordered, plans.times).pos)[..., 2]
 
 
-def test_the_net_is_on_the_ball_and_faces_it_at_the_fixed_height(throws, throw_plans):
-    verdict = referee_catches(throws, throw_plans)
+def test_the_net_is_on_the_ball_and_faces_it_at_the_fixed_height(throws):
+    cases, plans = throws
+    verdict = referee_catches(cases, plans)
     assert verdict.net_distance[:, 0].max() < 1e-4
     assert verdict.angle[:, 0].max() < 1e-3
     assert verdict.head_error.max() < 1e-5
     assert verdict.continuity_error.max() < 1e-4
-    np.testing.assert_allclose(heights(throws, throw_plans)[:, 0], MPP.height, atol=1e-4)
+    np.testing.assert_allclose(heights(cases, plans)[:, 0], MPP.height, atol=1e-4)
     assert MPP.height < 2.0
-    np.testing.assert_allclose(verdict.catch_times[:, 0], throw_plans.times[:, 0], atol=1e-6)
+    np.testing.assert_allclose(verdict.catch_times[:, 0], plans.times[:, 0], atol=1e-6)
 
 
-def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws, throw_plans):
-    verdict, solved = referee_catches(throws, throw_plans), is_solved(throw_plans.status)
+def test_a_plan_that_passes_the_check_afterwards_passes_the_referee(throws):
+    cases, plans = throws
+    verdict, solved = referee_catches(cases, plans), is_solved(plans.status)
     assert verdict.success[solved].all()
     assert set(verdict.failed_limit[~solved]) <= {"speed", "body rate", "thrust low", "thrust high"}
-    assert (throw_plans.violation[~solved] > 0.0).all()
+    assert (plans.violation[~solved] > 0.0).all()
     assert 0 < solved.sum() < NUM, "limits are not planned for"
-    assert (throw_plans.iterations == 0).all()
+    assert (plans.iterations == 0).all()
 
 
-def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
+def test_the_kept_candidate_is_the_cheapest(throws):
+    cases, plans = throws
+
     @jax.jit
     def try_candidates(case):
         context = order_targets(case)
@@ -81,10 +76,10 @@ def test_the_kept_candidate_is_the_cheapest(throws, throw_plans):
         return MPP.candidates(case.head_state, ball, times[0], case)
 
     for lane in (0, 7):
-        candidates = try_candidates(take(throws, lane))
+        candidates = try_candidates(take(cases, lane))
         assert candidates.cost.shape == (81,)
-        costs, coeffs = np.asarray(candidates.cost), throw_plans.trajectory.coeffs[lane, :2]
-        np.testing.assert_allclose(throw_plans.cost[lane], costs.min(), rtol=1e-4)
+        costs, coeffs = np.asarray(candidates.cost), plans.trajectory.coeffs[lane, :2]
+        np.testing.assert_allclose(plans.cost[lane], costs.min(), rtol=1e-4)
         cheapest = candidates.trajectory.coeffs[costs.argmin()]
         np.testing.assert_allclose(coeffs, cheapest, rtol=1e-3, atol=1e-2)
         np.testing.assert_allclose(costs, mean_squared_jerk(candidates.trajectory), rtol=1e-3)
@@ -101,37 +96,38 @@ def mean_squared_jerk(trajectory):
     return integral.sum(axis=1) / durations.sum(axis=1)
 
 
-def test_one_equals_its_lane_in_the_batch(pairs, pair_plans):
+def test_one_equals_its_lane_in_the_batch(pairs):
+    cases, plans = pairs
     solve = jax.jit(lambda case: MPP.solve(case, MPP.attempts[0]))
     for lane in (3, 5, 9):
-        alone = solve(take(pairs, lane))
-        among = jax.tree.leaves(take(pair_plans, lane))
+        alone = solve(take(cases, lane))
+        among = jax.tree.leaves(take(plans, lane))
         for one, other in zip(jax.tree.leaves(alone), among, strict=True):
             np.testing.assert_allclose(one, other, rtol=2e-3, atol=2e-3)
 
 
-def test_targets_are_caught_one_after_the_other_and_an_absent_one_is_not(pairs, pair_plans):
-    verdict = referee_catches(pairs, pair_plans)
+def test_targets_are_caught_one_after_the_other_but_for_those_absent_or_in_wrong_order(pairs):
+    cases, plans = pairs
+    verdict = referee_catches(cases, plans)
     right = np.arange(2, NUM)
-    assert pair_plans.trajectory.coeffs.shape == (NUM, 6, 6, 3)
+    assert plans.trajectory.coeffs.shape == (NUM, 6, 6, 3)
     assert verdict.net_distance[right, :2].max() < 1e-3
     assert verdict.angle[right, :2].max() < 1e-3
-    np.testing.assert_allclose(heights(pairs, pair_plans)[right, :2], MPP.height, atol=1e-4)
-    assert (np.diff(pair_plans.times[right, :2], axis=1) > 0.0).all()
-    np.testing.assert_array_equal(pair_plans.times[:, 2], pair_plans.times[:, 1])
-    assert not pair_plans.trajectory.durations[:, 4:].any()
-    solved = is_solved(pair_plans.status)
+    np.testing.assert_allclose(heights(cases, plans)[right, :2], MPP.height, atol=1e-4)
+    assert (np.diff(plans.times[right, :2], axis=1) > 0.0).all()
+    np.testing.assert_array_equal(plans.times[:, 2], plans.times[:, 1])
+    assert not plans.trajectory.durations[:, 4:].any()
+    solved = is_solved(plans.status)
     assert verdict.success[solved].all()
-
-
-def test_times_that_do_not_rise_leave_the_lane_unsolved(pair_plans):
-    assert set(np.asarray(pair_plans.status)[:2]) == {Status.INFEASIBLE}
-    assert (pair_plans.violation[:2] > 0.0).all()
-    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(pair_plans))
+    # Times that do not rise leave a case unsolved.
+    assert set(np.asarray(plans.status)[:2]) == {Status.INFEASIBLE}
+    assert (plans.violation[:2] > 0.0).all()
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(plans))
 
 
 def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
     """Try targets too low, rising, at rest and NaN; the others are solved."""
+    throws, plans = throws
     pos, vel = np.array(throws.targets.ball.pos), np.array(throws.targets.ball.vel)
     pos[0, 0, 2], vel[0, 0, 2] = 0.8, -1.0
     vel[1, 0, 2] = 30.0
@@ -145,7 +141,7 @@ def test_a_target_that_never_falls_through_the_height_is_not_solved(throws):
     assert set(found.status[:3]) == {Status.INFEASIBLE}
     assert found.status[3] == Status.BAD_INPUT
     assert all(np.isfinite(leaf[:3]).all() for leaf in jax.tree.leaves(found))
-    for old, new in zip(jax.tree.leaves(plan(MPP, throws)), jax.tree.leaves(found), strict=True):
+    for old, new in zip(jax.tree.leaves(plans), jax.tree.leaves(found), strict=True):
         np.testing.assert_array_equal(old[4:], new[4:])
 
 
