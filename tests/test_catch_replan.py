@@ -1,4 +1,4 @@
-"""Re-planning: the previous plan shifted in time is where the search begins, and where it ends."""
+"""Re-planning of catches: the search starts at the remainder of the previous plan."""
 
 import dataclasses
 
@@ -6,7 +6,6 @@ import jax
 import numpy as np
 import pytest
 
-from planner_jax.ball.flight import BallState
 from planner_jax.core.protocol import Status, is_solved, take
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.plan import plan
@@ -14,16 +13,17 @@ from planner_jax.referee.catch import referee_catches
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.suites import draw
+from planner_jax.trajectory.polynomial import states_at
 
 SCRATCH = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=20)),))
 AGAIN = ReplanCatch(
     rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=12, trial_steps=(1.0, 0.2, 0.04))),)
 )
-AS_IT_IS = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0)),))
+UNCHANGED = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0)),))
 
 
-def planned(name, num):
-    """A suite's first cases, and plans of them."""
+def plan_first(name, num):
+    """Return the first cases of a suite and their plans."""
     cases = draw(num, name)
     times = np.linspace(0.7, 0.9, cases.num_targets) * np.asarray(cases.horizon)
     cases = jax.tree.map(np.asarray, dataclasses.replace(cases, times=times))
@@ -32,64 +32,51 @@ def planned(name, num):
 
 @pytest.fixture(scope="module")
 def throws():
-    cases, plans = planned("throws", 6)
+    cases, plans = plan_first("throws", 6)
     assert is_solved(plans.status).all()
     return cases, plans
 
 
 @jax.jit
 @jax.vmap
-def seen_at(targets, time):
-    """The states of the targets of one case at one time."""
+def states_of(targets, time):
     return jax.vmap(lambda path: path.at(time))(targets)
 
 
 def ahead(cases, elapsed, noise=0.0):
-    """The targets seen `elapsed` (B,) later, a little beside where they were expected."""
-    ball = seen_at(cases.targets, np.asarray(elapsed, np.float32))
+    """Return the targets `elapsed` (B,) [s] later, with noise on position and velocity."""
+    ball = states_of(cases.targets, np.asarray(elapsed, np.float32))
     random = np.random.default_rng(1)
-    moved = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
-    return dataclasses.replace(cases.targets, ball=BallState(moved(ball.pos), moved(ball.vel)))
+    disturb = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
+    return dataclasses.replace(cases.targets, ball=jax.tree.map(disturb, ball))
 
 
-def states(trajectory, time):
-    """Position, velocity and acceleration (3, 3) of one trajectory, in float64."""
-    ends = np.cumsum(np.asarray(trajectory.durations, np.float64))
-    piece = min(int(np.sum(time >= ends)), len(ends) - 1)
-    coeffs = np.asarray(trajectory.coeffs[piece], np.float64)
-    local = time - (ends[piece] - trajectory.durations[piece])
-    rows = []
-    for _ in range(3):
-        rows.append(local ** np.arange(len(coeffs)) @ coeffs)
-        coeffs = coeffs[1:] * np.arange(1, len(coeffs))[:, None]
-    return np.stack(rows)
-
-
-def assert_same_way(old, new, elapsed, until, atol):
-    for time in np.linspace(0.0, until, 23):
-        np.testing.assert_allclose(
-            states(new, time), states(old, elapsed + time), rtol=0, atol=atol
+def assert_same_flight(old, new, elapsed, until, atol):
+    """Assert equal position, velocity and acceleration of plans and their remainders."""
+    for share in np.linspace(0.0, 1.0, 23):
+        times = share * until
+        found, expected = (
+            states_at(new.trajectory, times),
+            states_at(old.trajectory, elapsed + times),
         )
+        np.testing.assert_allclose(found[:, :3], expected[:, :3], rtol=0, atol=atol)
 
 
 @pytest.mark.slow
 def test_an_unchanged_target_and_no_time_give_the_plan_back(throws):
     cases, plans = throws
-    again = plan(AS_IT_IS, AS_IT_IS.begin(cases, plans, np.zeros(6), targets=cases.targets))
+    again = plan(UNCHANGED, UNCHANGED.begin(cases, plans, np.zeros(6), targets=cases.targets))
     np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
     np.testing.assert_allclose(again.cost, plans.cost, rtol=2e-3)
-    for k in range(6):
-        old, new = take(plans.trajectory, k), take(again.trajectory, k)
-        assert_same_way(old, new, 0.0, plans.times[k, 0], 1e-3)
+    assert_same_flight(plans, again, 0.0, plans.times[:, 0], 1e-3)
 
 
 def test_a_later_plan_begins_where_the_quadrotor_is_and_catches_the_target_that_moved(throws):
     cases, plans = throws
     elapsed = np.linspace(0.01, 0.5, 6)
     task = AGAIN.begin(cases, plans, elapsed, targets=ahead(cases, elapsed, 0.01))
-    for k in range(6):
-        expected = states(take(plans.trajectory, k), elapsed[k])
-        np.testing.assert_allclose(task.case.head_state[k, :3], expected, atol=1e-3)
+    expected = states_at(plans.trajectory, elapsed)[:, :3]
+    np.testing.assert_allclose(task.case.head_state[:, :3], expected, atol=1e-3)
     np.testing.assert_allclose(task.case.horizon, cases.horizon - elapsed[:, None])
     again = plan(AGAIN, task)
     verdict = referee_catches(task.case, again)
@@ -127,21 +114,17 @@ def test_with_too_little_time_left_the_previous_plan_is_kept(throws):
     np.testing.assert_array_equal(again.violation[kept], plans.violation[kept])
     assert is_solved(again.status[kept]).all()
     assert (again.trajectory.durations > 0.0).all()
-    for k in np.flatnonzero(kept):
-        old, new = take(plans.trajectory, k), take(again.trajectory, k)
-        assert_same_way(old, new, elapsed[k], left[k], 1e-3)
+    assert_same_flight(*(take(each, kept) for each in (plans, again, elapsed, left)), 1e-3)
 
 
 @pytest.mark.slow
 def test_what_is_left_of_a_plan_can_be_cut_anywhere(throws):
     cases, plans = throws
-    keeping = dataclasses.replace(AS_IT_IS, shortest=10.0)
+    keeping = dataclasses.replace(UNCHANGED, shortest=10.0)
     elapsed = np.array([0.0, 0.02, 0.21, 0.43, 0.6, 0.7], np.float32)
     rest = plan(keeping, keeping.begin(cases, plans, elapsed, targets=ahead(cases, elapsed)))
     assert (rest.trajectory.durations > 0.0).all()
-    for k in range(6):
-        old, new = take(plans.trajectory, k), take(rest.trajectory, k)
-        assert_same_way(old, new, elapsed[k], rest.times[k, 0], 1e-3)
+    assert_same_flight(plans, rest, elapsed, rest.times[:, 0], 1e-3)
 
 
 def test_after_the_catch_the_plan_is_empty(throws):
@@ -152,14 +135,13 @@ def test_after_the_catch_the_plan_is_empty(throws):
     again = plan(AGAIN, task)
     assert not again.trajectory.durations.any() and np.isfinite(again.cost).all()
     assert (again.status != Status.NON_FINITE).all()
-    for k in range(6):
-        caught = states(take(plans.trajectory, k), plans.times[k, 0])[0]
-        np.testing.assert_allclose(again.trajectory.coeffs[k, 0, 0], caught, atol=1e-4)
+    caught = states_at(plans.trajectory, plans.times[:, 0])[:, 0]
+    np.testing.assert_allclose(again.trajectory.coeffs[:, 0, 0], caught, atol=1e-4)
 
 
 @pytest.mark.slow
 def test_of_several_targets_those_not_caught_yet_are_planned_on():
-    cases, _ = planned("triangle3", 4)
+    cases, _ = plan_first("triangle3", 4)
     order = np.array([2, 0, 1], np.int32)
     cases = dataclasses.replace(cases, order=np.tile(order, (4, 1)))
     longer = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=40)),))
