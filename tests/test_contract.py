@@ -1,4 +1,4 @@
-"""One contract, which planners of every kind and task keep; and two planners of a user's own."""
+"""The contract that planners of every kind and task keep, and two planners of a user."""
 
 import dataclasses
 import functools
@@ -29,18 +29,19 @@ from planner_jax.task.block.default_planner import Search as BlockSearch
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import Search
+from tests.trees import assert_same
 
 NUM = 6  # cases of a batch; no more than one bucket
 
-# A task of a user's own: come near a place in the plane.
+# A task of a user: approach a point in the plane.
 
 
 @struct.dataclass
 class Place:
-    """Where to be."""
+    """A point in the plane."""
 
     goal: Array  # (2,)
-    reach: Array  # (), how near
+    reach: Array  # (), greatest distance
 
     @property
     def batch_shape(self):
@@ -49,7 +50,7 @@ class Place:
 
 @struct.dataclass
 class Stand(Plan):
-    """Where one is then."""
+    """The point that is reached."""
 
     point: Array  # (2,)
 
@@ -61,7 +62,7 @@ def places(num):
 
 @struct.dataclass
 class LibraryPlanner(pj.Planner):
-    """The nearest of some known points, in the first attempt of a few of them."""
+    """Selects the nearest of stored points, in the first attempt of only a few of them."""
 
     points: Array  # (K, 2)
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
@@ -78,7 +79,7 @@ class LibraryPlanner(pj.Planner):
 
 @dataclasses.dataclass(frozen=True)
 class NumpyPlanner(pj.Planner):
-    """A step towards the goal, the length of which the attempt gives; NumPy alone."""
+    """Makes a step towards the goal, of a length by attempt, in NumPy."""
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
     case_type: ClassVar[type] = Place
@@ -96,9 +97,7 @@ def library(seed):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
 
 
-# All planners there are, made small.
-
-# Compiling is what takes time: two iterations, or the first guess as the plan.
+# All planners in small sizes. Compilation dominates the time: two iterations, or none.
 FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
 NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
 # Of test_block, test_block_peers and test_block_library.
@@ -112,12 +111,12 @@ SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_n
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A planner with its cases, and what the contract has to know of both."""
+    """A planner with its cases."""
 
     planner: Any
     cases: Any  # of a number of them
-    broken: str  # place of a leaf of floats in the case
-    gradient: dict[str, Any] | None = None  # what to take the gradient of, and by what
+    broken: str  # name of a leaf of floats in the case
+    gradient: dict[str, Any] | None = None  # arguments of `pj.gradient`
 
     @functools.cached_property
     def batch(self):
@@ -163,7 +162,7 @@ def block(name, suite="pole", **options):
 
 
 ENTRIES = {
-    # Of the cost, which needs no adjoint: with it the program takes three times as long.
+    # The gradient of the cost needs no adjoint, whose program takes three times as long.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
     "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
     "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
@@ -194,7 +193,7 @@ ENTRIES = {
     "block online": block("online", **SMALL_SEARCH),
     "block brisk": block("brisk", **SMALL_SEARCH),
     "block direct": block("direct", points=6),
-    # Without a pole the first spline is found at once, long before the clock ends a search.
+    # Without a pole the first spline is found long before the time limit of a search.
     "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
     "block library": Entry(
         LibraryBlock(make_library(regime="R1")),
@@ -204,8 +203,8 @@ ENTRIES = {
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
-# They share their solver with others and take as long to compile, or by default they are planned
-# with, also where lanes are NaN or cannot be solved, in the modules of their tasks.
+# Planners that are slow here, because they share a solver with others, or because the modules of
+# their tasks make the same checks.
 LIKE_OTHERS = (
     *("hit bat", "hit bat-lite", "hit juggle", "catch exact", "catch catch"),
     *("intercept lattice", "intercept em", "intercept constant"),
@@ -214,7 +213,7 @@ LIKE_OTHERS = (
 
 
 def entries(*, on_host=True, slow=()):
-    """A parameter of every planner."""
+    """Parametrise a test by planners."""
     chosen = {name: entry for name, entry in ENTRIES.items() if on_host or not entry.on_host}
     return pytest.mark.parametrize(
         "entry",
@@ -226,33 +225,20 @@ def entries(*, on_host=True, slow=()):
 
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
-# By default these claims about one case are those of test_exact and test_decide, of programs that
-# they share with others.
+# By default test_exact and test_intercept check these claims, with programs of other tests.
 OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
-def inside(planner):
-    """The planner that plans, also behind a decision."""
-    return planner.inner
-
-
-def assert_equal(ours, theirs, lanes=slice(None)):
-    """All bits of some lanes."""
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(np.asarray(a)[lanes], np.asarray(b)[lanes])
-
-
 def assert_close(ours, theirs, tolerance=1e-3):
-    """The status, and all leaves relative to the largest number of each."""
+    """Assert equal statuses, and equal leaves relative to the largest number of each."""
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))  # others have to be equal
+        size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))  # others must be equal
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance * size)
 
 
 def with_nan(tree, name, k):
-    """The batch with NaN in lane k of one leaf."""
+    """Return the batch with NaN in lane k of one leaf."""
     first, _, rest = name.partition(".")
     leaf = getattr(tree, first)
     if rest:
@@ -263,7 +249,7 @@ def with_nan(tree, name, k):
 
 
 def all_nan(tree, k):
-    """The batch with NaN in lane k of every leaf of floats."""
+    """Return the batch with NaN in lane k of every leaf of floats."""
     tree = jax.tree.map(np.array, tree)
     for leaf in jax.tree.leaves(tree):
         if np.issubdtype(leaf.dtype, np.floating):
@@ -277,7 +263,7 @@ def test_a_nan_lane_says_so_and_leaves_its_neighbours_bits_alone(entry):
     found = pj.plan(entry.planner, jax.tree.map(jnp.asarray, broken))
     status = pj.Status.BAD_INPUT if has_rules(broken) else pj.Status.NON_FINITE
     assert list(found.status[np.array([1, 3])]) == [status] * 2
-    assert_equal(found, entry.plans, [0, 2, 4, 5])
+    assert_same(found, entry.plans, [0, 2, 4, 5])
 
 
 @every
@@ -315,7 +301,7 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
 @entries(on_host=False, slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
     monkeypatch.setattr(planner_module, "has_only_cpu", lambda: False)  # also in what is for a GPU
-    planner, case = inside(entry.planner), pj.take(entry.batch, 0)
+    planner, case = entry.planner.inner, pj.take(entry.batch, 0)
     for attempt in planner.attempts:
         assert_full_precision(lambda p, case, a=attempt: p.solve(case, a), planner, case)
         solve = lambda p, cases, a=attempt: p.solve_lanes(cases, a)  # noqa: E731
@@ -329,19 +315,18 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
 
 @pytest.fixture
 def traces(monkeypatch):
-    """Counts, in a list, how often planners are traced; for the planners that it is called with."""
+    """Return a function that lists, from the call on, the traces of a planner."""
     found = []
-
-    def noted(real):
-        def solve(self, cases, attempt):
-            found.append((type(self).__name__, attempt))
-            return real(self, cases, attempt)
-
-        return solve
 
     def count(planner):
         for name in {"solve", "solve_lanes"} & set(dir(planner)):
-            monkeypatch.setattr(type(planner), name, noted(getattr(type(planner), name)))
+            real = getattr(type(planner), name)
+
+            def solve(self, cases, attempt, real=real):
+                found.append((type(self).__name__, attempt))
+                return real(self, cases, attempt)
+
+            monkeypatch.setattr(type(planner), name, solve)
         return found
 
     return count
@@ -350,7 +335,7 @@ def traces(monkeypatch):
 @entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert entry.plans is not None  # planned once
-    found = traces(inside(entry.planner))
+    found = traces(entry.planner.inner)
     pj.plan(entry.planner, entry.cases(NUM + 3))  # jax arrays of another number
     found.clear()
     pj.plan(entry.planner, entry.cases(NUM + 3))
@@ -431,7 +416,7 @@ def test_a_derivative_is_refused_with_the_names_of_what_has_one(entry, call):
 
 @entries(slow=(*LIKE_OTHERS, "intercept spacetime"))
 def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
-    planner = inside(entry.planner)
+    planner = entry.planner.inner
     searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew
     if not (isinstance(planner, OptimisedPlanner) or searches_first):
         with pytest.raises(
@@ -441,7 +426,7 @@ def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
         assert "\n" not in str(caught.value)
         return
     found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
-    if not searches_first:  # the search goes on from where plans end
+    if not searches_first:  # the search continues from the plans
         assert (pj.solved(found.plans) | ~pj.solved(entry.plans)).all()
     there = np.isfinite(found.residual)
     assert found.residual.shape == found.value.shape == (NUM,)
@@ -461,7 +446,7 @@ def test_plans_are_read_from_a_file_as_they_were_written(entry, tmp_path):
         again = type(plans).load(path)
         assert type(again) is type(plans)
         assert jax.tree.structure(again) == jax.tree.structure(plans)
-        assert_equal(again, plans, ...)
+        assert_same(again, plans, ...)
 
 
 @every

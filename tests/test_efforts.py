@@ -1,4 +1,4 @@
-"""How much a planner is asked to do: which rounds that makes, and who has no such choice."""
+"""Efforts: the rounds that they make, and planners without efforts."""
 
 import pytest
 
@@ -13,12 +13,11 @@ from planner_jax.sweep.hit.settings import HitSettings
 def test_more_effort_is_a_longer_first_round_and_the_default_is_the_planner_itself(task):
     own = task.planner("exact")
     assert task.planner("exact", effort="feasible") == own
-    inside = lambda planner: planner.inner  # noqa: E731
-    rounds = [inside(task.planner("exact", effort=x)).rounds for x in ("feasible", "good", "best")]
+    rounds = [task.planner("exact", effort=x).inner.rounds for x in ("feasible", "good", "best")]
     assert len({each[1:] for each in rounds}) == 1
     feasible, good, best = (each[0] for each in rounds)
-    assert feasible == inside(own).rounds[0]
-    assert good.stages == best.stages == (Stage(feasible.solver),)  # and from there on Newton's
+    assert feasible == own.inner.rounds[0]
+    assert good.stages == best.stages == (Stage(feasible.solver),)
     assert isinstance(good.solver, pj.NewtonConfig) and isinstance(best.solver, pj.NewtonConfig)
     assert good.solver.max_steps < best.solver.max_steps
 

@@ -1,4 +1,4 @@
-"""The racket impact: what the bounce keeps, what it loses, and its inverse."""
+"""The racket impact: conserved quantities, losses, and the inverse."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ required = jax.jit(solve_impact)
 
 
 def split(vel):
-    """Speed along the normal, and velocity across it."""
+    """Return the speed along the normal and the velocity across it."""
     along = vel @ NORMAL
     return along, vel - along * NORMAL
 
@@ -63,13 +63,13 @@ def test_an_elastic_bounce_keeps_the_energy_and_a_plastic_one_leaves_ball_and_ra
 @float64
 @pytest.mark.parametrize("restitution", [0.0, 0.47, 0.7, 1.0])
 def test_the_solved_impact_inverts_the_bounce(restitution):
-    wanted = np.array([4.0, 1.5, 6.0])
-    normal, normal_speed = required(BALL_VEL, wanted, restitution)
+    after_hit = np.array([4.0, 1.5, 6.0])
+    normal, normal_speed = required(BALL_VEL, after_hit, restitution)
     np.testing.assert_allclose(np.linalg.norm(normal), 1.0, rtol=1e-15)
-    assert normal @ (wanted - BALL_VEL) > 0.0
+    assert normal @ (after_hit - BALL_VEL) > 0.0
     across = np.cross(normal, [0.3, -4.0, 1.0])
     after = bounce(BALL_VEL, normal_speed * normal + across, normal, restitution)
-    np.testing.assert_allclose(after, wanted, atol=1e-13)
+    np.testing.assert_allclose(after, after_hit, atol=1e-13)
 
 
 @float64
@@ -107,14 +107,14 @@ def test_no_change_of_velocity_needs_no_normal_and_has_a_finite_gradient():
 
 def test_batch_equals_loop_in_float32():
     balls = np.array([BALL_VEL, [0.0, 0.0, -2.0], [-9.0, 3.0, 1.0]], np.float32)
-    wanted = np.array([[4.0, 1.5, 6.0], [0.0, 0.0, 1.4], [3.0, -3.0, 7.0]], np.float32)
+    after_hit = np.array([[4.0, 1.5, 6.0], [0.0, 0.0, 1.4], [3.0, -3.0, 7.0]], np.float32)
     restitutions = np.array([0.7, 0.5, 0.9], np.float32)
-    many = jax.jit(jax.vmap(solve_impact))(balls, wanted, restitutions)
+    many = jax.jit(jax.vmap(solve_impact))(balls, after_hit, restitutions)
     normals, speeds = map(np.asarray, many)
     assert normals.dtype == speeds.dtype == np.float32
     for k in range(3):
-        normal, speed = required(balls[k], wanted[k], restitutions[k])
+        normal, speed = required(balls[k], after_hit[k], restitutions[k])
         np.testing.assert_allclose(normals[k], normal, atol=1e-6)
         np.testing.assert_allclose(speeds[k], speed, rtol=1e-6)
         after = bounce(balls[k], speed * normal, normal, restitutions[k])
-        np.testing.assert_allclose(after, wanted[k], atol=5e-6)
+        np.testing.assert_allclose(after, after_hit[k], atol=5e-6)

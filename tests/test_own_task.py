@@ -17,6 +17,7 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.registry import all_tasks
 from tests.sweeps import rows_of
+from tests.trees import assert_same
 
 OWN_TASK = Path(__file__).parent / "own_task"
 BROKEN = {
@@ -25,12 +26,12 @@ BROKEN = {
 }
 
 
-# From the command line: in processes of their own, or in this one, which has JAX already.
+# From the command line, in new processes, or in this one, which has already imported JAX.
 
 
 @pytest.fixture(scope="module")
 def meet():
-    """The task, on the path of packages for this module's tests."""
+    """Return the task, with its folder on the path of packages."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(OWN_TASK)
         all_tasks.cache_clear()
@@ -40,7 +41,7 @@ def meet():
 
 
 def process(folder, *arguments, path=()):
-    """A command in a folder, with the task and other folders where Python looks for packages."""
+    """Start a command in a folder, with the task and further folders on the path of packages."""
     others = [str(OWN_TASK), *map(str, path), os.environ.get("PYTHONPATH", "")]
     return subprocess.Popen(
         [sys.executable, "-m", "planner_jax", *arguments],
@@ -53,7 +54,7 @@ def process(folder, *arguments, path=()):
 
 
 def command(folder, *arguments, path=()):
-    """Exit code of a command, and what it prints."""
+    """Return exit code and output of a command."""
     running = process(folder, *arguments, path=path)
     out, err = running.communicate()
     return SimpleNamespace(code=running.returncode, out=out, err=err)
@@ -65,7 +66,7 @@ def manifest_of(folder):
 
 @pytest.fixture(scope="module")
 def swept(tmp_path_factory):
-    """The folder of a sweep, and what the command printed."""
+    """Return the folder of a sweep and the output of the command."""
     folder = tmp_path_factory.mktemp("own")
     done = command(folder, "sweep", "meet", "--num", "24", "--batch", "16", "--out", "run")
     assert done.code == 0, done.err
@@ -98,7 +99,7 @@ def test_the_rows_are_the_leaves_of_case_plan_and_verdict(swept, meet):
     cases, columns = meet.draw(24), {"case.most": "most", "case.target_pos": "target_pos"}
     for name, leaf in columns.items():
         np.testing.assert_array_equal(rows[name].to_pylist(), getattr(cases, leaf).tolist())
-    # By the program of the sweep.
+    # With the chunk size of the sweep, and so by the same program.
     plans = pj.plan(meet.planner(), jax.tree.map(np.asarray, cases), chunk=16)
     np.testing.assert_allclose(rows["plan.time"].to_numpy(), plans.time, rtol=1e-4)
     assert max(rows["verdict.miss"].to_pylist()) < 1e-3
@@ -114,19 +115,13 @@ def test_a_report_is_made_anew_from_the_folder(swept, meet, capsys):
 
 
 @pytest.mark.slow
-def test_a_sweep_by_a_planner_on_the_host(tmp_path):
-    done = command(tmp_path, "sweep", "meet", "--planner", "scipy", "--num", "6", "--out", "run")
-    assert done.code == 0, done.err
-    manifest = manifest_of(tmp_path / "run")
-    assert (manifest["summary"]["num"], manifest["summary"]["success_rate"]) == (6, 1.0)
-    assert manifest["parameters"]["planner"] == "scipy"
-
-
-@pytest.mark.slow
 def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     settings = ["--planner", "scipy", "--num", "6", "--batch", "1", "--out", "run"]
     whole = command(tmp_path, "sweep", "meet", *settings[:-1], "whole")
     assert whole.code == 0, whole.err
+    manifest = manifest_of(tmp_path / "whole")
+    assert (manifest["summary"]["num"], manifest["summary"]["success_rate"]) == (6, 1.0)
+    assert manifest["parameters"]["planner"] == "scipy"  # on the host
     with process(tmp_path, "sweep", "meet", *settings) as running:
         while not list(tmp_path.glob("run/plans/part-*.parquet")):
             assert running.poll() is None
@@ -141,24 +136,17 @@ def test_a_sweep_that_ctrl_c_stops_is_resumed_to_the_same_rows(swept, tmp_path):
     assert rows[0] == rows[1]
 
 
-def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path):
-    settings = ["--task", "meet", "--batch", "16", "--out", str(tmp_path / "run")]
-    assert main(["bench", "throughput", *settings]) == 0
+@pytest.mark.parametrize(("planner", "num"), [("smooth", 16), ("scipy", 2)])
+def test_throughput_is_measured_with_success_and_cost_beside(meet, tmp_path, planner, num):
+    """A planner that minimises nothing has no cost gap."""
+    settings = ["--task", "meet", "--planner", planner, "--batch", str(num), "--repeat", "1"]
+    assert main(["bench", "throughput", *settings, "--out", str(tmp_path / "run")]) == 0
     manifest = manifest_of(tmp_path / "run")
     summary = manifest["summary"]
     assert (manifest["kind"], manifest["state"]) == ("bench throughput", "complete")
-    assert (summary["num"], summary["success_rate"]) == (16, 1.0)
-    assert -1e-3 < summary["cost_gap_median"] <= summary["cost_gap_p90"] < 0.05
-
-
-def test_throughput_of_a_planner_that_minimises_nothing_has_no_cost_gap(meet, tmp_path):
-    settings = ["--planner", "scipy", "--batch", "2", "--repeat", "1", "--out"]
-    settings = ["--task", "meet", *settings, str(tmp_path / "run")]
-    assert main(["bench", "throughput", *settings]) == 0
-    summary = manifest_of(tmp_path / "run")["summary"]
-    assert (summary["num"], summary["success_rate"]) == (2, 1.0)
-    assert summary["cost_gap_median"] is None and summary["cost_gap_p90"] is None
-    assert summary["cost_gap_p99"] is None
+    assert (summary["num"], summary["success_rate"]) == (num, 1.0)
+    gaps = [summary[f"cost_gap_{name}"] for name in ("median", "p90", "p99")]
+    assert gaps == [None] * 3 if planner == "scipy" else -1e-3 < gaps[0] <= gaps[1] < 0.05
 
 
 def test_an_unknown_planner_is_one_line(tmp_path):
@@ -188,14 +176,12 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
 # From Python.
 
 
-def exact_planner(meet):
-    """The task's planner, searching until float64 has no more to give."""
+@pytest.fixture
+def exact(meet, float64):
+    """Return the task's planner with a search to the limits of float64, and six cases."""
     search = pj.LbfgsConfig(400, tolerance=1e-12, patience=20)
-    return meet.planner("smooth", rounds=(pj.Round(1, search),))
-
-
-def doubles(cases):
-    return jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), cases)
+    cases = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), meet.draw(6, seed=1))
+    return meet.planner("smooth", rounds=(pj.Round(1, search),)), cases
 
 
 @pytest.mark.parametrize("name", ["smooth", "scipy"])
@@ -209,12 +195,11 @@ def test_a_lane_that_is_not_finite_says_so_and_leaves_its_neighbours_alone(meet,
     verdict = meet.judge(cases, broken)
     assert verdict.success.tolist() == [True, True, False, True, True, True]
     assert verdict.sentence(2) == "not finite: the plan or its case is not finite"
-    for there, before in zip(jax.tree.leaves(broken), jax.tree.leaves(plans), strict=True):
-        np.testing.assert_array_equal(np.delete(there, 2, axis=0), np.delete(before, 2, axis=0))
+    assert_same(broken, plans, np.arange(6) != 2)
 
 
-def test_a_batch_has_the_plans_of_its_cases_one_by_one(meet, float64):
-    cases, planner = doubles(meet.draw(6, seed=1)), exact_planner(meet)
+def test_a_batch_has_the_plans_of_its_cases_one_by_one(exact):
+    planner, cases = exact
     plans = pj.plan(planner, cases)
     assert len(set(plans.iterations.tolist())) > 1  # unequal lanes
     for k in range(6):
@@ -223,14 +208,14 @@ def test_a_batch_has_the_plans_of_its_cases_one_by_one(meet, float64):
         np.testing.assert_allclose(alone.acc, plans.acc[k], atol=1e-6)
 
 
-def test_the_gradient_is_that_of_plans_made_anew(meet, float64):
-    cases, planner = doubles(meet.draw(6, seed=1)), exact_planner(meet)
+def test_the_gradient_is_that_of_plans_made_anew(exact):
+    planner, cases = exact
     found = pj.gradient(planner, cases, of="time", by="most", steps=3)
     apart = 1e-4 * cases.most
     later, sooner = (pj.plan(planner, cases.replace(most=cases.most + d)) for d in (apart, -apart))
     slope = (later.time - sooner.time) / (2.0 * apart)
     np.testing.assert_allclose(found.by["most"], slope, rtol=1e-4)
-    assert (slope < 0.0).all()  # who may accelerate more is there earlier
+    assert (slope < 0.0).all()  # more acceleration means an earlier meeting
 
 
 def test_a_planner_on_the_host_has_no_gradient_and_says_so(meet):

@@ -1,4 +1,4 @@
-"""Reading batches: `pj.take` and `pj.solved`, verdicts of one case, draws that go on."""
+"""Reading batches by `pj.take` and `pj.solved`, verdicts on single cases, further draws."""
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +12,7 @@ from planner_jax.core.registry import all_tasks
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import REAL_SCENARIOS
+from tests.trees import assert_same
 
 TASKS = ("hit", "catch")
 SUITES = [(name, suite) for name in TASKS for suite in all_tasks()[name].suites]
@@ -21,10 +22,9 @@ CHEAP = {
 }
 
 
-def assert_same(ours, theirs):
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        assert a.dtype == b.dtype
-        np.testing.assert_array_equal(a, b)
+@pytest.fixture(params=TASKS)
+def task(request):
+    return pj.task_named(request.param)
 
 
 # Lanes.
@@ -33,38 +33,16 @@ def assert_same(ours, theirs):
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_a_lane_is_an_entry_of_every_leaf(array):
     cases = jax.tree.map(array, pj.hit.draw(5))
-    one, some, picked = (
-        pj.take(cases, 3),
-        pj.take(cases, slice(1, 3)),
-        pj.take(cases, np.array([4, 0])),
-    )
-    assert type(one) is type(cases)
-    assert (one.batch_shape, some.batch_shape, picked.batch_shape) == ((), (2,), (2,))
-    for whole, a, b, c in zip(*map(jax.tree.leaves, (cases, one, some, picked)), strict=True):
-        np.testing.assert_array_equal(a, whole[3])
-        np.testing.assert_array_equal(b, whole[1:3])
-        np.testing.assert_array_equal(c, np.asarray(whole)[[4, 0]])
+    for lanes, shape in ((3, ()), (slice(1, 3), (2,)), (np.array([4, 0]), (2,))):
+        some = pj.take(cases, lanes)
+        assert type(some) is type(cases) and some.batch_shape == shape
+        assert_same(some, jax.tree.map(lambda leaf, at=lanes: np.asarray(leaf)[at], cases))
 
 
 def test_a_lane_that_is_not_there_is_an_error():
     cases = jax.tree.map(np.asarray, pj.hit.draw(2))
     with pytest.raises(IndexError):
         pj.take(cases, 2)
-
-
-@pytest.mark.parametrize("task", TASKS)
-def test_a_lane_of_a_verdict_is_a_verdict(task):
-    task = pj.task_named(task)
-    cases = task.draw(4)
-    verdict = task.judge(cases, pj.plan(CHEAP[task.name](), cases))
-    assert isinstance(verdict, pj.Verdict)
-    for k in range(4):
-        one = pj.take(verdict, k)
-        assert type(one) is type(verdict)
-        assert np.shape(one.success) == () and one.success == verdict.success[k]
-        assert one.sentence() == verdict.sentence(k)
-    some = pj.take(verdict, verdict.success)
-    assert some.success.all() and some.success.shape == (verdict.success.sum(),)
 
 
 def test_solved_is_read_from_the_status():
@@ -77,32 +55,31 @@ def test_solved_is_read_from_the_status():
     resident = pj.solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
     assert pj.solved(pj.take(plans, 1)) and not pj.solved(pj.take(plans, 4))
-    # What is broken, blocked, without a way or too far is neither solved nor worth another attempt.
+    # Broken, blocked, unreachable or too distant cases are unsolved, but need no further attempt.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 
 
 # Verdicts.
 
 
-@pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_a_verdict_on_one_plan_is_that_of_its_lane(task, array):
-    task = pj.task_named(task)
     cases = jax.tree.map(array, task.draw(4))
     plans = pj.plan(CHEAP[task.name](), cases)
     together = task.judge(cases, plans)
-    assert together.success.shape == (4,)
+    assert isinstance(together, pj.Verdict) and together.success.shape == (4,)
     for k in range(4):
         alone = task.judge(pj.take(cases, k), pj.take(plans, k))
-        assert np.shape(alone.success) == ()
-        assert alone.sentence() == together.sentence(k)
-        for name in vars(alone):
-            np.testing.assert_array_equal(getattr(alone, name), getattr(together, name)[k])
+        for one in (alone, pj.take(together, k)):
+            assert type(one) is type(together) and np.shape(one.success) == ()
+            assert one.sentence() == together.sentence(k)
+            for name in vars(one):
+                np.testing.assert_array_equal(getattr(one, name), getattr(together, name)[k])
+    some = pj.take(together, together.success)
+    assert some.success.all() and some.success.shape == (together.success.sum(),)
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_a_verdict_names_the_failure_with_when_and_by_how_much(task):
-    task = pj.task_named(task)
+def test_a_verdict_names_the_failure_its_time_and_its_size(task):
     cases = task.draw(2)
     plans = pj.plan(CHEAP[task.name](), cases)
     coeffs = np.array(plans.trajectory.coeffs)
@@ -116,46 +93,38 @@ def test_a_verdict_names_the_failure_with_when_and_by_how_much(task):
     assert set(verdict.SENTENCES) > {"head state", "not finite"}
 
 
-@pytest.mark.parametrize("task", TASKS)
 def test_only_cases_and_plans_of_the_task_are_judged(task):
-    own, other = pj.task_named(task), pj.task_named(TASKS[1 - TASKS.index(task)])
-    cases, strangers = own.draw(2), other.draw(2)
-    plans = pj.plan(CHEAP[task](), cases)
+    cases, strangers = task.draw(2), pj.task_named(TASKS[1 - TASKS.index(task.name)]).draw(2)
+    plans = pj.plan(CHEAP[task.name](), cases)
     with pytest.raises(TypeError, match=r"^cases must be a \w+Case, got a \w+Case$"):
-        own.judge(strangers, plans)
-    with pytest.raises(TypeError, match=r"^plans must be a \w+Plan, got a Place$"):
-        own.judge(cases, Place())
+        task.judge(strangers, plans)
+    with pytest.raises(TypeError, match=r"^plans must be a \w+Plan, got a list$"):
+        task.judge(cases, [])
     with pytest.raises(ValueError, match="samples must be >= 200, got 50"):
-        own.judge(cases, plans, samples=50)
-
-
-class Place:
-    """No plan."""
+        task.judge(cases, plans, samples=50)
 
 
 # Draws.
 
 
-@pytest.mark.parametrize(("task", "suite"), SUITES)
-def test_a_draw_from_further_on_is_the_tail_of_one_from_the_beginning(task, suite):
-    draw = pj.task_named(task).draw
+@pytest.mark.parametrize(("task_name", "suite"), SUITES)
+def test_a_draw_from_further_on_is_the_tail_of_one_from_the_beginning(task_name, suite):
+    draw = pj.task_named(task_name).draw
     whole = draw(12, suite, 3)
     for first, num in ((1, 11), (5, 3), (11, 1)):
         assert_same(draw(num, suite, 3, first=first), pj.take(whole, slice(first, first + num)))
 
 
-@pytest.mark.parametrize(("task", "suite"), SUITES)
-def test_another_seed_is_another_draw_and_the_type_is_that_asked_for(task, suite, float64):
-    draw = pj.task_named(task).draw
+@pytest.mark.parametrize(("task_name", "suite"), SUITES)
+def test_another_seed_is_another_draw_and_the_type_is_the_requested_one(task_name, suite, float64):
+    draw = pj.task_named(task_name).draw
     one, other = draw(3, suite, 0, dtype=jnp.float64), draw(3, suite, 1, dtype=jnp.float64)
     pairs = list(zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
     assert any((a != b).any() for a, b in pairs)
     assert {leaf.dtype.name for leaf, _ in pairs} <= {"float64", "int32", "bool"}
 
 
-@pytest.mark.parametrize("task", TASKS)
 def test_without_a_name_the_first_suite_is_drawn(task):
-    task = pj.task_named(task)
     assert_same(task.draw(3), task.draw(3, next(iter(task.suites)), 0))
 
 
@@ -172,16 +141,13 @@ def test_a_real_scenario_has_its_two_of_the_court_in_equal_shares():
     assert (landed == near).sum() == (landed == far).sum() == 100
 
 
-@pytest.mark.parametrize("task", TASKS)
 def test_a_draw_cannot_begin_before_its_first_case(task):
     with pytest.raises(ValueError, match="first must be >= 0, got -1"):
-        pj.task_named(task).draw(1, first=-1)
+        task.draw(1, first=-1)
 
 
-@pytest.mark.parametrize("task", TASKS)
 def test_weaker_limits_are_drawn_by_their_scale(task):
-    draw = pj.task_named(task).draw
-    whole, half = draw(2), draw(2, limit_scale=0.5)
+    whole, half = task.draw(2), task.draw(2, limit_scale=0.5)
     np.testing.assert_allclose(half.limits.speed, 0.5 * np.asarray(whole.limits.speed))
     np.testing.assert_allclose(half.limits.body_rate, 0.5 * np.asarray(whole.limits.body_rate))
     assert_same(half.head_state, whole.head_state)

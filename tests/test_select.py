@@ -1,4 +1,4 @@
-"""Which of two plans is selected: one that keeps limits, then the cheaper, then the nearer one."""
+"""Selection of plans: feasible before infeasible, then by cost, or else by violation."""
 
 from types import SimpleNamespace
 
@@ -12,7 +12,7 @@ GOOD, BAD = Status.FEASIBLE, Status.MAX_STEPS
 
 
 def plans(*rows, xp=np):
-    """A batch of plans from rows of status, cost and violation."""
+    """Return a batch of plans from rows of status, cost and violation."""
     status, cost, violation = zip(*rows, strict=True)
     return Plan(
         cost=xp.asarray(cost, xp.float32),
@@ -51,7 +51,7 @@ def test_plans_on_the_host_are_changed_in_place_and_only_in_the_lanes_that_were_
     assert before.cost.tolist() == [5.0, 1.0, 5.0, 5.0]
 
 
-def test_with_a_tolerance_the_violation_says_what_keeps_limits_and_a_share_what_is_cheaper():
+def test_a_tolerance_and_a_share_decide_what_is_feasible_and_what_is_cheaper():
     of = lambda violation, cost: SimpleNamespace(violation=violation, cost=cost)  # noqa: E731
     options = {"tolerance": 0.01, "share": 0.95}
     assert is_better(of(0.005, 0.9), of(0.0, 1.0), **options)

@@ -1,4 +1,4 @@
-"""`plan` on a toy planner: rounds, packing, padding and status, without any physics."""
+"""`plan` with a toy planner without physics: rounds, packing, padding and statuses."""
 
 import dataclasses
 
@@ -14,11 +14,12 @@ from planner_jax.optimise.planner import OptimisedPlanner, pending
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round, Stage
 from planner_jax.planning import batch
 from planner_jax.planning.plan import plan, solve
+from tests.trees import assert_same
 
 
 @struct.dataclass
 class Well:
-    """Reach `goal`, which lies behind a ridge unless the start is on its side."""
+    """A goal that may lie behind a ridge of the cost."""
 
     goal: Array  # ()
 
@@ -38,7 +39,7 @@ TRACES = []
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WellPlanner(OptimisedPlanner):
-    """Guesses at 0 and 4; goals above 2 are only found from the second."""
+    """Starts at 0 and 4; only the second start finds goals above 2."""
 
     rounds: tuple[Round, ...] = (
         Round(1, LbfgsConfig(max_steps=40, step_cap=0.2)),
@@ -81,31 +82,31 @@ def test_a_single_case_equals_its_lane_in_a_batch():
         assert alone.status == batch.status[lane]
 
 
-def _kept(keep):
-    """A look at both guesses, and a search from those that are kept."""
-    look, search = (LbfgsConfig(max_steps=num, step_cap=0.2) for num in (3, 40))
-    return WellPlanner(rounds=(Round(2, search, stages=(Stage(look, keep=keep),)),))
+def keep_starts(keep):
+    """Make a planner with a short search from both starts, and a long one from the best."""
+    short, long = (LbfgsConfig(max_steps=num, step_cap=0.2) for num in (3, 40))
+    return WellPlanner(rounds=(Round(2, long, stages=(Stage(short, keep=keep),)),))
 
 
 @pytest.mark.parametrize("keep", [1, 2, 5])
 def test_the_starts_that_a_stage_keeps_are_those_that_cost_least_by_then(keep):
-    plans = plan(_kept(keep), Well(GOALS))
+    plans = plan(keep_starts(keep), Well(GOALS))
     assert is_solved(plans.status).all()
     np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
     for lane, goal in enumerate(GOALS):
-        alone = plan(_kept(keep), Well(goal))
+        alone = plan(keep_starts(keep), Well(goal))
         np.testing.assert_allclose(alone.point, plans.point[lane], rtol=1e-5, atol=1e-5)
         assert alone.status == plans.status[lane]
         assert alone.iterations == plans.iterations[lane] > 3
 
 
-def test_a_start_whose_cost_is_not_finite_is_the_last_to_be_kept():
+def test_a_start_whose_cost_is_not_finite_is_the_last_to_bekeep_starts():
     @jax.tree_util.register_static
     class Cliff(WellPlanner):
         def guesses(self, context, num):
             return jnp.array([[jnp.nan], [context.goal]])[:num]
 
-    plans = plan(Cliff(rounds=_kept(1).rounds), Well(GOALS))
+    plans = plan(Cliff(rounds=keep_starts(1).rounds), Well(GOALS))
     np.testing.assert_allclose(plans.point[:, 0], GOALS, atol=0.05)
 
 
@@ -128,7 +129,7 @@ def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
     with jax.enable_x64(True):
         found = plan(WellPlanner(), Well(goals), chunk=16).point[:, 0]
     assert found.dtype == np.float64
-    assert (found != found.astype(np.float32)).all()  # none has gone through a shorter type
+    assert (found != found.astype(np.float32)).all()  # no number has passed through float32
 
 
 def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
@@ -141,10 +142,8 @@ def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
 
 def test_a_plans_shapes_are_known_without_planning():
     shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
-    made = plan(WellPlanner(), Well(GOALS))
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), shapes) == jax.tree.map(
-        lambda x: (x.shape, x.dtype), made
-    )
+    found = jax.eval_shape(lambda plans: plans, plan(WellPlanner(), Well(GOALS)))
+    assert jax.tree.leaves(shapes) == jax.tree.leaves(found)
 
 
 def test_a_lane_that_is_not_finite_says_so_and_spoils_no_neighbour():
@@ -205,30 +204,29 @@ def test_arrays_on_a_device_stay_there_and_give_the_same_plans(apart, monkeypatc
     goals = np.linspace(-1.0, 5.0, 41).astype(np.float32)
     host = plan(WellPlanner(), Well(goals), chunk=16)
     resident = plan(WellPlanner(), Well(jnp.asarray(goals)), chunk=16)
-    for ours, theirs in zip(jax.tree.leaves(resident), jax.tree.leaves(host), strict=True):
-        assert isinstance(ours, jax.Array)
-        assert isinstance(theirs, np.ndarray)
-        np.testing.assert_array_equal(ours, theirs)
+    for plans, kind in ((resident, jax.Array), (host, np.ndarray)):
+        assert all(isinstance(leaf, kind) for leaf in jax.tree.leaves(plans))
+    assert_same(resident, host)
 
 
 def test_a_later_round_takes_only_what_is_unsolved(monkeypatch):
-    """On a device that is not the host: also where the last lane fills up the last chunk."""
+    """On a device other than the host, also where copies of a lane fill up the last chunk."""
     monkeypatch.setattr(batch, "is_one_cpu", lambda mesh: False)
-    sizes, real = [], batch.solve_on_devices
+    sizes, solve_on_devices = [], batch.solve_on_devices
 
-    def noted(planner, attempt, mesh, cases):
+    def note_size(planner, attempt, mesh, cases):
         sizes.append(cases.goal.size)
-        return real(planner, attempt, mesh, cases)
+        return solve_on_devices(planner, attempt, mesh, cases)
 
-    monkeypatch.setattr(batch, "solve_on_devices", noted)
+    monkeypatch.setattr(batch, "solve_on_devices", note_size)
     goals = np.full(300, 0.5, np.float32)
     goals[[7, -1]] = 3.5
     assert is_solved(plan(WellPlanner(), Well(jnp.asarray(goals))).status).all()
-    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]  # the first two at once
+    assert sorted(sizes[:2]) == [128, 256] and sizes[2:] == [16]  # the first two calls run at once
 
 
-def _near(within):
-    """A second round for what the first leaves no farther off than this."""
+def retry_within(within):
+    """Make a planner whose second round is for violations up to a bound."""
     first, second = WellPlanner().rounds
     return WellPlanner(rounds=(first, dataclasses.replace(second, within=within)))
 
@@ -237,7 +235,7 @@ def _near(within):
 def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch):
     goals = np.array([0.5, 3.8, 3.4, 4.5], np.float32)  # all but the first behind the ridge
 
-    def planned(planner):
+    def plan_goals(planner):
         if kind == "one by one":
             plans = [plan(planner, Well(goal)) for goal in goals]
             return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
@@ -248,16 +246,16 @@ def test_a_round_leaves_alone_what_is_farther_off_than_it_says(kind, monkeypatch
             return plan(planner, Well(jnp.asarray(goals)))
         return plan(planner, Well(goals))
 
-    first = planned(WellPlanner(rounds=WellPlanner().rounds[:1]))
+    first = plan_goals(WellPlanner(rounds=WellPlanner().rounds[:1]))
     order = np.argsort(np.asarray(first.violation)[1:]) + 1
     nearest, middle = np.asarray(first.violation)[order[:2]]
-    near = planned(_near(0.5 * (nearest + middle)))
+    near = plan_goals(retry_within(0.5 * (nearest + middle)))
     solved = is_solved(np.asarray(near.status))
     assert list(np.flatnonzero(solved)) == sorted([0, order[0]])
     left = [lane for lane in range(4) if not solved[lane]]
     points = (np.asarray(plans.point)[left] for plans in (near, first))
     np.testing.assert_array_equal(*points)
-    assert is_solved(np.asarray(planned(_near(None)).status)).all()
+    assert is_solved(np.asarray(plan_goals(retry_within(None)).status)).all()
 
 
 def test_a_round_behind_one_that_had_nothing_to_try_is_made():

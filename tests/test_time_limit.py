@@ -1,4 +1,4 @@
-"""How long planning may take, and what it says meanwhile: the clock moves with every report."""
+"""Time limits and reports of progress, by a clock that moves with every report."""
 
 import dataclasses
 import types
@@ -14,11 +14,12 @@ from jax import Array
 import planner_jax as pj
 from planner_jax.planning import batch as watch
 from planner_jax.planning.decided import DecidedPlanner
+from tests.trees import assert_same
 
 
 @struct.dataclass
 class Task:
-    """Solved by the round of this number."""
+    """A case that the round of this number solves."""
 
     number: Array  # ()
 
@@ -59,7 +60,7 @@ class OnHost(pj.Planner):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class TwoWays:
-    """A decision between two choices, neither of which is better."""
+    """A decision between two equal choices."""
 
     def check(self, cases):
         pass
@@ -76,16 +77,15 @@ class TwoWays:
 
 @pytest.fixture
 def clock(monkeypatch):
-    """A clock, and a `progress` that notes what it is told and moves it on by a second."""
-    now = [0.0]
+    """Return a `progress` that stores its reports and advances a fake clock by one second."""
+    now, reports = [0.0], []
     monkeypatch.setattr(watch, "time", types.SimpleNamespace(monotonic=lambda: now[0]))
-    told = []
 
     def progress(report):
-        told.append(report)
+        reports.append(report)
         now[0] += 1.0
 
-    return types.SimpleNamespace(told=told, progress=progress)
+    return types.SimpleNamespace(reports=reports, progress=progress)
 
 
 NUMBERS = np.array([1.0, 3.0, 0.5, 2.0, 9.0], np.float32)
@@ -108,8 +108,7 @@ def test_no_round_begins_after_its_time_and_what_is_solved_keeps_its_bits(planne
     found = pj.plan(planner, cases, time_limit=1.0, progress=clock.progress)
     late = NUMBERS > 1.0
     assert (np.asarray(found.status)[late] == pj.Status.OUT_OF_TIME).all()
-    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(free), strict=True):
-        np.testing.assert_array_equal(np.asarray(ours)[~late], np.asarray(theirs)[~late])
+    assert_same(found, free, ~late)
 
 
 def test_one_case_stops_too(clock):
@@ -119,22 +118,22 @@ def test_one_case_stops_too(clock):
 
 
 def test_chunks_of_a_round_are_not_begun_after_the_time(clock):
-    """The second round is reported to begin at 3 s, which takes until 4 s."""
+    """The second round is reported to start at 3 s, and the report takes until 4 s."""
     numbers = np.full(32, 2.0, np.float32)
     found = pj.plan(Rounds(), Task(numbers), chunk=16, time_limit=3.5, progress=clock.progress)
     assert (found.status == pj.Status.OUT_OF_TIME).all()
-    last = clock.told[-1]
+    last = clock.reports[-1]
     assert (last.round, last.tried, last.cases) == (2, 0, 32)
 
 
 def test_all_attempts_are_reported_and_a_report_is_a_line(clock):
     pj.plan(Rounds(), Task(NUMBERS), progress=clock.progress)
-    assert [(one.round, one.tried, one.cases) for one in clock.told] == [
+    assert [(one.round, one.tried, one.cases) for one in clock.reports] == [
         *((1, 0, 5), (1, 5, 5)),
         *((2, 0, 3), (2, 3, 3)),
         *((3, 0, 2), (3, 2, 2)),
     ]
-    assert str(clock.told[3]) == "round 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
+    assert str(clock.reports[3]) == "round 2 of at most 3: 3 of 3 cases tried, after 3.0 s"
 
 
 @pytest.mark.parametrize(

@@ -170,7 +170,7 @@ def case(
     require_path("targets", targets, shape, 3, "horizon")
     tool = require_tool(robot, NET)
     shares = np.arange(1, num + 1) / (num + 1.0)
-    made = CatchCase(
+    cases = CatchCase(
         targets=targets,
         present=_broadcast_present(present, shape),
         horizon=leaf("horizon", horizon, num),
@@ -195,9 +195,9 @@ def case(
         extras=for_batch(extras, batch, dtype),
         optional=optional,
     )
-    require_sound(made, _ARGUMENTS)
-    require_start(made)
-    return made
+    require_sound(cases, _ARGUMENTS)
+    require_start(cases)
+    return cases
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:

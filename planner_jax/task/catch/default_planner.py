@@ -257,12 +257,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         """Return the point (n,) that describes given catches: the inverse of `decode`.
 
         Balls off the net's plane are projected onto it, and balls outside of the hoop onto its rim.
-
-        Args:
-            context: case with its targets in the order of catching.
-            durations: (N,) [s], of the segments.
-            tail_states: (N, 4, 3) position to jerk of the quadrotor at the catches.
-            offsets: (N, M - 1, 3) whitened waypoint offsets.
+        Segments have durations (N,) [s], states of the quadrotor at the catches (N, 4, 3), and
+        whitened waypoint offsets (N, M - 1, 3).
         """
         case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))

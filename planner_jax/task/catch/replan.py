@@ -96,15 +96,10 @@ class ReplanCatch(OptimisedPlanner):
     ) -> Replanning:
         """Return the remaining case, or batch, some time into its plan.
 
-        Caught targets become absent; the others keep their order. `pj.replan` describes the first
-        three arguments and the errors.
-
-        Args:
-            cases: planned cases.
-            previous: plans of the cases.
-            elapsed: () or (B,) [s].
-            targets: estimated paths, shapes as in the cases, time 0 now.
-            head_state: (4, 3) or (B, 4, 3) state of the quadrotor; by default the plan's.
+        Caught targets become absent; the others keep their order. `pj.replan` describes `cases`,
+        `previous`, `elapsed` and the errors. The estimated `targets` have the shapes of the cases'
+        targets, and their time 0 is the present. The quadrotor's `head_state`, (4, 3) or (B, 4, 3),
+        is by default the state in the plan.
         """
         elapsed = moment_of(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)

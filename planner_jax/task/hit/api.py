@@ -89,12 +89,12 @@ def planner(
         TypeError: the planner has no such field.
         ModuleNotFoundError: the planner needs an extra that is not installed.
     """
-    made = TASK.make_planner(name, options).with_effort(effort)
+    own = TASK.make_planner(name, options).with_effort(effort)
     if recovery is None:
-        return made
+        return own
     from planner_jax.recovery.with_recovery import add_recovery  # few hits need it
 
-    return add_recovery(made, recovery)
+    return add_recovery(own, recovery)
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:

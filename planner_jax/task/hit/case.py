@@ -160,7 +160,7 @@ def case(
     def leaf(name: str, value: object, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
 
-    made = HitCase(
+    cases = HitCase(
         ball=BallState(pos=leaf("serve_pos", serve_pos, 3), vel=leaf("serve_vel", serve_vel, 3)),
         head_state=hover_at(start, batch, dtype),
         target=leaf("target", target, 3),
@@ -190,8 +190,8 @@ def case(
             "racket_radius", tool.radius if racket_radius is None else racket_radius
         ),
     )
-    require_sound(made, _ARGUMENTS)
-    require_start(made)
-    height = np.asarray(made.ball.pos)[..., 2]
+    require_sound(cases, _ARGUMENTS)
+    require_start(cases)
+    height = np.asarray(cases.ball.pos)[..., 2]
     require_rule("serve_pos", height, height >= 0.0, "at a height >= 0 m", batch)
-    return made
+    return cases

@@ -68,15 +68,9 @@ class ReplanHit(OptimisedPlanner):
     ) -> Replanning:
         """Return the remaining case, or batch, some time into its plan.
 
-        `pj.replan` describes the first three arguments and the errors.
-
-        Args:
-            cases: planned cases.
-            previous: plans of the cases.
-            elapsed: () or (B,) [s].
-            ball: estimated ball, leaves (3,) or (B, 3).
-            drag: () or (B,) K_D [1/m]; by default the drag of the cases.
-            head_state: (4, 3) or (B, 4, 3) state of the quadrotor; by default the plan's.
+        `pj.replan` describes `cases`, `previous`, `elapsed` and the errors. The estimated `ball`
+        has leaves (3,) or (B, 3). The `drag` K_D [1/m], () or (B,), is by default the drag of the
+        cases, and the quadrotor's `head_state`, (4, 3) or (B, 4, 3), the state in the plan.
         """
         elapsed = moment_of(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)

@@ -103,11 +103,8 @@ def generate_serves(
     the vertical speed are uniform and determine the horizontal velocity, and a draw is accepted
     with a probability proportional to |d horizontal velocity / d landing point|.
 
-    Args:
-        num: as in `pj.hit.draw`, also for the errors.
-        seed: as in `pj.hit.draw`.
-        scenarios: names in court.SCENARIOS; all of them by default.
-        first: as in `pj.hit.draw`.
+    The `scenarios` are names in court.SCENARIOS, by default all of them. Further arguments and the
+    errors are as in `pj.hit.draw`.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
