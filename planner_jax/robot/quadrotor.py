@@ -199,29 +199,28 @@ def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
 
 
 def beyond_reach(
-    places: Array, times: Array, head_state: Array, limits: QuadrotorLimits, gravity: Array
+    positions: Array, times: Array, head_state: Array, limits: QuadrotorLimits, gravity: Array
 ) -> Array:
-    """Return lower bounds (K,) [m] on the distances from targets that a quadrotor cannot close.
+    """Return lower bounds (K,) [m] on a quadrotor's distances from positions at given times.
 
-    Zero or less means that a target may be reached. At the time t the quadrotor is in each of
+    Zero or less means that the position may be reached. At the time t the quadrotor is in each of
 
     - the ball around the start whose radius is the integral of the greatest speed, which rises
       with the greatest acceleration A up to its limit,
     - the ball of radius A t^2 / 2 around the position that the first velocity alone leads to,
     - the ball of radius T t^2 / 2 around the position in free fall, with the greatest thrust T,
 
-    where such limits exist. The balls are exact bounds, since the mean of accelerations lies in a
-    ball that contains all of them.
+    where such limits exist: the mean of accelerations lies in every ball that contains all of them.
 
     Args:
-        places: (K, 3) [m], positions of the targets at the times.
+        positions: (K, 3) [m], one for each time.
         times: (K,) [s], >= 0.
         head_state: (4, 3), state of the quadrotor at time 0.
         limits: limits of the quadrotor.
         gravity: () [m/s^2], magnitude.
     """
     start, vel = head_state[0], head_state[1]
-    x, y, z = (place - start[k] for k, place in enumerate(components(places)))
+    x, y, z = (each - start[k] for k, each in enumerate(components(positions)))
     half_square = 0.5 * jnp.maximum(times, _SHORTEST) ** 2
     thrust = _greatest_thrust(limits)
     acceleration = _greatest_acceleration(limits, thrust, gravity)

@@ -376,7 +376,7 @@ def _parse(part: Value, kind: str, span: bool) -> list[float]:
 
 
 def _has_unit(value: Value) -> bool:
-    """Return whether no number in a value lacks a unit; a value without numbers passes."""
+    """Return whether all numbers in a value have units; true for a value without numbers."""
     if isinstance(value, list | tuple):
         return all(map(_has_unit, value))
     if isinstance(value, str):

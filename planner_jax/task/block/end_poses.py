@@ -106,7 +106,7 @@ def end_poses(
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return the angles (..., 6) [rad] at which joints stop if they brake in the first piece."""
+    """Return the angles (..., 6) [rad] at which joints stop if they brake evenly in piece 1."""
     of_first = step_weights(pieces, (1.0,))[0][0]
     return case.angles + of_first * duration[..., None] * case.rates
 
