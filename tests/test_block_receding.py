@@ -152,21 +152,14 @@ def test_contradictory_settings_are_rejected(given, name):
 
 @pytest.mark.slow
 def test_sweeps_report_observations_and_planning_times(tmp_path):
-    seen = BlockSettings(planner="direct", regime="R1", wide=True, num=4, perception=True)
-    manifest = start_sweep(TASK, seen, tmp_path / "seen", progress=False)
-    assert 0.0 < manifest["summary"]["fit_error_median"] < 0.3
-    counted = BlockSettings(planner="direct", regime="R1", num=4, planning_budget=0.0)
-    manifest = start_sweep(TASK, counted, tmp_path / "counted", progress=False)
-    assert 0.0 < manifest["summary"]["planning_p50"] <= manifest["summary"]["planning_p99"]
-    assert (
-        start_sweep(
-            TASK,
-            dataclasses.replace(counted, planning_budget=5.0),
-            tmp_path / "late",
-            progress=False,
-        )["summary"]["successes"]
-        == 0
-    )  # the ball arrives earlier
+    def sweep(name, **options):
+        settings = BlockSettings(planner="direct", regime="R1", num=4, **options)
+        return start_sweep(TASK, settings, tmp_path / name, progress=False)["summary"]
+
+    assert 0.0 < sweep("seen", wide=True, perception=True)["fit_error_median"] < 0.3
+    counted = sweep("counted", planning_budget=0.0)
+    assert 0.0 < counted["planning_p50"] <= counted["planning_p99"]
+    assert sweep("late", planning_budget=5.0)["successes"] == 0  # the ball arrives earlier
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):

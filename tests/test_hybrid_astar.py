@@ -15,6 +15,7 @@ pytest.importorskip("numba", reason="needs the extra baselines")
 from planner_jax.baselines.intercept import hybrid_astar_kernels as kernels  # noqa: E402
 
 CURVATURE, BODY, MIDDLE = 2.0, (-0.05, 0.35, 0.125), 0.15
+CAR_AND_MAP = {"curvature": CURVATURE, "body": BODY, "lower": (0.0, 0.0), "upper": (8.0, 8.0)}
 START = np.array([0.8, 4.0, 0.0])
 DEFAULT = HybridAstar()
 
@@ -28,17 +29,9 @@ TRAP = [box(4.0, 2.5, 4.2, 5.5), box(2.6, 2.5, 4.0, 2.7), box(2.6, 5.3, 4.0, 5.5
 
 
 def find_path(meeting, polygons=(), end_heading=None, start=START, **settings):
-    return hybrid_astar(
-        start,
-        meeting,
-        obstacles(polygons),
-        curvature=CURVATURE,
-        body=BODY,
-        lower=(0.0, 0.0),
-        upper=(8.0, 8.0),
-        end_heading=end_heading,
-        settings=dataclasses.replace(DEFAULT, **settings),
-    )
+    chosen = dataclasses.replace(DEFAULT, **settings)
+    options = {"end_heading": end_heading, "settings": chosen}
+    return hybrid_astar(start, meeting, obstacles(polygons), **CAR_AND_MAP, **options)
 
 
 def rear(meeting, heading):
@@ -216,8 +209,7 @@ def test_a_mirrored_case_has_the_mirrored_path():
     ],
 )
 def test_arguments_out_of_range_are_rejected(change, message):
-    given = {"start": START, "meeting": (6.0, 4.0), "walls": obstacles([])}
-    given |= {"curvature": CURVATURE, "body": BODY, "lower": (0.0, 0.0), "upper": (8.0, 8.0)}
+    given = {"start": START, "meeting": (6.0, 4.0), "walls": obstacles([]), **CAR_AND_MAP}
     with pytest.raises(ValueError, match=message):
         hybrid_astar(**(given | change))
 

@@ -35,16 +35,16 @@ def paths(goals):
         path = dubins(jnp.asarray(START), goal, 0.8 * CURVATURE)
         poses = sample_dubins(path, NUM)
         spacing = path.length / (NUM - 1)
-        bends = jnp.diff(poses[:, 2]) / spacing
-        return poses, jnp.append(bends, bends[-1]), path.length
+        curvatures = jnp.diff(poses[:, 2]) / spacing
+        return poses, jnp.append(curvatures, curvatures[-1]), path.length
 
     return jax.vmap(one)(goals)
 
 
-def smooth(poses, bends, length, walls):
+def smooth(poses, curvatures, length, walls):
     return smooth_path(
         poses,
-        bends,
+        curvatures,
         length,
         walls,
         curvature=jnp.asarray(CURVATURE),
@@ -186,11 +186,11 @@ def test_poses_are_equally_far_apart_and_turn_by_their_curvature(batch):
 
 def test_a_path_that_cannot_be_smoothed_is_returned_and_others_stay(batch):
     """One path runs through a wall, another one is NaN."""
-    (poses, bends, length), found = batch
+    (poses, curvatures, length), found = batch
     poses, length = poses.copy(), length.copy()
     poses[1] = poses[0] + np.array([0.0, -1.4, 0.0])
     poses[2], length[2] = np.nan, np.inf
-    again = jax.tree.map(np.asarray, all_smooth(poses, bends, length, walls_of()))
+    again = jax.tree.map(np.asarray, all_smooth(poses, curvatures, length, walls_of()))
     np.testing.assert_array_equal(again.is_smooth, [True, False, False, True])
     np.testing.assert_array_equal(again.poses[1], poses[1])
     assert np.isnan(again.poses[2]).all() and again.length[2] == np.inf

@@ -180,18 +180,20 @@ def test_a_car_drives_beside_arcs_without_a_jump_of_its_curvature():
         """Return the path of arcs, its curvature, and the path of a car along it."""
         way = dubins(start, goal, jnp.asarray(1.6))
         poses = sample_dubins(way, 129)
-        bends = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
+        curvatures = jnp.diff(poses[:, 2], append=poses[-1:, 2]) * (128 / way.length)
         most, rate = jnp.asarray(2.0), jnp.asarray(8.0)
-        path = path_beside(start, jnp.zeros(()), poses[:, :2], bends, way.length, most, rate)
-        return poses, bends, path
+        path = path_beside(start, jnp.zeros(()), poses[:, :2], curvatures, way.length, most, rate)
+        return poses, curvatures, path
 
     goal = np.float32([1.5, 1.5, 2.0])
-    poses, bends, path = jax.device_get(beside(np.zeros(3, np.float32), goal))
+    poses, curvatures, path = jax.device_get(beside(np.zeros(3, np.float32), goal))
     away = np.linalg.norm(path.pos - poses[:, :2], axis=1)
     assert away.max() < 0.06
     assert path.curvature[0] == 0.0 and np.abs(path.curvature).max() <= 2.0
     changes = np.diff(path.curvature) / (path.length / 128)
-    assert np.abs(changes).max() <= 8.0 * 1.01 < np.abs(np.diff(bends)).max() * 128 / path.length
+    assert (
+        np.abs(changes).max() <= 8.0 * 1.01 < np.abs(np.diff(curvatures)).max() * 128 / path.length
+    )
 
 
 drive = jax.jit(lambda case, path: STEP.drive(case, path, STEP.problem(case, path)))

@@ -66,14 +66,6 @@ def test_single_precision_is_as_cheap_to_a_millionth_and_keeps_the_bounds(solved
 
 
 @float64
-def test_a_batch_is_its_lanes_one_by_one(solved):
-    for k in np.argsort(solved.steps)[[0, LANES // 2, -1]]:
-        lane = one(*(each[k] for each in PROGRAMS))
-        np.testing.assert_allclose(lane.point, solved.point[k], atol=1e-10)
-        assert lane.steps == solved.steps[k]
-
-
-@float64
 def test_without_bounds_the_solution_needs_no_step():
     right_side = PROGRAMS[0][0]
     free = one(right_side, np.full(ROWS, -np.inf), np.full(ROWS, np.inf))

@@ -135,15 +135,6 @@ def test_an_empty_graph_has_the_straight_line_and_a_full_one_has_none():
     np.testing.assert_allclose(found.station[1], np.linspace(0.0, 6.0, 6), atol=1e-12)
 
 
-def test_a_batch_is_its_lanes_one_by_one(lines):
-    problems, found = lines
-    with jax.enable_x64(True):
-        one = jax.jit(lambda p: reference_line(p, GRID))
-        for k in (0, np.argmin(found.found)):
-            lane = one(jax.tree.map(lambda leaf, k=k: leaf[k], problems))
-            np.testing.assert_array_equal(lane.station, found.station[k])
-
-
 SHARES = np.linspace(0.0, 1.0, 9)
 
 

@@ -55,8 +55,8 @@ class PaperIntercept(Planner):
         """Return the plans of a batch."""
         num = len(np.asarray(cases.time))
         found = [self.search_path(take(cases, k)) for k in range(num)]
-        poses, bends, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
-        plans = _drive_paths(self, cases, poses, bends, length, is_found)
+        poses, curvatures, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
+        plans = _drive_paths(self, cases, poses, curvatures, length, is_found)
         return jax.tree.map(np.array, plans)
 
     def search_path(self, case: InterceptCase) -> tuple[np.ndarray, ...]:
@@ -95,11 +95,11 @@ class PaperIntercept(Planner):
             settings=self.search,
         )
 
-    def path(self, case: InterceptCase, poses: Array, bends: Array, length: Array) -> Path:
+    def path(self, case: InterceptCase, poses: Array, curvatures: Array, length: Array) -> Path:
         """Return the path that the car drives, from the poses of a searched path."""
         smooth = smooth_path(
             poses,
-            bends,
+            curvatures,
             length,
             case.walls,
             curvature=case.limits.curvature,
@@ -128,19 +128,19 @@ def _drive_paths(
     planner: PaperIntercept,
     cases: InterceptCase,
     poses: Array,
-    bends: Array,
+    curvatures: Array,
     length: Array,
     is_found: Array,
 ) -> InterceptPlan:
     """Return the plans along searched paths; leaves have a leading axis B."""
 
     def plan_one(lane: tuple) -> InterceptPlan:
-        case, poses, bends, length, is_found = lane
-        path = planner.path(case, poses, bends, length)
+        case, poses, curvatures, length, is_found = lane
+        path = planner.path(case, poses, curvatures, length)
         plan = planner.step.drive(case, path, planner.step.problem(case, path))
         worst = jnp.where(is_found, plan.violation, jnp.inf)
         status = jnp.where(is_found, plan.status, Status.NO_PATH)
         plan = dataclasses.replace(plan, violation=worst, status=status)
         return explain(case, status, plan)
 
-    return lax.map(plan_one, (cases, poses, bends, length, is_found))
+    return lax.map(plan_one, (cases, poses, curvatures, length, is_found))

@@ -71,7 +71,7 @@ class FollowConfig:
 
     stride: int = 2  # points between two knots of the curvature
     miss: float = 0.01  # [m], distance from a point that adds 1 to the cost
-    rate: float = 1.0  # weight of (curvature rate / limit)^2
+    rate: float = 1.0  # factor of (curvature rate / limit) in the residuals
     slack: float = 0.02  # fraction of every limit that stays unused
     solver: LevenbergConfig = LevenbergConfig(30)
 
@@ -80,7 +80,7 @@ def path_beside(
     start: Array,
     curvature: Array,
     points: Array,
-    bends: Array,
+    curvatures: Array,
     length: Array,
     most: Array,
     rate: Array,
@@ -97,7 +97,7 @@ def path_beside(
         curvature: () [1/m], at the start.
         points: (N, 2) [m], at equal distances, the first at the start; N - 1 is a multiple of the
             stride.
-        bends: (N,) [1/m], curvature at the points, the initial guess.
+        curvatures: (N,) [1/m], curvature at the points, the initial guess.
         length: () [m], of the path.
         most: () [1/m], limit of the curvature.
         rate: () [1/m^2], limit of the curvature's derivative by station.
@@ -135,7 +135,7 @@ def path_beside(
             violation=excess - 1.0,
         )
 
-    guess = jnp.clip(bends[config.stride :: config.stride], -most, most)
+    guess = jnp.clip(curvatures[config.stride :: config.stride], -most, most)
     knots = knots_of(least_squares(evaluate, guess, config.solver).point)
     positions = jnp.arange(points.shape[0]) / config.stride
     return path_along(start, length, jnp.interp(positions, jnp.arange(num + 1), knots))

@@ -69,7 +69,7 @@ class SmoothPath:
 
 def smooth_path(
     poses: Array,
-    bends: Array,
+    curvatures: Array,
     length: Array,
     walls: Obstacles,
     *,
@@ -86,7 +86,7 @@ def smooth_path(
 
     Args:
         poses: (N, 3) at equal distances, N - 1 a multiple of the stride.
-        bends: (N,) [1/m], curvature at the poses.
+        curvatures: (N,) [1/m], curvature at the poses.
         length: () [m], of the given path.
         walls: standing obstacles.
         curvature: () [1/m], > 0, greatest curvature.
@@ -103,7 +103,7 @@ def smooth_path(
         raise ArgumentError(
             "poses", f"{settings.stride} k + 1, k >= 4, for this stride", poses.shape[0]
         )
-    given = control_points(poses[:: settings.stride], bends[:: settings.stride])
+    given = control_points(poses[:: settings.stride], curvatures[:: settings.stride])
     smooth = smooth_points(given, walls, curvature, settings)
     corners = walls.vertices(jnp.zeros_like(length))
     middle = 0.5 * (body[0] + body[1])
@@ -125,7 +125,7 @@ def smooth_path(
     first, is_smooth = jnp.argmax(good), jnp.any(good)
     found, bent, total = (
         jnp.where(is_smooth, path[first], kept)
-        for path, kept in zip(paths, (poses, bends, length), strict=True)
+        for path, kept in zip(paths, (poses, curvatures, length), strict=True)
     )
     return SmoothPath(
         poses=found,
@@ -198,7 +198,7 @@ def smoothing_cost(
     )
 
 
-def control_points(poses: Array, bends: Array) -> Array:
+def control_points(poses: Array, curvatures: Array) -> Array:
     """Return control points (n + 1, 2) [m] of a B-spline close to poses (n + 1, 3).
 
     A cubic B-spline deviates from a control point by a sixth of the second difference of the points
@@ -207,7 +207,7 @@ def control_points(poses: Array, bends: Array) -> Array:
 
     Args:
         poses: (n + 1, 3), about equally spaced.
-        bends: (n + 1,) [1/m], curvature at the poses.
+        curvatures: (n + 1,) [1/m], curvature at the poses.
     """
     points = poses[:, :2]
     step = _mean_distance(points)
@@ -218,7 +218,7 @@ def control_points(poses: Array, bends: Array) -> Array:
         left = jnp.stack([-ahead[1], ahead[0]])
         return pose[:2] + step * ahead + (bend * step**2 / 3.0) * left
 
-    first, last = beside(poses[0], bends[0], step), beside(poses[-1], bends[-1], -step)
+    first, last = beside(poses[0], curvatures[0], step), beside(poses[-1], curvatures[-1], -step)
     return jnp.concatenate([points[:1], first[None], inner[1:-1], last[None], points[-1:]])
 
 
