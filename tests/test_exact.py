@@ -33,7 +33,7 @@ def first_guess(case):
 
 @pytest.fixture(scope="module")
 def cases():
-    """In NumPy arrays, so that batches of all sizes up to 16 are planned by one program."""
+    """Return cases in NumPy arrays, so that one program plans batches of up to 16."""
     return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 11)))
 
 

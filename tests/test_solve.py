@@ -33,9 +33,6 @@ class Reached(Plan):
     point: Array
 
 
-TRACES = []
-
-
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WellPlanner(OptimisedPlanner):
@@ -47,7 +44,6 @@ class WellPlanner(OptimisedPlanner):
     )
 
     def prepare(self, case):
-        TRACES.append(case.goal)
         return case
 
     def guesses(self, context, num):
@@ -72,14 +68,6 @@ def test_lanes_unsolved_in_one_round_are_solved_in_the_next():
     assert is_solved(both.status).all()
     np.testing.assert_allclose(both.point[:, 0], GOALS, atol=0.05)
     np.testing.assert_array_equal(both.point[[0, 2, 4]], first.point[[0, 2, 4]])
-
-
-def test_a_single_case_equals_its_lane_in_a_batch():
-    batch = plan(WellPlanner(), Well(GOALS))
-    for lane, goal in enumerate(GOALS):
-        alone = plan(WellPlanner(), Well(goal))
-        np.testing.assert_allclose(alone.point, batch.point[lane], rtol=1e-5, atol=1e-5)
-        assert alone.status == batch.status[lane]
 
 
 def keep_starts(keep):
@@ -132,27 +120,10 @@ def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
     assert (found != found.astype(np.float32)).all()  # no number has passed through float32
 
 
-def test_new_batch_sizes_of_one_bucket_are_not_traced_again():
-    plan(WellPlanner(), Well(GOALS[:3]))
-    TRACES.clear()
-    plan(WellPlanner(), Well(GOALS[:2]))
-    plan(WellPlanner(), Well(GOALS[1:]))
-    assert TRACES == []
-
-
 def test_a_plans_shapes_are_known_without_planning():
     shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
     found = jax.eval_shape(lambda plans: plans, plan(WellPlanner(), Well(GOALS)))
     assert jax.tree.leaves(shapes) == jax.tree.leaves(found)
-
-
-def test_a_lane_that_is_not_finite_says_so_and_spoils_no_neighbour():
-    broken = GOALS.copy()
-    broken[2] = np.nan
-    clean, spoiled = plan(WellPlanner(), Well(GOALS)), plan(WellPlanner(), Well(broken))
-    assert spoiled.status[2] == Status.NON_FINITE
-    others = [0, 1, 3, 4]
-    np.testing.assert_array_equal(clean.point[others], spoiled.point[others])
 
 
 @pytest.mark.parametrize("kind", [int, np.int32, np.asarray, jnp.asarray])
@@ -184,12 +155,6 @@ def test_wrong_batches_are_refused():
         plan(WellPlanner(), Well(GOALS), chunk=0)
     with pytest.raises(ValueError, match="devices must be at least one"):
         plan(WellPlanner(), Well(GOALS), devices=[])
-
-
-@pytest.mark.parametrize("goals", [GOALS, GOALS[0]], ids=["batch", "one case"])
-def test_a_plan_that_jax_would_transform_says_what_to_use(goals):
-    with pytest.raises(TypeError, match="pj.gradient, and pj.optimal_plan"):
-        jax.grad(lambda goal: jnp.sum(plan(WellPlanner(), Well(goal)).point))(jnp.asarray(goals))
 
 
 def test_a_round_needs_a_start():
