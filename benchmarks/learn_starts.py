@@ -34,7 +34,7 @@ from planner_jax.benchmarks.cost_gap import to_the_optimum
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.shipped import StartNetwork
 from planner_jax.planning.decided import first_choice
-from planner_jax.task.hit.default_planner import SUPPLE
+from planner_jax.task.hit.default_planner import WITH_VELOCITIES
 
 _POOL = 262_144  # cases that are drawn at first, and taken in another order again and again
 _BATCH = 8192
@@ -181,7 +181,7 @@ TASKS = {
     "hard-hit": _Learnt(
         "hit/start_exact-12-supple.npz",
         hard_hits,
-        pj.hit.ExactHit(learned=False).with_settings(SUPPLE),
+        pj.hit.ExactHit(learned=False).with_settings(WITH_VELOCITIES),
         hard_hits,
         hidden=(160, 160),
         floor=3e-5,

@@ -32,7 +32,7 @@ _DRAWN_BYTES = 1_000  # estimated memory of a drawn case
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return an argument as a JAX array of shape batch + shape; errors as of `numbers_of`."""
+    """Return an argument as a JAX array of shape batch + shape; errors as in `numbers_of`."""
     with np.errstate(over="ignore"):  # numbers too large for the type become infinite
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 

@@ -71,7 +71,9 @@ class Net:
 
     height: Array  # () l [m], of the hoop's centre above the propeller plane
     radius: Array  # () [m]
-    max_angle: Array  # () theta_safe [rad], between the net's axis and minus the ball's velocity
+    max_angle: (
+        Array  # () theta_safe [rad], between the net's axis and the reversed velocity of the ball
+    )
 
 
 @struct.dataclass
@@ -102,7 +104,7 @@ class CatchCase:
     net: Net
     limits: QuadrotorLimits  # with a least and a greatest thrust [Yu2023catch, eqs 3d, 3e]
     extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
-    # Whether targets may be left, to catch the greatest possible number.
+    # Whether targets may be left out; the number of caught targets is then maximised.
     optional: bool = struct.field(pytree_node=False, default=False)
 
     @property
@@ -155,7 +157,7 @@ def case(
     * `robot`: quadrotor with a net. Arguments that are None take the robot's numbers.
     * `net_height`, `net_radius`: height l above the propeller plane and radius of the net [m].
     * `max_angle`: theta_safe [rad].
-    * `optional`: whether targets may be left, to catch the greatest possible number.
+    * `optional`: whether targets may be left out; the number of caught ones is then maximised.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:

@@ -233,7 +233,7 @@ class Greedy(CatchDecision):
     """Catches next the target that can be caught earliest."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the only choice for one case, leaves (1, N), or (LENGTHS, N) if optional."""
+        """Return one choice for one case, leaves (1, N); LENGTHS choices for optional targets."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
@@ -266,5 +266,5 @@ class Given(CatchDecision):
         require_orders(cases.order)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the only choice of one case, leaves (1, N)."""
+        """Return one choice for one case, leaves (1, N)."""
         return CatchChoice(order=case.order[None], times=case.times[None], taken=case.present[None])

@@ -17,7 +17,7 @@ class Suite:
     success: float | None = None  # [%], of the planner
     time_ratio: float | None = None  # optimal time ratio
     mpp_success: float | None = None  # [%], of the motion primitives of the paper
-    optional: bool = False  # whether targets may be left, because some cannot be caught
+    optional: bool = False  # whether targets may be left out
 
 
 SUITES = {

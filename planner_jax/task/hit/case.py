@@ -64,7 +64,7 @@ _ARGUMENTS = {
 class HitLimits:
     """Limits of the stroke [Yu2023bat, eqs 18f and 18g]."""
 
-    hitting_speed: Array  # (3,) [m/s], of the quadrotor at the impact, for each world axis
+    hitting_speed: Array  # (3,) [m/s], of the quadrotor at the impact on each world axis
     min_apex: Array  # () [m], of the ball after the impact
     max_apex: Array  # () [m]
 
@@ -129,22 +129,22 @@ def case(
         robot: quadrotor with a racket. Arguments that are None take the robot's numbers.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
         drag: K_D [1/m]. The drag and all later numbers are one value, or one value a case.
-        gravity: [m/s^2].
+        gravity: [m/s^2], magnitude.
         restitution: coefficient beta of the racket.
         racket_height: [m], of the racket's centre above the propeller plane.
         racket_radius: [m]. A valid contact is within 0.9 of it around the racket's centre.
-        speed: [m/s].
-        acceleration: [m/s^2].
-        min_thrust: [m/s^2], per unit mass.
-        max_thrust: [m/s^2], per unit mass.
-        body_rate: [rad/s].
-        min_height: [m].
-        hitting_speed: (3,) [m/s], limit of the quadrotor's speed at the impact, for each axis.
+        speed: [m/s], greatest speed of the quadrotor.
+        acceleration: [m/s^2], greatest acceleration.
+        min_thrust: [m/s^2], least thrust per unit mass.
+        max_thrust: [m/s^2], greatest thrust per unit mass.
+        body_rate: [rad/s], greatest body rate.
+        min_height: [m], least height of the propeller plane.
+        hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis.
         min_apex: [m], least apex of the returned ball.
         max_apex: [m], greatest apex of the returned ball.
         extras: constraints and costs such as `pj.KeepOut`, without batch axes to share them, or
             with the batch's axes on every leaf.
-        dtype: of every floating leaf.
+        dtype: type of every floating leaf.
 
     Returns:
         Case whose leaves have the batch shape of `serve_pos`.

@@ -45,9 +45,9 @@ _FEATURE_TIMES = (0.5, 0.75, 0.95)  # relative to the landing time, of the ball 
 # needs a starting point near a feasible one. Where limits bind along the whole trajectory, the
 # margin is reduced to what peaks between the nodes need.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
-_SMOOTH = (*_ANY_FEASIBLE, ("learned", False))
-SUPPLE = (*_ANY_FEASIBLE, ("velocities", True))
-_TO_THE_LIMIT = (
+_FROM_GUESSES = (*_ANY_FEASIBLE, ("learned", False))
+WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
+_SMALL_MARGIN = (
     ("energy_weight", 1e-11),
     ("margin", 0.004),
     ("hinge_width", 0.02),
@@ -83,7 +83,7 @@ def _hard(steps: int) -> LbfgsConfig:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactHit(ChainPlanner[HitCase, HitPlan]):
-    """Plans minimum-snap hits; the decision variables satisfy the equations of the impact.
+    """Plans minimum-snap hits whose decision variables satisfy the equations of the impact.
 
     The n = 3 (M - 1) + 8 variables are the whitened waypoint offsets, the logarithms of the impact
     time, of the ball's flight time after the impact and of the thrust at the impact, two velocities
@@ -107,7 +107,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     # Relative durations of the pieces. The first are short, because a hovering quadrotor must start
     # to turn at once, and its jerk is continuous.
     proportions: tuple[float, ...] = _PROPORTIONS
-    nodes: int = 4  # penalty intervals a piece
+    nodes: int = 4  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
     energy_weight: float = 1e-8
     num_table_nodes: int = 36
@@ -120,17 +120,19 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     rounds: tuple[Round, ...] = (
         Round(1, LbfgsConfig(max_steps=3)),
         Round(1, LbfgsConfig(max_steps=60)),
-        Round(1, _hard(150), SUPPLE),
-        Round(1, _hard(500), _TO_THE_LIMIT, (Stage(_hard(800), SUPPLE, keep=1),), within=0.1),
-        Round(12, _hard(240), SUPPLE, (Stage(_hard(50), _SMOOTH, keep=2),)),
+        Round(1, _hard(150), WITH_VELOCITIES),
+        Round(
+            1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES, keep=1),), within=0.1
+        ),
+        Round(12, _hard(240), WITH_VELOCITIES, (Stage(_hard(50), _FROM_GUESSES, keep=2),)),
         Round(
             starts=12,
             solver=_hard(300),
-            settings=_TO_THE_LIMIT,
+            settings=_SMALL_MARGIN,
             stages=(
-                Stage(_hard(60), _SMOOTH, keep=6),
-                Stage(_hard(150), _SMOOTH, keep=2),
-                Stage(_hard(400), SUPPLE, keep=1),
+                Stage(_hard(60), _FROM_GUESSES, keep=6),
+                Stage(_hard(150), _FROM_GUESSES, keep=2),
+                Stage(_hard(400), WITH_VELOCITIES, keep=1),
             ),
             within=0.04,
         ),
@@ -250,7 +252,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Return a point (n,) without velocities as one with the smoothest velocities."""
+        """Return a point (n,) with zero offsets of velocities for one without velocities."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
