@@ -18,7 +18,7 @@ def equal(found, expected):
 
 
 def on_devices():
-    """All of four, three, and one other than the first; from NumPy and from jax arrays."""
+    """Compare plans on all of four devices, on three, and on one other than the first."""
     devices = jax.local_devices()
     assert len(devices) == 4
     alone = plan(WellPlanner(), Well(GOALS), devices=devices[:1])

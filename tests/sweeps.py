@@ -19,24 +19,24 @@ from planner_jax.task.hit.default_planner import ExactHit
 
 
 def quick_hit(**options):
-    """Return the planner of hits with its first round alone, so that one program is compiled."""
+    """Return the planner of hits with its first round alone: one program."""
     return ExactHit(rounds=ExactHit().rounds[:1], **options)
 
 
 def quick_catch(**options):
-    """Return the planner of catches with one short round: one program, shared by modules."""
+    """Return the planner of catches with one short round: one program for several modules."""
     rounds = (Round(1, LbfgsConfig(max_steps=20)),)
     return pj.catch.planner(rounds=rounds, **{"decide": "greedy", **options})
 
 
 def columns(out):
-    """The rows of a run as NumPy arrays, lists stacked."""
+    """Return the rows of a run as NumPy arrays, lists stacked."""
     table = pq.read_table(out / "plans")
     return {name: np.array(table[name].to_pylist()) for name in table.column_names}
 
 
 def rows_of(out):
-    """The rows of a run bit for bit, without how long they took to make."""
+    """Return the rows of a run bit for bit, without times."""
     table = pq.read_table(out / "plans").replace_schema_metadata(None)
     file = io.BytesIO()
     with pa.ipc.new_file(file, table.schema) as writer:
@@ -45,7 +45,7 @@ def rows_of(out):
 
 
 def stop_after(monkeypatch, sweep, num_chunks):
-    """Ctrl-C in the chunk after so many: in the call of `plan` of that class of sweeps."""
+    """Raise KeyboardInterrupt in `sweep.plan` after some chunks."""
     calls = iter(range(num_chunks))
 
     def plan(*arguments):
@@ -58,7 +58,7 @@ def stop_after(monkeypatch, sweep, num_chunks):
 
 
 class RunTests:
-    """Tests of the finished run of a module; a subclass has the sweep and what is its own."""
+    """Tests of a module's finished run; a subclass sets the sweep and its properties."""
 
     sweep: Sweep
     figures: tuple[str, ...]
@@ -121,7 +121,6 @@ class RunTests:
     def test_an_interrupted_sweep_is_resumed_to_the_same_rows(
         self, finished, tmp_path, monkeypatch, request, num_chunks
     ):
-        """Parts and texts that a killed process was writing are removed."""
         out, settings, task = tmp_path / "run", request.module.SETTINGS, self.sweep.task
         monkeypatch.setattr("planner_jax.sweep.run.write_report", lambda folder: None)
         monkeypatch.setattr(type(self.sweep), "other_planners", lambda *_: {})
@@ -131,6 +130,7 @@ class RunTests:
                 start_sweep(task, settings, out, progress=False)
         folder = RunFolder(out)
         assert folder.read_manifest()["state"] == "interrupted"
+        # Files that a killed process was writing are removed.
         (out / "plans").mkdir(exist_ok=True)
         (out / "plans" / ".4711.tmp.part-000002.parquet").write_bytes(b"half a part")
         (out / ".4711.tmp.table.md").write_bytes(b"half a table")

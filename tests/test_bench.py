@@ -1,4 +1,4 @@
-"""Benchmarks write run folders, and throughput is measured of tasks that nobody has heard of."""
+"""Benchmarks write run folders, and measure throughput of tasks from outside."""
 
 import csv
 import dataclasses
@@ -21,7 +21,7 @@ from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
 from planner_jax.core.errors import ArgumentError
 
-NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not what tests install
+NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not installed for tests
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
 
 
@@ -93,7 +93,7 @@ def test_a_run_that_fails_says_so_and_no_run_is_overwritten(tmp_path):
 
 @struct.dataclass
 class Number:
-    """A case of a task that has nothing to do with quadrotors."""
+    """A case of a task without quadrotors."""
 
     value: jax.Array
 
@@ -165,9 +165,8 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 
 
 def test_a_yardstick_for_cases_of_another_class_is_none():
-    """As are a car's group of targets, and an interception that is planned again."""
     cases = pj.hit.draw(2)
-    plans = pj.plan(pj.hit.planner("bat"), cases)  # as test_baselines does
+    plans = pj.plan(pj.hit.planner("bat"), cases)  # shares the program of test_baselines
     assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
 
 

@@ -1,4 +1,4 @@
-"""The command line: what it prints, its exit codes, and one line for every bad argument."""
+"""The command line: its output, its exit codes, and one line for every bad argument."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
 
 
 def trial_file(folder, serve, name="1_1_1_p.csv"):
-    """A folder with one trial file of one serve."""
+    """Write a folder with one trial file of one serve."""
     folder.mkdir(exist_ok=True)
     row = f"1,{serve},-2.9 -0.3 0,1.75 0 0,failed,failed,failed"
     (folder / name).write_text(f"{HEADER}\n{row}\n")
@@ -31,7 +31,7 @@ def expect_one_line(arguments, *parts):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """An empty working folder."""
+    """Enter an empty folder."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     monkeypatch.chdir(folder)
@@ -48,7 +48,6 @@ def test_a_throughput_is_measured_with_what_was_asked_for(elsewhere, monkeypatch
 
 @pytest.mark.parametrize("command", [["sweep", "hit", "--num", "0"], ["bench", "throughput", "-x"]])
 def test_a_command_that_needs_no_flights_needs_no_extra_of_flights(elsewhere, monkeypatch, command):
-    """Simulation without MuJoCo says so as soon as it is imported."""
     monkeypatch.setitem(sys.modules, "planner_jax.sims.settings", None)
     expect_one_line(command)
     with pytest.raises(ModuleNotFoundError):
@@ -110,15 +109,11 @@ def test_a_platform_that_does_not_work_gets_one_line_and_leaves_nothing(
     assert not list(elsewhere.iterdir())
 
 
-def test_a_report_needs_a_finished_run(elsewhere):
-    expect_one_line(["report", "nowhere"], "RUN must be the folder of a run", "nowhere")
-
-
 def test_ctrl_c_says_how_to_resume(elsewhere, monkeypatch):
-    def interrupted(*_):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(HitSweep, "plan", interrupted)
+    monkeypatch.setattr(HitSweep, "plan", interrupt)
     code, out, err = run("sweep", "hit", "--num", "3", "--out", "a run")
     assert code == 130 and out == ""
     expected = "planner-jax: interrupted; finish with: planner-jax sweep hit --resume --out 'a run'"

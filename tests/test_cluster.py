@@ -1,4 +1,4 @@
-"""Sweeps whose chunks are made by a Ray cluster: a stand-in for Ray, and Ray itself (slow)."""
+"""Sweeps with a Ray cluster: a stand-in for Ray by default, Ray itself in slow tests."""
 
 import dataclasses
 import os
@@ -32,11 +32,11 @@ COMMAND = f"sweep hit --num {NUM} --batch {BATCH} --seed 3".split()
 
 
 class RayError(Exception):
-    """As Ray's, where a worker has died too often."""
+    """Ray's error if a worker dies too often."""
 
 
 class RayTaskError(RayError):
-    """As Ray's, where a task has raised."""
+    """Ray's error if a task raises."""
 
     def __init__(self, cause):
         super().__init__("a long traceback\nof many lines")
@@ -44,9 +44,9 @@ class RayTaskError(RayError):
 
 
 class StandIn:
-    """What a sweep asks of Ray, in this process: the task that was asked for last is done first.
+    """Ray as a sweep uses it, in this process; tasks are done in reverse order.
 
-    Workers die so often in the chunks of `deaths`, before the task is done.
+    `deaths` holds the number of workers that die in a chunk.
     """
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
@@ -103,7 +103,6 @@ class StandIn:
 
 
 def start(out, settings=SETTINGS):
-    """Run the sweep by workers."""
     return start_sweep(TASK, settings, out, progress=False, workers="ray")
 
 
@@ -115,12 +114,12 @@ def quick():
 
 @pytest.fixture(autouse=True)
 def ray(monkeypatch, request):
-    """The stand-in; Ray itself in slow tests. No report."""
+    """Replace Ray by the stand-in, except in slow tests; leave the report out."""
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
     changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
     for name in ("NPROC", "PJRT_NPROC", *told, *changed):
-        monkeypatch.setenv(name, "1")  # to be put back
+        monkeypatch.setenv(name, "1")  # restored later
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     cluster._maker_of.cache_clear()
@@ -134,7 +133,7 @@ def ray(monkeypatch, request):
 def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, tmp_path, ray):
     out = tmp_path / "run"
     manifest = start(out)
-    assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at first
+    assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at the start
     assert rows_of(out) == rows_of(finished[0])
     assert manifest["run"] == finished[1]["run"]
     assert manifest["sessions"][0]["workers"] == "ray"
@@ -190,7 +189,7 @@ def test_a_run_begun_alone_is_finished_by_workers(finished, tmp_path, monkeypatc
         with pytest.raises(SweepInterrupted):
             start_sweep(TASK, SETTINGS, out, progress=False)
     manifest = resume_sweep(TASK, out, progress=False, workers="ray", num=NUM)
-    assert sorted(ray.done) == [2, 3, 4]  # what was there is not made again
+    assert sorted(ray.done) == [2, 3, 4]  # existing parts are not made again
     assert rows_of(out) == rows_of(finished[0])
     assert [session.get("workers") for session in manifest["sessions"]] == [None, "ray"]
 
@@ -248,7 +247,7 @@ def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(
 
 @pytest.fixture
 def gpus(monkeypatch, ray):
-    """JAX says that it computes on a GPU, and the cluster has two."""
+    """Let JAX claim a GPU, and the cluster two GPUs."""
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
     ray.resources = {"CPU": 8.0, "GPU": 2.0}
     return ray
@@ -314,7 +313,7 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 
 @pytest.mark.slow
 def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
-    """One that is killed with the first part; the sweep ends by itself, and so does its cluster."""
+    """A worker is killed with the first part."""
     pytest.importorskip("ray")
     plain, out = tmp_path / "plain", tmp_path / "run"
     options = "--num 64 --batch 2 --planner juggle --out".split()

@@ -1,4 +1,4 @@
-"""Runs side by side: what is compared, what is refused, and the numbers of the difference."""
+"""Comparison of runs: what is compared and rejected, and the numbers."""
 
 import csv
 
@@ -15,8 +15,8 @@ from planner_jax.sweep.compare import describe, difference_of, differing, other_
 FAILED = {0: "", 1: "speed", 2: "landing"}
 
 
-def written_run(folder, outcomes, *, kind="sweep hit", **settings):
-    """A finished run with these outcomes: 0 for a success, else the limit that fails."""
+def write_run(folder, outcomes, *, kind="sweep hit", **settings):
+    """Write a finished run with outcomes: 0 for a success, else the limit that fails."""
     outcomes = np.array(outcomes)
     num, successes = len(outcomes), int((outcomes == 0).sum())
     rows = pa.table(
@@ -56,8 +56,8 @@ OTHER = [0] * 40 + [2] * 9 + [0] * 3 + [1] * 8
 @pytest.fixture
 def pair(tmp_path):
     return (
-        written_run(tmp_path / "one", ONE),
-        written_run(tmp_path / "other", OTHER, planner="bat"),
+        write_run(tmp_path / "one", ONE),
+        write_run(tmp_path / "other", OTHER, planner="bat"),
     )
 
 
@@ -82,8 +82,8 @@ def test_runs_that_end_alike_differ_by_nothing(pair):
 
 
 def test_other_limits_make_other_cases_which_are_compared_as_independent(tmp_path):
-    first = read_run(written_run(tmp_path / "a", ONE))
-    other = read_run(written_run(tmp_path / "b", OTHER[:50], limit_scale=0.5, num=50))
+    first = read_run(write_run(tmp_path / "a", ONE))
+    other = read_run(write_run(tmp_path / "b", OTHER[:50], limit_scale=0.5, num=50))
     assert other_cases(first, other) == ["num 60 and 50", "limit_scale 1.0 and 0.5"]
     found = difference_of(first, other)
     assert found.mcnemar_p is None and found.first_only is None
@@ -112,7 +112,7 @@ def test_the_command_shows_rates_and_cases_and_writes_them(pair, tmp_path, capsy
 
 
 def test_cases_of_three_runs_are_told_by_all_of_them(pair, tmp_path):
-    third = written_run(tmp_path / "third", [0] * 60)
+    third = write_run(tmp_path / "third", [0] * 60)
     runs = [read_run(path) for path in (*pair, third)]
     apart = differing(runs)
     assert len(apart) == 20
@@ -128,8 +128,8 @@ def test_cases_of_three_runs_are_told_by_all_of_them(pair, tmp_path):
     ],
 )
 def test_runs_of_other_cases_altogether_are_refused_by_name(tmp_path, capsys, changed, told):
-    first = written_run(tmp_path / "first", ONE)
-    other = written_run(tmp_path / "other", OTHER, **changed)
+    first = write_run(tmp_path / "first", ONE)
+    other = write_run(tmp_path / "other", OTHER, **changed)
     assert main(["compare", first, other]) == 2
     line = capsys.readouterr().err
     assert told in line and first in line and other in line and line.count("\n") == 1

@@ -1,4 +1,4 @@
-"""One batch on several devices gives the plans of one device."""
+"""A batch on several devices has the plans of one device."""
 
 import os
 import subprocess

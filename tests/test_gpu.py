@@ -1,4 +1,4 @@
-"""On a GPU, where kernels take the place of single operations: the same as on a CPU."""
+"""Results on a GPU, with kernels, agree with a CPU."""
 
 import dataclasses
 import functools
@@ -29,7 +29,7 @@ LANES = 256
 
 @pytest.fixture(scope="module")
 def devices():
-    """The first GPU, and the CPU beside it."""
+    """Provide the first GPU, and the CPU."""
     assert jax.default_backend() == "gpu"
     return jax.devices()[0], jax.devices("cpu")[0]
 
@@ -40,7 +40,7 @@ def serves():
 
 
 def run(device, function, *args):
-    """The function's results, its arguments and the constants within on a device."""
+    """Return the results of a function whose arguments and constants are on a device."""
     with jax.default_device(device):
         return jax.tree.map(np.asarray, function(*jax.device_put(args, device)))
 
@@ -146,7 +146,7 @@ def in_float64(leaf):
 
 
 def test_several_gpus_give_the_plans_of_one(devices, serves):
-    """Also where the lanes are not as many for each, and where a later round has to solve them."""
+    """The lanes are unevenly shared, and a later round must solve some."""
     gpus = jax.devices("gpu")
     if len(gpus) == 1:
         pytest.skip("there is one GPU")

@@ -1,4 +1,4 @@
-"""Cores, threads and the processor's kind, and that rows of a sweep do not depend on the first."""
+"""Cores, threads and kind of the processor; rows do not depend on the number of cores."""
 
 import os
 import subprocess

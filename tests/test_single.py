@@ -1,4 +1,4 @@
-"""One case in a few numbers: the command `plan`, its words, its table, its files and refusals."""
+"""The command `plan`: text, table, files and rejections."""
 
 import csv
 import dataclasses

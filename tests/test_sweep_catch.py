@@ -1,4 +1,4 @@
-"""The catch sweep: rows, table and figures of a suite, resuming, and what it refuses."""
+"""Sweeps of catches: rows, tables and figures, resuming, and rejected settings."""
 
 from types import SimpleNamespace
 

@@ -1,4 +1,4 @@
-"""The intercept sweep: rows that hold a case and its drive, figures, counts."""
+"""Sweeps of interceptions: rows that hold a case and its drive, figures, counts."""
 
 import dataclasses
 from types import SimpleNamespace
@@ -35,7 +35,7 @@ SETTINGS = InterceptSettings(suite="hard", num=NUM, batch=BATCH, seed=0)  # some
 
 
 def one_search():
-    """The planner with one search, so that one program is compiled: that of test_intercept."""
+    """Return the planner with one search: one program, shared with test_intercept."""
     return pj.intercept.planner(searches=(Search(12, lattice=Lattice(layers=22)),))
 
 
@@ -45,13 +45,12 @@ LIMITS = [field.name for field in dataclasses.fields(CarLimits)]
 
 @struct.dataclass
 class SampledTarget:
-    """A target of any class, straight between the places where it is at even times."""
+    """A target of any class, interpolated between evenly spaced times."""
 
     places: Array  # (M, 2) [m], the first at time 0
     end: Array  # () [s], the time of the last
 
     def at(self, time: Array) -> PointState:
-        """Position [m] and velocity [m/s] at one time () [s]."""
         num = self.places.shape[0] - 1
         share = jnp.clip(time / self.end * num, 0.0, num)
         k = jnp.clip(share.astype(jnp.int32), 0, num - 1)
@@ -60,7 +59,7 @@ class SampledTarget:
 
 
 def case_of(row: Row, setting: Entries) -> InterceptCase:
-    """Return the case of a row, with the manifest's `setting`; its target is a `SampledTarget`."""
+    """Return the case of a row with the manifest's `setting` and a `SampledTarget`."""
 
     def leaf(value: ArrayLike, *shape: int) -> Array:
         return jnp.asarray(np.reshape(value, shape), jnp.float32)

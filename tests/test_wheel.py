@@ -1,4 +1,4 @@
-"""A built wheel: what it holds, and that every command runs from it in an empty folder.
+"""A built wheel: its contents, and every command run from it in an empty folder.
 
 By default the wheel's dependencies are borrowed from the environment that runs the tests, which
 needs no network. `make test-wheel` sets PLANNER_JAX_WHEEL=whole: then they are installed from the
@@ -34,8 +34,8 @@ def run(*command, cwd, **environment):
     )
 
 
-def built(kind, tree, out):
-    """The file that hatchling makes of a source tree: "sdist" or "wheel"."""
+def build(kind, tree, out):
+    """Return the file that hatchling builds from a source tree: "sdist" or "wheel"."""
     done = run(sys.executable, "-m", "hatchling", "build", "-t", kind, "-d", out, cwd=tree)
     assert done.returncode == 0, done.stderr
     (file,) = out.iterdir()
@@ -43,7 +43,7 @@ def built(kind, tree, out):
 
 
 def python_files(folder):
-    """Modules and data below a folder, caches left out, as paths from it."""
+    """Return paths of modules and data below a folder, without caches."""
     paths = [Path(top) / name for top, _, names in os.walk(folder) for name in names]
     kept = [path for path in paths if "__pycache__" not in path.parts]
     return {path.relative_to(folder).as_posix() for path in kept}
@@ -51,17 +51,17 @@ def python_files(folder):
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory):
-    return built("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
+    return build("sdist", ROOT, tmp_path_factory.mktemp("sdist"))
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    return built("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
+    return build("wheel", ROOT, tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def installed(wheel, tmp_path_factory):
-    """An environment with the wheel: the folder of its commands, and what the wheel owns there."""
+    """Install the wheel; return the folder of its commands and the wheel's files."""
     folder = tmp_path_factory.mktemp("environment")
     subprocess.run([sys.executable, "-m", "venv", folder], check=True)
     python = folder / "bin" / "python"
@@ -79,7 +79,7 @@ def installed(wheel, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def elsewhere(tmp_path_factory):
-    """An empty folder, in which one command finds what another one has written."""
+    """Provide a folder that the commands share."""
     return tmp_path_factory.mktemp("elsewhere")
 
 
@@ -100,7 +100,7 @@ def test_a_wheel_from_the_sdist_is_the_one_from_the_tree(sdist, wheel, tmp_path)
     with tarfile.open(sdist) as archive:
         archive.extractall(tmp_path / "source", filter="data")
     (tree,) = (tmp_path / "source").iterdir()
-    again = built("wheel", tree, tmp_path / "wheel")
+    again = build("wheel", tree, tmp_path / "wheel")
     first, second = zipfile.ZipFile(wheel), zipfile.ZipFile(again)
     assert sorted(first.namelist()) == sorted(second.namelist())
     assert all(first.read(name) == second.read(name) for name in first.namelist())

@@ -26,11 +26,7 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """Yield findings on versions, devices, precision, cache and plans.
-
-    Raises:
-        ArgumentError: JAX has no platform that works.
-    """
+    """Yield findings on versions, devices, precision, cache and plans."""
     require_backend()
     folder = keep_compiled_programs()
     found = environment()

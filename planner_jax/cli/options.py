@@ -32,13 +32,7 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line and return its exit code.
-
-    Args:
-        error: the error.
-        flags: options of the command by the names of their arguments.
-        code: exit code.
-    """
+    """Print an error in one line, with `flags` for names of arguments; return its exit code."""
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)

@@ -10,11 +10,7 @@ from typing import BinaryIO
 
 
 def open_plain(path: str | os.PathLike) -> BinaryIO:
-    """Open a file to read bytes.
-
-    Raises:
-        OSError: the file cannot be opened, or it is a folder, a pipe or a device.
-    """
+    """Open a regular file to read bytes; raise `OSError` for a folder, a pipe or a device."""
     # Without O_NONBLOCK, opening a pipe waits for a writer.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
     if not stat.S_ISREG(os.fstat(handle).st_mode):

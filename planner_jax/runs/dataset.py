@@ -50,23 +50,14 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
 
 
 def number_of(path: Path) -> int:
-    """Return the number in the name of a part.
-
-    Raises:
-        DamagedPart: the name is not the name of a part.
-    """
+    """Return the number in the name of a part; raise `DamagedPart` for another name."""
     if (name := _NAME.fullmatch(path.name)) is None:
         raise DamagedPart("is not a part of a run")
     return int(name[1])
 
 
 def check_part(path: Path) -> Entries:
-    """Return the record of a part after a check of its name, checksum and number of rows.
-
-    Raises:
-        DamagedPart: the file is not the part that was written.
-        OSError: the file cannot be read, or is not a regular file.
-    """
+    """Return the record of a part; raise `DamagedPart` if the file is not what was written."""
     number_of(path)
     with open_plain(path) as file:
         content = file.read()
@@ -96,11 +87,7 @@ class Dataset:
         return sorted(path for path in there if not path.name.startswith("."))
 
     def write(self, number: int, content: bytes) -> None:
-        """Write the content of a part, and remove other files of the same number.
-
-        Raises:
-            OSError: the file cannot be written.
-        """
+        """Write the content of a part, and remove other files of the same number."""
         self.folder.mkdir(exist_ok=True)
         path = self.folder / f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
         with replacing(path) as scratch:
@@ -130,11 +117,7 @@ class Dataset:
         return found
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return some columns, by default all, of all rows.
-
-        Raises:
-            pa.ArrowException, OSError: the rows cannot be read, or a column is missing.
-        """
+        """Return some columns, by default all, of all rows."""
         return self._open().to_table(columns=None if columns is None else list(columns))
 
     def parts(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:

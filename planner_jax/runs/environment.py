@@ -75,11 +75,7 @@ def makers_of(found: Entries) -> Entries:
 
 
 def require_backend() -> str:
-    """Return the platform on which JAX computes.
-
-    Raises:
-        ArgumentError: JAX has no platform that works, or the switch for kernels has a wrong value.
-    """
+    """Return the platform on which JAX computes; raise `ArgumentError` if none works."""
     import jax
 
     from planner_jax.lanes.kernels import is_switched_on

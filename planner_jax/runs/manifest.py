@@ -39,11 +39,7 @@ def to_write(entries: Mapping[str, object]) -> Entries:
 
 
 def parse_object(text: bytes | str) -> Entries:
-    """Return the JSON object in a text.
-
-    Raises:
-        JsonError: the text is not a JSON object.
-    """
+    """Return the JSON object in a text; raise `JsonError` if there is none."""
     try:
         found = json.loads(text)
     except RecursionError:
@@ -56,11 +52,7 @@ def parse_object(text: bytes | str) -> Entries:
 
 
 def parse_written(text: bytes | str) -> Entries:
-    """Return entries that `to_write` returned.
-
-    Raises:
-        JsonError: the text is of another format, or was changed.
-    """
+    """Return entries that `to_write` returned; raise `JsonError` if the text was changed."""
     entries = parse_object(text)
     if type(found := entries.get("format")) is not int or found != FORMAT:
         shown = "no format" if found is None else f"format {str(found)[:40]}"

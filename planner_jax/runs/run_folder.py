@@ -161,11 +161,7 @@ class RunFolder:
                     path.unlink(missing_ok=True)
 
     def read_manifest(self) -> Entries:
-        """Return the manifest.
-
-        Raises:
-            ArgumentError: the folder is not the folder of a run, or its manifest was changed.
-        """
+        """Return the manifest; raise `ArgumentError` if it is missing or was changed."""
         return read_written(self.path / MANIFEST, self.name, "a run")
 
     def write_manifest(self, manifest: Entries) -> Entries:

@@ -67,10 +67,8 @@ def require_recovery(value: str) -> None:
 class SweepSettings:
     """Settings that the sweeps of all tasks have; the class of a task adds its own.
 
-    Together the settings decide every number of the rows of a run.
-
-    Raises:
-        ArgumentError: a value breaks its rule.
+    Together the settings decide every number of the rows of a run. A value that breaks its rule
+    raises `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None: the task's first
@@ -99,11 +97,7 @@ class SweepSettings:
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
-        """Return the settings with default names of planner and suite filled in, and names checked.
-
-        Raises:
-            ArgumentError: the task has no planner or suite of the name.
-        """
+        """Return the settings with the task's planner and suite; None selects the first."""
         planners, suites = task.all_planners(), task.all_suites()
         filled = dataclasses.replace(
             self,

@@ -47,19 +47,12 @@ class Source(abc.ABC):
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
-        """Check cases before anything is written, and return the cases of one chunk.
-
-        One chunk suffices where all cases are drawn from one distribution.
-        """
+        """Check one chunk before anything is written, and return its cases."""
         return self.chunk(0).cases
 
     @abc.abstractmethod
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases `first` to `last - 1`, checked.
-
-        Raises:
-            ArgumentError: a case breaks a rule.
-        """
+        """Return the cases `first` to `last - 1`; raise `ArgumentError` if one breaks a rule."""
 
     @abc.abstractmethod
     def description(self) -> Entries:
@@ -73,11 +66,7 @@ class DrawnSource(Source):
     task: Task
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases `first` to `last - 1`.
-
-        Raises:
-            ArgumentError: the suite rejects a setting.
-        """
+        """Return the cases `first` to `last - 1`."""
         settings = self.settings
         drawn = self.task.draw(
             last - first, settings.suite, settings.seed, first=first, **settings.draw_options()

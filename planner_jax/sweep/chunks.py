@@ -74,11 +74,7 @@ class Maker:
 
     @classmethod
     def of(cls, sweep: Sweep, settings: SweepSettings, batch: int) -> "Maker":
-        """Open the source and the planner of a sweep.
-
-        Raises:
-            ArgumentError: a file or name in the settings does not exist.
-        """
+        """Open the source and the planner of a sweep."""
         source = sweep.open_source(settings, batch)
         makers, description = makers_of(environment()), source.description()
         parameters = source.settings.parameters()

@@ -58,19 +58,14 @@ class Difference(NamedTuple):
     difference: float  # of the rates, -1 to 1
     difference_low: float  # ends of its 95 % interval
     difference_high: float
-    # Cases that only the first run and only this run solves, and the p-value of McNemar's exact
-    # test. None for runs of different cases.
+    # Numbers of cases that one run alone solves, and McNemar's exact p-value; None for other cases.
     first_only: int | None = None
     this_only: int | None = None
     mcnemar_p: float | None = None
 
 
 def read_run(path: str | os.PathLike) -> ComparedRun:
-    """Read a run for a comparison.
-
-    Raises:
-        ArgumentError: the folder does not hold a complete, finished sweep.
-    """
+    """Read a run; raise `ArgumentError` unless it is a complete, finished sweep."""
     folder = RunFolder(path, name="RUN")
     manifest, sweep = read_finished(folder)
     with folder.reading_rows():

@@ -27,11 +27,7 @@ def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
 
 
 def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
-    """Return manifest and sweep of a folder after a check of the manifest and all parts.
-
-    Raises:
-        ArgumentError: the folder does not hold a complete, finished sweep.
-    """
+    """Return manifest and sweep of a folder; raise `ArgumentError` if parts are missing."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     if "summary" not in manifest:

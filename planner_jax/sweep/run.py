@@ -252,10 +252,7 @@ _OF_NETWORKS = ("parent", "name")  # fields of every Flax module
 
 
 def _fields_of(planner: object) -> Entries:
-    """Return the static fields of a planner for the manifest.
-
-    Arrays appear as their shapes, the weights of a network as their number.
-    """
+    """Return static fields of a planner for the manifest, with shapes for arrays."""
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
         if field.name in _OF_NETWORKS:

@@ -98,11 +98,7 @@ class Sweep(Generic[AnySettings]):
         )
 
     def open_source(self, settings: AnySettings, batch: int) -> Source:
-        """Return the source of a sweep's cases; `batch` is the default of the settings.
-
-        Raises:
-            ArgumentError: a file or name in the settings does not exist.
-        """
+        """Return the source of a sweep's cases; `batch` is the default of the settings."""
         return DrawnSource(**fill_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
     def plan(self, planner: Planner, cases: PyTree) -> PyTree:

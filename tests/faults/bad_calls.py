@@ -1,11 +1,11 @@
 # ruff: noqa: E501
-"""Bad calls of the library, which it has to refuse in one line.
+"""Bad calls of the library, which it must reject with one line.
 
-A row is a call, written as a user writes it, and the beginning of the message that refuses it. The
-names that stand for what is given, such as `hits`, are those of `test_bad_calls.py`.
+A row is a call, as a user writes it, and the start of the message. `test_bad_calls.py` defines
+names such as `hits`.
 """
 
-# Calls with one argument left open: every value below is malformed for every argument of its kind.
+# Values that are malformed for every argument of a kind.
 NOT_NUMBERS = ("'x'", "None", "(1, 2)", "1j", "[[1.0]]", "b'1'", "object()")
 NOT_SIZES = ("0", "-1", "1.5", "'2'", "None", "nan", "True", "(1,)")
 NOT_VECTORS = ("'abc'", "None", "5.0", "[]", "(1, 2)", "(1j, 0, 1)", "((1, 2), (3,))", "object()")
@@ -19,7 +19,7 @@ TASKS = ("hit", "catch", "intercept", "block")
 PATH, FLY = "pj.predict_path(**{**PATH, **dict(@)})", "pj.fly(**{**FLY, **dict(@)})"
 GRADIENT = "pj.gradient(exact, hits, **{**dict(of='cost', by='target'), **dict(@)})"
 
-# Calls with "@" where `argument=value` is put, their arguments, and what these may not be.
+# Calls with "@" for `argument=value`, their arguments, and malformed values.
 ARGUMENTS = (
     (HIT, ("serve_pos", "serve_vel", "target"), NOT_VECTORS),
     (HIT, ("speed", "acceleration", "body_rate", "min_height"), ("-1", "nan", "inf", "'x'", "1j")),
@@ -61,7 +61,7 @@ ARGUMENTS = (
     (FLY, ("num_steps",), NOT_SIZES[:5]),
 )
 
-# A line each: a call, and how the message begins.
+# A call, and the start of the message.
 _ROWS = """
 pj.hit.case(**{**HIT, **dict(target=(1e60, 0, 0))}) | target must be finite, got
 pj.hit.case(**{**HIT, **dict(start=(0, 0, 0.2))}) | start must be at a height >= min_height
@@ -100,9 +100,9 @@ pj.plan('exact', hits) | planner must be one, such as
 pj.plan(exact, catches) | ExactHit plans cases of the class HitCase
 pj.solve(catcher, hits) | DecidedPlanner plans cases of the class Catch
 pj.plan(exact, having(hits, 'drag', np.zeros(3, np.float32))) | drag must have the shape (2,), got (3,)
-pj.plan(exact, filled(hits, 'target', nan)) | target must be finite, got nan in lane 0 (1 more such lane)
-pj.plan(exact, filled(hits, 'hit_limits.min_apex', 9.0)) | hit_limits.min_apex must be < hit_limits.max_apex
-pj.plan(catcher, filled(catches, 'order', 1)) | order must be a permutation
+pj.plan(exact, fill(hits, 'target', nan)) | target must be finite, got nan in lane 0 (1 more such lane)
+pj.plan(exact, fill(hits, 'hit_limits.min_apex', 9.0)) | hit_limits.min_apex must be < hit_limits.max_apex
+pj.plan(catcher, fill(catches, 'order', 1)) | order must be a permutation
 pj.plan(catcher, having(catches, 'targets', None)) | targets must be given, got None
 pj.plan(exact, jax.tree.map(np.float16, hits)) | ball.pos must be in float32 or float64
 pj.plan(exact, pj.take(hits, slice(0, 0))) | cases must be a batch of at least one
@@ -125,7 +125,7 @@ pj.block.judge(blocks, first(3, block_plans)) | plans must have the batch shape 
 hit_plans.sample(0) | rate must be
 hit_plans.save(5) | path must be the path of a file
 HitPlan.load('junk') | path must be
-CatchPlan.load(saved(hit_plans)) | path must be a file of CatchPlan of version 1
+CatchPlan.load(save(hit_plans)) | path must be a file of CatchPlan of version 1
 pj.require_sound(5) | cases must be a case or a batch, got a int
 pj.solved(hits.drag) | plans must be
 pj.task_named('x') | task must be one of

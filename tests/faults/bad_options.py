@@ -1,7 +1,7 @@
-"""Malformed options and files, which every command has to refuse in one line.
+"""Malformed options and files, which every command must reject with one line.
 
-A row is a command line, and words that the one line on the standard error stream has to hold. The
-names `pipe`, `folder`, `empty`, `junk` and `gone` stand for paths of those kinds.
+A row is a command line, and parts of the line on the standard error stream. The names `pipe`,
+`folder`, `empty`, `junk` and `gone` are paths of these kinds.
 """
 
 TASKS = ("hit", "catch", "intercept", "block")
@@ -97,7 +97,7 @@ ROWS = [
     (tuple(words.split()), says.strip().split(" .. "))
     for words, says in (line.split("|") for line in _ROWS.strip().splitlines())
 ]
-# Options that hold a number, or one of several words: what Hypothesis draws malformed values of.
+# Options that accept a number, or one of several words; Hypothesis draws malformed values.
 WHOLE = (
     *((f"sweep {task}", option) for task in TASKS for option in ("--num", "--batch", "--seed")),
     *((f"fly {task}", option) for task in TASKS for option in ("--num", "--batch", "--record")),

@@ -1,4 +1,4 @@
-"""Commands in this process and in others, and what may be said of how they end."""
+"""Commands in this process and in others, and checks of how they end."""
 
 import contextlib
 import io
@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 class Ended(NamedTuple):
-    """How a command ended."""
+    """Exit code and output of a command."""
 
     code: int
     out: str
@@ -24,7 +24,7 @@ class Ended(NamedTuple):
 
 
 def run(*arguments: str | Path) -> Ended:
-    """A command in this process, which has no handlers of signals."""
+    """Run a command in this process, which has no signal handlers."""
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
@@ -73,8 +73,8 @@ def start(
     )
 
 
-def finished(process: subprocess.Popen, within: float = 300.0) -> Ended:
-    """Wait for the end of a process; one that does not end within so many seconds is killed."""
+def wait_for(process: subprocess.Popen, within: float = 300.0) -> Ended:
+    """Wait for the end of a process; kill it after `within` seconds."""
     try:
         out, err = process.communicate(timeout=within)
     except subprocess.TimeoutExpired:
@@ -84,25 +84,25 @@ def finished(process: subprocess.Popen, within: float = 300.0) -> Ended:
 
 
 def children_of(parent: int, name: str) -> list[int]:
-    """Processes that a process has begun and whose program has a name with this beginning."""
+    """Return child processes of a process whose program has a name with this beginning."""
     found = []
     for process in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):  # it has ended meanwhile
-            told = (process / "stat").read_text().rpartition(")")[2].split()
+        with contextlib.suppress(OSError):  # the process has ended meanwhile
+            status = (process / "stat").read_text().rpartition(")")[2].split()
             program = (process / "cmdline").read_text().partition("\0")[0]
-            if int(told[1]) == parent and Path(program).name.startswith(name):
+            if int(status[1]) == parent and Path(program).name.startswith(name):
                 found.append(int(process.name))
     return found
 
 
 def is_one_line(ended: Ended) -> bool:
-    """Whether a command that failed said so in one line of its own, and nothing else."""
+    """Return whether a command failed with one line of its own as its only output."""
     said = ended.err.startswith("planner-jax: error: ") and ended.err.count("\n") == 1
     return ended.code in (1, 2) and said and ended.out == ""
 
 
 def is_stopped(ended: Ended, number: int) -> bool:
-    """Whether a command was ended by a signal with its code and a line, without a traceback."""
+    """Return whether a signal ended a command with its code and a line, without a traceback."""
     words = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
     last = ended.err.rstrip("\n").rpartition("\n")[2]
     said = last.startswith(f"planner-jax: {words[signal.Signals(number)]}; ")

@@ -1,4 +1,4 @@
-"""One set of small runs for all modules of the folder."""
+"""Small runs for all modules of the folder."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ set_hypothesis_home_dir(Path(__file__).resolve().parents[2] / ".cache" / "hypoth
 
 @pytest.fixture(scope="package")
 def runs(tmp_path_factory):
-    """The runs of `make_runs`, and sweeps that are quick for as long as they are used."""
+    """Provide the runs of `make_runs`, with quick sweeps as long as they are used."""
     place = tmp_path_factory.mktemp("faults")
     with quick_sweeps():
         make_runs(place)
@@ -23,5 +23,5 @@ def runs(tmp_path_factory):
 
 @pytest.fixture
 def own_checks(monkeypatch):
-    """Have the library check malformed arguments itself, without the types that tests check."""
+    """Turn off the type checks of the tests, so that the library checks arguments itself."""
     monkeypatch.setattr(typecheck, "is_on", False)

@@ -1,16 +1,15 @@
-"""Damage to files: bits that flip, ends that are cut, values that are swapped, depth."""
+"""Damage to files: flipped bits, cut ends, swapped values, deep nesting."""
 
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-# What stands for a value that does not belong.
+# Values that do not fit.
 ODD = (None, True, -1, 0, 10**400, 1.5, float("nan"), float("inf"), "", "x", [], {}, [[]], {"a": 1})
 
 
 def flip(content: bytes, random: Any) -> bytes:
-    """Some bits changed, anywhere."""
     changed = bytearray(content)
     for _ in range(random.choice((1, 1, 2, 64))):
         place = random.randrange(len(changed))
@@ -19,12 +18,11 @@ def flip(content: bytes, random: Any) -> bytes:
 
 
 def cut(content: bytes, random: Any) -> bytes:
-    """The end missing, or all."""
     return content[: random.choice((0, random.randrange(len(content)), len(content) - 1))]
 
 
 def overwrite(content: bytes, random: Any) -> bytes:
-    """A stretch of zeros, or of another place of the file."""
+    """Overwrite a stretch with zeros, or with another part of the file."""
     length = random.randrange(1, 65)
     place, other = (random.randrange(len(content)) for _ in range(2))
     stretch = random.choice((bytes(length), content[other : other + length]))
@@ -32,18 +30,16 @@ def overwrite(content: bytes, random: Any) -> bytes:
 
 
 def append(content: bytes, random: Any) -> bytes:
-    """Something behind the end."""
     return content + random.choice((b"\0", b"{}", content))
 
 
 def nest(content: bytes, random: Any) -> bytes:
-    """Depth without an end."""
     depth = random.choice((1_000, 100_000))
     return random.choice((b"[", b'{"a":')) * depth
 
 
 def swap(content: bytes, random: Any) -> bytes:
-    """A value of a JSON object, however deep, that does not belong; or an entry is missing."""
+    """Replace a value of a JSON object at any depth by an odd one, or remove an entry."""
     lines = content.decode().splitlines()
     if not _is_json(lines[0]):  # one object in the whole file
         lines = [content.decode()]
@@ -76,7 +72,7 @@ OF_JSON = (*ANY, nest, swap)
 
 
 def damage(path: Path, random: Any) -> str:
-    """Damage a file; gives the name of the damage."""
+    """Damage a file, and return the name of the damage."""
     kinds = OF_JSON if path.suffix in (".json", ".jsonl") else ANY
     kind = random.choice(kinds)
     path.write_bytes(kind(path.read_bytes(), random))

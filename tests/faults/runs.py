@@ -1,4 +1,4 @@
-"""Small runs to be damaged, made once a process, and what their readers may say of the damage."""
+"""Small runs to be damaged, and checks of what their readers do with the damage."""
 
 import contextlib
 import dataclasses
@@ -33,12 +33,12 @@ from tests.recordings import recording
 from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")
-SETTINGS = HitSettings(num=40, batch=13, seed=3)  # by the program of tests/test_sweep.py
+SETTINGS = HitSettings(num=40, batch=13, seed=3)  # shares the program of tests/test_sweep.py
 IDENTICAL, REFUSED, MENDED = "identical", "refused", "mended"
 
 
 def make_runs(place: Path) -> None:
-    """Two finished sweeps, one with some of its four parts, flights, a training and plans."""
+    """Write two finished sweeps, an interrupted one, flights, a training and plans."""
     start_sweep(TASK, SETTINGS, place / "whole", progress=False)
     other = dataclasses.replace(SETTINGS, seed=4)
     start_sweep(TASK, other, place / "other", progress=False)
@@ -53,7 +53,7 @@ def make_runs(place: Path) -> None:
 
 
 def make_flights(out: Path) -> None:
-    """A folder like that of a run of flights."""
+    """Write a folder like a run of flights."""
     manifest = {
         **{"kind": "fly catch", "state": "complete", "seed": 0},
         "parameters": dataclasses.asdict(CatchFly()),
@@ -71,7 +71,7 @@ def make_flights(out: Path) -> None:
 
 
 def make_training(out: Path) -> None:
-    """A folder with what curves are drawn from."""
+    """Write a folder from which curves are drawn."""
     out.mkdir()
     (out / "training.json").write_text(json.dumps(to_write({"suites": ["throws"], "seed": 0})))
     names = ("per_second", "reward", "solved", "last", "ratio", "violation")
@@ -80,20 +80,20 @@ def make_training(out: Path) -> None:
 
 
 def verdict(place: Path, target: str, name: str, random: Any, scratch: Path) -> str:
-    """Damage a file of a copy of a run, read it, and say what came of it.
+    """Damage a file of a copy of a run, read it, and return the outcome.
 
     Args:
-        place: of the runs that `make_runs` made.
+        place: folder of the runs that `make_runs` wrote.
         target: the run, and the reader behind a colon.
-        name: of the file, or a pattern of which one is taken.
-        random: that chooses the damage.
-        scratch: folder for the copy, new.
+        name: file, or a pattern that selects one.
+        random: chooses the damage.
+        scratch: new folder for the copy.
 
     Returns:
         `IDENTICAL`, `REFUSED` or `MENDED`.
 
     Raises:
-        AssertionError: none of these; says what was damaged and how.
+        AssertionError: none of these; the text names file and damage.
     """
     which, _, reader = target.partition(":")
     shutil.copytree(place / which, scratch)
@@ -125,7 +125,6 @@ def _report(place: Path, out: Path) -> str | None:
 
 
 def _resume(place: Path, out: Path) -> str | None:
-    """The rows are those of the whole run, or the folder is refused."""
     ended = run("sweep", "hit", "--resume", "--out", out)
     if ended.code:
         return REFUSED if is_one_line(ended) else None
@@ -135,7 +134,7 @@ def _resume(place: Path, out: Path) -> str | None:
 
 
 def _view(place: Path, out: Path) -> str | None:
-    """What the viewer is given, instead of the viewer."""
+    """Record what the viewer would show."""
     shown: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
         viewer = SimpleNamespace(Viewer=lambda _, found, *__: shown.append(found) or _Shut())
@@ -152,12 +151,12 @@ def _view(place: Path, out: Path) -> str | None:
 
 
 class _Shut:
-    """A viewer that is closed at once."""
+    """A viewer that closes at once."""
 
     url = "nowhere"
 
     def run(self) -> None:
-        """Return."""
+        """Stop at once."""
 
 
 def _curves(place: Path, out: Path) -> str | None:
@@ -192,7 +191,7 @@ _READERS = {
     "curves": _curves,
     "load": _load,
 }
-# What is damaged, and by whom it is read then: of a manifest, of parts, of rows, of flights, ...
+# Kind of damage -> runs with their reader, and files.
 TARGETS = {
     "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],
     "manifest of an interrupted run": [("begun:resume", "manifest.json")],
@@ -204,6 +203,6 @@ TARGETS = {
 }
 
 
-def copied(place: Path, which: str, under: Path) -> Path:
-    """A copy of a run in a folder."""
+def copy_run(place: Path, which: str, under: Path) -> Path:
+    """Copy a run into a folder."""
     return Path(shutil.copytree(place / which, under / which))

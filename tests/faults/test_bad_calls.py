@@ -1,4 +1,4 @@
-"""Every bad call of the library is refused in one line, before anything is compiled."""
+"""Every bad call of the library is rejected with one line, before anything is compiled."""
 
 import dataclasses
 import os
@@ -22,22 +22,20 @@ from tests.faults.bad_calls import ARGUMENTS, ROWS
 
 
 def host(tree):
-    """NumPy leaves."""
     return jax.tree.map(np.asarray, tree)
 
 
 def zeros(*shape):
-    """One array of two plans."""
     return np.zeros((2, *shape), np.float32)
 
 
 def pieces(num, degree, dimensions):
-    """Motions of a tenth of a second a piece that stay where they are."""
+    """Return motions with pieces of a tenth of a second that stay in place."""
     return pj.PiecewisePolynomial(zeros(num, degree + 1, dimensions), zeros(num) + np.float32(0.1))
 
 
-def made_up_plans():
-    """Plans of every task, two each, of the shapes that planners make: nothing is compiled."""
+def make_plans():
+    """Return two plans of every task, with the shapes of real ones."""
     whole = np.zeros(2, np.int32)
     of_all = {"cost": zeros(), "violation": zeros(), "iterations": whole, "status": whole}
     flown = {**of_all, "gravity": zeros() + np.float32(9.8)}
@@ -54,42 +52,37 @@ def made_up_plans():
 
 
 def having(tree, name, value):
-    """A case with something else in a place that is named with dots."""
+    """Replace a leaf, named with dots, of a case."""
     first, _, rest = name.partition(".")
     inner = having(getattr(tree, first), rest, value) if rest else value
     return dataclasses.replace(tree, **{first: inner})
 
 
-def filled(tree, name, value):
-    """A case with one number all over a place."""
+def fill(tree, name, value):
     return having(tree, name, np.full_like(part_at(tree, name), value))
 
 
 def first(num, plans):
-    """So many plans, the last one repeated."""
     return jax.tree.map(lambda leaf: np.resize(leaf, (num, *leaf.shape[1:])), plans)
 
 
 def lane0(tree):
-    """One of a batch."""
     return pj.take(tree, 0)
 
 
 def ball_path(num):
-    """Paths of so many balls."""
     vectors = np.zeros((num, 3), np.float32)
     return pj.BallPath(pj.BallState(vectors, vectors), vectors, vectors[:, 0])
 
 
 def turning(num):
-    """Paths of so many targets in the plane."""
     vectors = np.zeros((num, 2), np.float32)
     return pj.TurningPath(vectors, vectors, vectors[:, 0])
 
 
 @pytest.fixture(scope="module")
 def given(tmp_path_factory):
-    """What the calls of the list name, in a folder with something of every kind."""
+    """Provide the names in the calls, and a folder with files of every kind."""
     folder = tmp_path_factory.mktemp("calls")
     os.mkfifo(folder / "pipe")
     (folder / "empty").touch()
@@ -102,7 +95,7 @@ def given(tmp_path_factory):
     square = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
     ball = pj.take(hits.ball, 0)
 
-    def saved(plans):
+    def save(plans):
         plans.save(folder / "saved.npz")
         return folder / "saved.npz"
 
@@ -111,12 +104,12 @@ def given(tmp_path_factory):
         **{"dataclasses": dataclasses, "Best": Best, "Policy": Policy, "policy": policy},
         "ReplanBlock": ReplanBlock,
         **{"HitPlan": HitPlan, "CatchPlan": CatchPlan},
-        **{"having": having, "filled": filled, "first": first, "lane0": lane0, "saved": saved},
+        **{"having": having, "fill": fill, "first": first, "lane0": lane0, "save": save},
         **{"ball_path": ball_path, "turning": turning, "SQUARE": square},
         **{"exact": exact, "catcher": catcher, "driver": driver, "blocker": blocker},
         **{"hits": hits, "catches": catches, "drives": drives, "blocks": blocks},
         "hit": pj.take(hits, 0),
-        **made_up_plans(),
+        **make_plans(),
         "two_walls": jax.tree.map(lambda leaf: np.stack([leaf] * 2), host(pj.obstacles([square]))),
         "HIT": {"serve_pos": (0, 5, 1), "serve_vel": (0, -5, 4), "target": (0, 4, 0)},
         "HITS": {name: np.ones((2, 3)) for name in ("serve_pos", "serve_vel", "target")},
@@ -132,7 +125,7 @@ def given(tmp_path_factory):
 
 
 def refuse(given, call):
-    """The one line with which a call is refused, by the library itself."""
+    """Return the line with which the library itself rejects a call."""
     folder, names = given
     before = os.getcwd()
     os.chdir(folder)

@@ -1,4 +1,4 @@
-"""Every malformed option or file gets one line, the code of whose fault it is, and no trace."""
+"""Every malformed option or file is rejected with one line and exit code 2."""
 
 import os
 
@@ -12,7 +12,7 @@ from tests.faults.commands import is_one_line, run
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
-    """A working folder with something of every kind that a path may lead to."""
+    """Enter a folder with files of every kind."""
     folder = tmp_path_factory.mktemp("files")
     os.mkfifo(folder / "pipe")
     (folder / "folder").mkdir()
@@ -25,7 +25,7 @@ def files(tmp_path_factory):
 
 
 def refuse(arguments):
-    """Return the one line that refuses a command; nothing else is printed, and nothing is left."""
+    """Return the line that rejects a command, which prints and leaves nothing else."""
     before = {name: os.lstat(name).st_mtime_ns for name in os.listdir()}
     ended = run(*arguments)
     assert is_one_line(ended) and ended.code == 2, ended
@@ -41,7 +41,7 @@ def test_it_is_refused_in_one_line_and_leaves_nothing(files, arguments, words):
 
 
 def is_no(kind):
-    """A filter of texts that do not stand for a number."""
+    """Return a filter of texts that do not denote a number."""
 
     def is_malformed(text):
         try:
@@ -53,16 +53,16 @@ def is_no(kind):
     return is_malformed
 
 
-def malformed(options, texts):
-    """Strategy of a command, one of its options, and a text that the option cannot hold."""
+def spoil(options, texts):
+    """Return a strategy of a command, an option, and a text that the option does not accept."""
     return st.tuples(st.sampled_from(options), texts)
 
 
 TEXTS = st.text(st.characters(blacklist_categories=("Cs",), blacklist_characters="\0"), max_size=20)
 MALFORMED = st.one_of(
-    malformed(WHOLE, st.one_of(TEXTS, st.just("1.5"), st.just("9" * 5000)).filter(is_no(int))),
-    malformed(NUMBERS, st.one_of(TEXTS, st.just("1,5"), st.just("0x1p3")).filter(is_no(float))),
-    malformed(WORDS, TEXTS.filter(lambda text: not text.isascii() and not text.startswith("-"))),
+    spoil(WHOLE, st.one_of(TEXTS, st.just("1.5"), st.just("9" * 5000)).filter(is_no(int))),
+    spoil(NUMBERS, st.one_of(TEXTS, st.just("1,5"), st.just("0x1p3")).filter(is_no(float))),
+    spoil(WORDS, TEXTS.filter(lambda text: not text.isascii() and not text.startswith("-"))),
 )
 
 

@@ -1,4 +1,4 @@
-"""Who may look at the viewer, request by request."""
+"""Requests that the viewer accepts or rejects."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Absurd cases in a batch: each is marked, and no other case loses a bit."""
+"""Absurd cases in a batch are marked, and no other case loses a bit."""
 
 import dataclasses
 
@@ -12,13 +12,11 @@ from planner_jax.core.rules import is_sound, part_at
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
 TASKS = ("hit", "catch", "intercept", "block")
-# Of a kind that stays on the host, another batch would be drawn for every test.
 CASES = {name: jax.tree.map(np.asarray, pj.task_named(name).draw(3)) for name in TASKS}
 SOUND = jax.jit(is_sound)
 
 
 def with_all_limits(robot):
-    """The robot, with every limit that there may be."""
     limits = dataclasses.replace(robot.limits, acceleration=15.0, thrust=(3.0, 18.0))
     return dataclasses.replace(robot, limits=limits)
 

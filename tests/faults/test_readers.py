@@ -1,4 +1,4 @@
-"""Damaged files are refused in one line, mended, or read as if they were whole."""
+"""Damaged files are rejected with one line, mended, or read as if they were whole."""
 
 import json
 import os
@@ -16,7 +16,7 @@ from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.hit.sweep import HitSweep
 from planner_jax.sweep.run import resume_sweep
 from tests.faults.commands import is_one_line, run
-from tests.faults.runs import TARGETS, TASK, copied, verdict
+from tests.faults.runs import TARGETS, TASK, copy_run, verdict
 from tests.sweeps import rows_of
 
 
@@ -36,12 +36,11 @@ def test_damage_is_refused_in_one_line_or_mended_or_changes_nothing(runs, what, 
 
 
 def manifest_of(out):
-    """The manifest, whatever it says."""
     return parse_object((out / "manifest.json").read_text())
 
 
 def rewritten(out, **entries):
-    """The manifest with other entries, as if it had been written so."""
+    """Write the manifest with other entries and a fitting digest."""
     folder = RunFolder(out)
     folder.write_manifest({**manifest_of(out), **entries})
 
@@ -51,7 +50,7 @@ def rewritten(out, **entries):
     [(1, "has format 1, and"), (3, "has format 3, and"), (None, "has no format, and")],
 )
 def test_another_format_is_named_beside_the_one_that_is_understood(runs, tmp_path, found, told):
-    out = copied(runs, "whole", tmp_path)
+    out = copy_run(runs, "whole", tmp_path)
     manifest = {**manifest_of(out), "format": found}
     (out / "manifest.json").write_text(json.dumps(manifest))
     ended = run("report", out)
@@ -59,7 +58,7 @@ def test_another_format_is_named_beside_the_one_that_is_understood(runs, tmp_pat
 
 
 def test_an_edited_manifest_is_refused(runs, tmp_path):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     text = (out / "manifest.json").read_text()
     (out / "manifest.json").write_text(text.replace('"batch": 13', '"batch": 7'))
     ended = run("sweep", "hit", "--resume", "--out", out)
@@ -67,7 +66,7 @@ def test_an_edited_manifest_is_refused(runs, tmp_path):
 
 
 def test_a_summary_that_its_rows_do_not_have_is_refused(runs, tmp_path):
-    out = copied(runs, "whole", tmp_path)
+    out = copy_run(runs, "whole", tmp_path)
     summary = manifest_of(out)["summary"]
     rewritten(out, summary={**summary, "successes": summary["successes"] - 1})
     ended = run("report", out)
@@ -75,7 +74,7 @@ def test_a_summary_that_its_rows_do_not_have_is_refused(runs, tmp_path):
 
 
 def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_path):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     makers = manifest_of(out)["makers"]
     for what, value, told in (
         ("jax", "0.0.1", r"jax 0\.0\.1, as it started, got 0\."),
@@ -90,7 +89,7 @@ def test_a_run_is_not_gone_on_with_by_other_versions_code_or_devices(runs, tmp_p
 
 
 def test_parts_of_another_run_are_planned_again(runs, tmp_path):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     for path in (out / "plans").iterdir():
         path.unlink()
     for path in (runs / "other" / "plans").iterdir():
@@ -101,7 +100,7 @@ def test_parts_of_another_run_are_planned_again(runs, tmp_path):
 
 
 def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     first, *_ = sorted((out / "plans").iterdir())
     first.rename(first.with_name(first.name.replace("000000", "000003")))
     ended = run("sweep", "hit", "--resume", "--out", out)
@@ -110,7 +109,7 @@ def test_a_part_in_the_place_of_another_is_planned_again(runs, tmp_path):
 
 
 def test_only_the_damaged_part_of_a_finished_run_is_planned_again(runs, tmp_path, monkeypatch):
-    out, drawn = copied(runs, "whole", tmp_path), []
+    out, drawn = copy_run(runs, "whole", tmp_path), []
     _, second, *_ = sorted((out / "plans").iterdir())
     second.write_bytes(second.read_bytes()[:-1])
     real = HitSweep.plan
@@ -122,7 +121,7 @@ def test_only_the_damaged_part_of_a_finished_run_is_planned_again(runs, tmp_path
 
 @pytest.mark.parametrize("content", [b"", b"PAR1", b"PAR1\x19\x0c\0\3\0\0\0PAR1"])
 def test_a_part_whose_name_fits_and_whose_footer_does_not_is_planned_again(runs, tmp_path, content):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     path = sorted((out / "plans").iterdir())[0]
     path.unlink()
     path.with_name(f"part-000000-{zlib.crc32(content):08x}.parquet").write_bytes(content)
@@ -146,7 +145,7 @@ def test_a_part_whose_name_fits_and_whose_footer_does_not_is_planned_again(runs,
 def test_what_is_no_plain_file_is_refused_without_waiting(
     runs, tmp_path, kind, run_of, name, command
 ):
-    out = copied(runs, run_of, tmp_path)
+    out = copy_run(runs, run_of, tmp_path)
     path = sorted(out.glob(name))[0]
     path.unlink()
     if kind == "device":
@@ -166,7 +165,7 @@ def test_a_pipe_in_the_place_of_the_lock_is_not_waited_for(tmp_path):
 
 
 def test_what_is_no_part_of_the_run_is_removed_from_its_rows(runs, tmp_path):
-    out = copied(runs, "begun", tmp_path)
+    out = copy_run(runs, "begun", tmp_path)
     part = sorted((out / "plans").iterdir())[0]
     crc = part.stem.rpartition("-")[2]
     names = ("part-999999-00000000.parquet", f"part-{'9' * 200}-00000000.parquet", "notes.txt")

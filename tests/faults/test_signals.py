@@ -1,4 +1,4 @@
-"""Signals end a command with their own code and a line, whatever its threads are doing."""
+"""Signals end a command with their own code and a line, whatever its threads do."""
 
 import importlib.util
 import signal
@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.faults.commands import finished, is_stopped, start
+from tests.faults.commands import is_stopped, start, wait_for
 from tests.faults.runs import make_flights
 
 PREPARED = """
@@ -16,11 +16,11 @@ import os, signal, sys, time
 from planner_jax.host import signals as stopping
 stopping.listen()
 """
-# What a command does then; `rest` is what it says of itself.
+# Scripts of commands that are ready for a signal.
 READY = 'print("ready", flush=True)'
 NOTHING_UNDER_WAY = f"{READY}\ntime.sleep(30.0)"
 CHECKING = f"""
-with stopping.under_way(lambda: "go on with: this", bar=False):
+with stopping.under_way(lambda: "continue with: this", bar=False):
     {READY}
     try:
         while True:
@@ -32,16 +32,16 @@ with stopping.under_way(lambda: "go on with: this", bar=False):
 """
 BUSY = f"""
 stopping.GRACE = 0.3
-with stopping.under_way(lambda: "go on with: this", bar=False):
+with stopping.under_way(lambda: "continue with: this", bar=False):
     {READY}
     time.sleep(30.0)
 """
 NUMBERS = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
 
 
-def stopped(script, *numbers, ignored=()):
-    """How a script ends that is sent signals when it is ready."""
-    # The tests themselves may run under `nohup`, whose children inherit that SIGHUP is ignored.
+def stop_script(script, *numbers, ignored=()):
+    """Send signals to a script when it is ready, and return how it ends."""
+    # Under `nohup` the children of the tests inherit that SIGHUP is ignored.
     heard = {number: "SIG_IGN" if number in ignored else "SIG_DFL" for number in NUMBERS}
     before = "".join(
         f"import signal; signal.signal({int(n)}, signal.{how})\n" for n, how in heard.items()
@@ -55,8 +55,8 @@ def stopped(script, *numbers, ignored=()):
     assert process.stdout is not None and process.stdout.readline() == "ready\n"
     for number in numbers:
         process.send_signal(number)
-        time.sleep(0.1)  # or the second is the first one still
-    return finished(process)
+        time.sleep(0.1)  # otherwise the system merges two signals
+    return wait_for(process)
 
 
 @pytest.mark.parametrize("number", NUMBERS)
@@ -64,25 +64,25 @@ def stopped(script, *numbers, ignored=()):
     ("script", "rest", "out"),
     [
         (NOTHING_UNDER_WAY, "there is nothing to resume", ""),
-        (CHECKING, "go on with: this", "tidy\n"),
-        (BUSY, "go on with: this", ""),
+        (CHECKING, "continue with: this", "tidy\n"),
+        (BUSY, "continue with: this", ""),
     ],
     ids=["nothing under way", "one that checks", "one that is busy"],
 )
 def test_a_signal_ends_a_command_with_its_code_and_a_line(number, script, rest, out):
-    ended = stopped(script, number)
+    ended = stop_script(script, number)
     assert is_stopped(ended, number) and ended.out == out
     assert ended.err.count("\n") == 1 and ended.err.endswith(f"; {rest}\n")
 
 
 def test_a_second_signal_ends_a_busy_command_at_once():
     busy = BUSY.replace("0.3", "60.0")
-    ended = stopped(busy, signal.SIGINT, signal.SIGINT, signal.SIGINT)
+    ended = stop_script(busy, signal.SIGINT, signal.SIGINT, signal.SIGINT)
     assert is_stopped(ended, signal.SIGINT)
 
 
 def test_nohup_is_respected_and_a_background_job_hears_ctrl_c():
-    ended = stopped(
+    ended = stop_script(
         NOTHING_UNDER_WAY, signal.SIGHUP, signal.SIGINT, ignored=[signal.SIGHUP, signal.SIGINT]
     )
     assert is_stopped(ended, signal.SIGINT)
@@ -93,7 +93,7 @@ def test_a_command_that_imports_is_ended_without_a_traceback(tmp_path):
     with pytest.raises(subprocess.TimeoutExpired):
         process.wait(0.7)
     process.send_signal(signal.SIGINT)
-    ended = finished(process)
+    ended = wait_for(process)
     assert is_stopped(ended, signal.SIGINT) and "there is nothing to resume" in ended.err
     assert not list(tmp_path.iterdir())
 
@@ -111,5 +111,5 @@ def test_a_viewer_is_ended_with_its_code_and_a_line(tmp_path, number):
     while not process.stdout.readline().startswith("Playing 1 flights"):
         assert process.poll() is None
     process.send_signal(number)
-    ended = finished(process, within=20.0)
+    ended = wait_for(process, within=20.0)
     assert is_stopped(ended, number) and "there is nothing to resume" in ended.err

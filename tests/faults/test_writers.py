@@ -1,4 +1,4 @@
-"""Runs that are killed, twins, and disks that fill up: nothing is lost, nothing is silent."""
+"""Killed runs, two writers and full disks: nothing is lost, and nothing fails silently."""
 
 import contextlib
 import errno
@@ -23,11 +23,11 @@ COMMAND = ("sweep", "hit", "--num", "40", "--batch", "13", "--seed", "3", "--out
 
 
 class Killed(BaseException):
-    """Nothing that follows is done."""
+    """Stands for SIGKILL."""
 
 
 def failing(monkeypatch, number, error):
-    """Let the write of that number fail before its file has its name; tells how many there were."""
+    """Let the write of this number fail before the renaming; return a count of writes."""
     real, count = os.replace, [0]
 
     def replace(*names):
@@ -61,7 +61,7 @@ def test_a_sweep_killed_before_any_of_its_writes_is_resumed_to_the_same_rows(
 def test_a_folder_without_its_first_manifest_is_new(runs, tmp_path, monkeypatch):
     out = tmp_path / "run"
     out.mkdir()
-    (out / LOCK).write_text("{")  # of a process that was killed
+    (out / LOCK).write_text("{")  # left by a killed process
     (out / ".4711.tmp.manifest.json").write_text("{")
     start_sweep(TASK, SETTINGS, out, progress=False)
     assert rows_of(out) == rows_of(runs / "whole")
@@ -86,7 +86,7 @@ def test_a_write_that_fails_names_file_and_option_and_how_to_go_on(
 
 
 def test_files_that_may_not_grow_are_told_of(runs, tmp_path):
-    """As where the disk is full; the limit is between the smallest part and the others."""
+    """The limit of file sizes lies between the smallest part and the others."""
     out, before = tmp_path / "run", resource.getrlimit(resource.RLIMIT_FSIZE)
     small, other, *_ = sorted(path.stat().st_size for path in (runs / "whole/plans").iterdir())
     resource.setrlimit(resource.RLIMIT_FSIZE, ((small + other) // 2, before[1]))
@@ -121,7 +121,7 @@ def test_the_second_writer_is_refused_and_told_of_the_first(runs, tmp_path):
 
 
 def test_of_many_that_begin_at_once_one_owns_the_folder(tmp_path):
-    """Threads are as strangers to the lock, since each opens its file anew."""
+    """Each thread opens the lock file itself, as another process would."""
     barrier, won = threading.Barrier(4), []
 
     def hold(number):

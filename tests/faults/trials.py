@@ -15,7 +15,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.faults.commands import children_of, finished, is_one_line, is_stopped, start
+from tests.faults.commands import children_of, is_one_line, is_stopped, start, wait_for
 from tests.faults.quick import quick_sweeps
 from tests.faults.runs import TARGETS, make_runs, verdict
 from tests.sweeps import rows_of
@@ -41,7 +41,7 @@ class Trial(NamedTuple):
     run: Callable[[random.Random, int, Path, Path], Survived]
     num: int
     most: int  # faults that one process tries
-    whole: str  # undisturbed run of `SWEEPS` that is needed, or "" for those of `make_runs`
+    whole: str  # undisturbed run in `SWEEPS`, or "" for the runs of `make_runs`
 
 
 def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
@@ -56,7 +56,7 @@ def kill(name: str, moment: random.Random, num: int, place: Path, base: Path) ->
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(moment.uniform(0.2, 1.0) * took)
             process.kill()
-        ended = finished(process)
+        ended = wait_for(process)
         if ended.code == -signal.SIGKILL:
             tried += 1
             yield True, "killed"
@@ -74,7 +74,7 @@ def start_twins(moment: random.Random, num: int, place: Path, base: Path) -> Sur
         pair = [sweep(*SWEEPS["hit"], "--out", out, cwd=place)]
         time.sleep(moment.choice((0.0, moment.uniform(0.0, 1.0))))
         pair.append(sweep(*SWEEPS["hit"], "--out", out, cwd=place))
-        ends = sorted(map(finished, pair), key=lambda ended: ended.code)
+        ends = sorted(map(wait_for, pair), key=lambda ended: ended.code)
         refused = is_one_line(ends[1]) and ends[1].code == 2
         good = ends[0].code == 0 and refused and rows_of(out) == rows_of(base / "hit")
         named = "owned by process" in ends[1].err
@@ -104,7 +104,7 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
             with contextlib.suppress(ProcessLookupError):
                 os.kill(moment.choice(workers), signal.SIGKILL)
                 killed = True
-        ended = finished(process)
+        ended = wait_for(process)
         working = time.monotonic() - began
         if killed or ended.code != 0:
             tried += 1
@@ -145,7 +145,7 @@ def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survi
             process.send_signal(number)
             time.sleep(0.01 if times > 1 else 0.0)
         began = time.monotonic()
-        ended = finished(process)
+        ended = wait_for(process)
         if cache:
             shutil.rmtree(cache, ignore_errors=True)
         if not alive or ended.code == 0:
@@ -163,11 +163,11 @@ def fill_disk(limits: random.Random, num: int, place: Path, base: Path) -> Survi
     for number in range(num):
         out = place / str(number)
         blocks = limits.randrange(1, largest // 1024)
-        ended = finished(sweep(*SWEEPS["hit"], "--out", out, cwd=place, blocks=blocks))
+        ended = wait_for(sweep(*SWEEPS["hit"], "--out", out, cwd=place, blocks=blocks))
         last = ended.err.rstrip("\n").rpartition("\n")[2]
         named = ended.code in (1, 2) and "--out must be a folder that can be written" in last
         again = ("hit", "--resume") if out.exists() else SWEEPS["hit"]
-        resumed = finished(sweep(*again, "--out", out, cwd=place))
+        resumed = wait_for(sweep(*again, "--out", out, cwd=place))
         good = named and resumed.code == 0 and rows_of(out) == rows_of(whole)
         yield good, f"exit {ended.code}" if good else f"{blocks} {ended.err[-300:]}"
         shutil.rmtree(out, ignore_errors=True)
@@ -212,7 +212,7 @@ def make_whole(name: str, base: Path) -> None:
         with quick_sweeps():
             return make_runs(base / "runs")
     module = "planner_jax" if name == "many" else QUICK
-    ended = finished(start("sweep", *SWEEPS[name], "--out", base / name, cwd=base, module=module))
+    ended = wait_for(start("sweep", *SWEEPS[name], "--out", base / name, cwd=base, module=module))
     assert ended.code == 0, ended.err
 
 

@@ -98,11 +98,7 @@ class Single(abc.ABC, Generic[SingleT]):
         """Return margins of limits that only this task has."""
 
     def answer(self) -> Answer:
-        """Return the plan and the referee's verdict.
-
-        Raises:
-            ArgumentError: a number of the case breaks a rule.
-        """
+        """Return plan and verdict; raise `ArgumentError` if a number of the case breaks a rule."""
         try:
             case = jax.tree.map(np.asarray, self.case())
             planner = self.task.planner(self.settings.planner, **self.settings.planner_options())

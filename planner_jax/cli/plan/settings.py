@@ -56,11 +56,7 @@ class SingleSettings:
                 require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
-        """Return the settings with the default planner filled in, and the planner's name checked.
-
-        Raises:
-            ArgumentError: the task has no planner of the name.
-        """
+        """Return the settings with the task's planner, checked; None selects the first one."""
         name = next(iter(task.all_planners())) if self.planner is None else self.planner
         task.split_planner(name)
         return dataclasses.replace(self, planner=name)

@@ -1,64 +1,28 @@
 """The sweep of blocks: rows, execution times, and results of perception."""
 
-import dataclasses
 from collections.abc import Sequence
-from typing import ClassVar
 
-import jax
 import numpy as np
 import pyarrow as pa
-from flax import struct
-from jax import Array
 from jaxtyping import PyTree
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
-from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
-from planner_jax.core.planner import Drive, Planner
+from planner_jax.core.planner import Planner
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.timing import measure_plans
-from planner_jax.studies.block.contact_check import delay_motion
+from planner_jax.studies.block.clock import CountedPlanner, TimedPlan
 from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.sweep.block.columns import COLUMNS, FRAME, SEEN_COLUMNS, TIMED_COLUMNS
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.rows import arm_plan
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
-from planner_jax.task.block.plan import BlockPlan
 
 _ROOM = 0.1  # [m], tolerance of a contact beside the shield's middle
-
-
-@struct.dataclass
-class TimedPlan(BlockPlan):
-    """A plan with the time that planning took."""
-
-    planning_time: Array  # () [s]
-
-
-@jax.tree_util.register_static
-@dataclasses.dataclass(frozen=True)
-class CountedPlanner(Planner[BlockCase, TimedPlan]):
-    """Planner of one case after another that counts its own planning time.
-
-    A motion starts later by the time that planning exceeds `allowed`.
-    """
-
-    case_type: ClassVar[type] = BlockCase
-    planner: Planner
-    allowed: float  # [s] of planning, included in the delay
-
-    def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Return plans of a batch, up to the contact with the ball."""
-        plans, spent = measure_plans(self.planner, cases)
-        late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
-        met = delay_motion(cases, plans, late)
-        return jax.tree.map(np.asarray, TimedPlan(**vars(met), planning_time=host_leaf(spent)))
 
 
 class BlockTally(Tally):

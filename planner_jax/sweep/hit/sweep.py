@@ -156,12 +156,7 @@ class HitSweep(Sweep[HitSettings]):
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
-        """Return the source of a sweep's serves; a folder is read and checked whole.
-
-        Raises:
-            ArgumentError: the suite is of another package, the folder is missing, a row is not
-                sound, or too few serves are in it.
-        """
+        """Return the source of a sweep's serves; a folder is read and checked completely."""
         require_one_of(
             TASK.suites, "suite", str(settings.suite)
         )  # suites of other packages have no serves
