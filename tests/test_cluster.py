@@ -280,7 +280,7 @@ def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
 
 @pytest.mark.parametrize(
     ("own", "others", "rule"),
-    [(1, 0.0, "of a cluster with GPUs"), (2, 2.0, "asked for before JAX .* got 2")],
+    [(1, 0.0, "of a cluster with GPUs"), (2, 2.0, "requested before JAX .* got 2")],
 )
 def test_gpus_here_and_not_there_or_several_here_are_refused(
     tmp_path, monkeypatch, gpus, own, others, rule

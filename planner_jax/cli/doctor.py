@@ -11,7 +11,7 @@ from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend
 
-_BATCH = 1024  # hits that are planned and refereed
+_BATCH = 1024  # number of planned and refereed hits
 # Products in float32 have errors of 1e-7, products in TF32 with its ten bits of 1e-3.
 _FULL_PRECISION = 1e-5
 

@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     flags: dict[str, str] = {}  # options of the command by the names of their arguments
     try:
-        with warnings.catch_warnings():  # of another package, such as a task that fails
+        with warnings.catch_warnings():  # warnings of other packages, such as a task that fails
             warnings.simplefilter("always")
             warnings.showwarning = lambda text, *_, **__: print(
                 f"planner-jax: warning: {text}", file=sys.stderr

@@ -27,7 +27,7 @@ _THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 def add_sweep(task: Task, parser: Parser) -> None:
     """Add the options of `sweep` for one task."""
     parser.description = (
-        f"Plan many cases of one task, {task.summary},\nand judge every plan by a referee.\n"
+        f"Plan many cases of the task: {task.summary}.\nA referee judges every plan.\n"
         "Writes a run folder: index.html, table.md, figures, plans (Parquet), manifest.json."
     )
     add_settings(parser, pkgutil.resolve_name(task.sweep), task)
@@ -45,7 +45,7 @@ def _sweep(task: Task, given: Options) -> None:
         raise ArgumentError("out", "the folder to resume", verb="name", shown="nothing")
     settings = pkgutil.resolve_name(task.sweep)(**given).of(task)
     out = out or _name_run_folder(f"{task.name}-{task.split_planner(settings.planner)[0]}")
-    settings.require_room(out)
+    settings.require_disk_space(out)
     keep_compiled_programs()
     from planner_jax.sweep import run
 
@@ -70,15 +70,15 @@ def _print_sweep(manifest: Options, out: str) -> None:
 def add_fly(task: Task, parser: Parser) -> None:
     """Add the options of `fly` for one task."""
     parser.description = (
-        f"Fly many cases of one task, {task.summary},\n"
-        "in MuJoCo MJX with noise and latency.\n"
+        f"Fly many cases of the task: {task.summary}.\n"
+        "Flights are simulated in MuJoCo MJX with noise and latency.\n"
         "Writes a run folder: index.html, table.md, a figure, plans and flights (Parquet),\n"
         "manifest.json."
     )
     kind = pkgutil.resolve_name(str(task.flight))
     add_settings(parser, kind, task)
-    kept = "number of flights recorded for `planner-jax view`, the first ones (default: 16)"
-    parser.add("--record", type=int, metavar="K", help=kept)
+    recordings = "number of flights recorded for `planner-jax view`, the first ones (default: 16)"
+    parser.add("--record", type=int, metavar="K", help=recordings)
     film = (
         "film the first three of these into the run folder, .gif, or .mp4 if ffmpeg is "
         "installed (default name: flights.gif)"

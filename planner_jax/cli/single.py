@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 def add_plan(task: Task, parser: Parser) -> None:
     """Add the options of `plan` for one task."""
     parser.description = (
-        f"Plan one case, {task.summary}, and judge the plan by a referee.\n"
+        f"Plan one case of the task: {task.summary}. A referee judges the plan.\n"
         "Prints time and position of the contact, and how close the plan comes to each limit."
     )
     add_settings(parser, pkgutil.resolve_name(str(task.single)), task)
@@ -70,7 +70,7 @@ def _write_answer(
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        recovery = None if answer.plan.recovery is None else "brake"  # one of its own stays
+        recovery = None if answer.plan.recovery is None else "brake"  # the plan keeps its own
         how = {"rate": rate, "recovery": recovery}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(task, planner, answer, out)

@@ -15,7 +15,7 @@ from typing import ParamSpec, TypeVar
 _Arguments = ParamSpec("_Arguments")
 _Result = TypeVar("_Result")
 
-_CGROUP = Path("/sys/fs/cgroup")  # of a container, version 2
+_CGROUP = Path("/sys/fs/cgroup")  # control group of a container, version 2
 
 
 def available_memory() -> int | None:

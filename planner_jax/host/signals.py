@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-GRACE = 5.0  # [s]
+GRACE = 5.0  # [s] for the main thread to stop cleanly
 NOTHING = "there is nothing to resume"
 _WORDS = {
     signal.SIGINT: "interrupted",
@@ -32,7 +32,7 @@ class _State:
     """State of the process, which has one set of signal handlers."""
 
     def __init__(self) -> None:
-        self.number: int | None = None  # of the first signal
+        self.number: int | None = None  # number of the first signal
         self.patient = False
         self.bar = False
         self.remainder: Callable[[], str] = lambda: NOTHING

@@ -36,7 +36,7 @@ class Column(NamedTuple):
     unit: str  # "" for names and counts, "1" for ratios
     meaning: str
     type: pa.DataType
-    values: Callable[[RefereedBatch], Values]  # (B,) or (B, ...), lists flat; None: all null
+    values: Callable[[RefereedBatch], Values]  # (B,) or (B, ...); None for a column of nulls
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()

@@ -13,12 +13,12 @@ from typing import Any, TypeAlias
 from planner_jax.core.errors import ArgumentError, PlannerJaxError
 from planner_jax.host.files import open_plain
 
-FORMAT = 2  # of manifest, parts, rows and recordings
+FORMAT = 2  # version of manifest, parts, rows and recordings
 MANIFEST = "manifest.json"
 _LARGEST = 1 << 26  # [bytes]
 
-Entries: TypeAlias = dict[str, Any]  # of a JSON object, such as a manifest
-Row: TypeAlias = Mapping[str, Any]  # a row of a dataset, by columns
+Entries: TypeAlias = dict[str, Any]  # entries of a JSON object, such as a manifest
+Row: TypeAlias = Mapping[str, Any]  # values of a row by column
 
 
 class JsonError(PlannerJaxError, ValueError):

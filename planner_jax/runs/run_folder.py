@@ -26,7 +26,7 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_write
 
 LOCK = ".lock"
-FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # in figures
+FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # numbers of rows in figures
 _TRIES, _BETWEEN = 20, 0.01  # attempts to take the lock, and the pause between them [s]
 
 
@@ -55,7 +55,7 @@ class RunFolder:
             if self.path.is_dir():
                 self._require_empty()
             ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
-        except OSError as error:  # such as a name that is too long
+        except OSError as error:  # for example, the name is too long
             raise self._unwritable(error) from None
         if not ancestor.is_dir() or not os.access(ancestor, os.W_OK | os.X_OK):
             raise self._unwritable()

@@ -36,9 +36,9 @@ class WorkersFailed(PlannerJaxError, RuntimeError):
         return f"workers must {self.rule}"
 
 
-def option(default: object, metavar: str, words: str) -> Any:
+def option(default: object, metavar: str, text: str) -> Any:
     """Return a field of settings with its help text; a switch has no `metavar`."""
-    return dataclasses.field(default=default, metadata={"metavar": metavar, "help": words})
+    return dataclasses.field(default=default, metadata={"metavar": metavar, "help": text})
 
 
 def recovery_option(usual: str = NONE) -> str:
@@ -71,13 +71,15 @@ class SweepSettings:
     raises `ArgumentError`.
     """
 
-    planner: str | None = option(None, "NAME", "")  # None: the task's first
-    suite: str | None = option(None, "NAME", "")  # None: the task's first
-    num: int | None = option(None, "N", "cases")  # None: `DEFAULT_NUM`, or all that a source holds
+    planner: str | None = option(None, "NAME", "")  # None selects the first of the task
+    suite: str | None = option(None, "NAME", "")  # None selects the first of the task
+    num: int | None = option(
+        None, "N", "number of cases"
+    )  # None: `DEFAULT_NUM`, or all of a folder
     batch: int | None = option(
         None, "B", "cases planned, judged and written at once; bounds the memory"
     )
-    seed: int = option(0, "K", "of the cases that are drawn")
+    seed: int = option(0, "K", "seed of the drawn cases")
 
     RUN: ClassVar[str] = ""  # subclass of `Sweep`, "module:Class"; "" is `Sweep` itself
     DEFAULT_NUM: ClassVar[int] = 1000
@@ -113,7 +115,7 @@ class SweepSettings:
         """Memory [bytes] of one case of a batch while it is planned, judged and written."""
         return self.CASE_BYTES
 
-    def require_room(self, out: str | os.PathLike) -> None:
+    def require_disk_space(self, out: str | os.PathLike) -> None:
         """Raise `ArgumentError` if the rows of the run do not fit on the disk of `out`."""
         require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 

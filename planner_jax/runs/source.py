@@ -14,7 +14,7 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 
-_MOST_PARTS = 10**6  # of a run; each is a file of one folder
+_MOST_PARTS = 10**6  # greatest number of files in the folder of a run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Chunk:
 class Source(abc.ABC):
     """The source of the cases of a sweep."""
 
-    settings: SweepSettings  # of the task's sweep, with `num` and `batch` filled in
-    num: int  # of all cases
-    batch: int  # cases of a chunk
+    settings: SweepSettings  # settings of the sweep, with `num` and `batch` filled in
+    num: int  # number of all cases
+    batch: int  # number of cases of a chunk
 
     @property
     def num_chunks(self) -> int:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from planner_jax.host.files import replacing
 
 if TYPE_CHECKING:
-    from matplotlib.typing import RcKeyType  # from Matplotlib 3.11 on
+    from matplotlib.typing import RcKeyType  # exists since Matplotlib 3.11
 
 BLUE, ORANGE, GREEN, RED = "#0072B2", "#E69F00", "#009E73", "#D55E00"
 PURPLE, SKY, GREY, INK = "#CC79A7", "#56B4E9", "#8A8F98", "#24292F"
@@ -32,7 +32,7 @@ PLANNER_COLOURS = {
     "constant": SKY,
 }
 
-Look: TypeAlias = dict[str, Any]  # named arguments of Matplotlib
+Look: TypeAlias = dict[str, Any]  # keyword arguments of Matplotlib
 
 _STYLE: "dict[RcKeyType, object]" = {
     "font.size": 10.0,

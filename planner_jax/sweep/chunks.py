@@ -34,9 +34,9 @@ _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
     "first_seconds": "planning the first chunk, with the compilation in it",
-    "warm_seconds": "planning of chunks in which nothing was compiled, cases to plans on the "
-    "host: decisions, ball tables, guesses and all rounds. Where these were less than half a "
-    "batch, the first chunk planned again. Seconds of workers are added up",
+    "warm_seconds": "planning of chunks in which nothing was compiled, from cases to plans on the "
+    "host: decisions, ball tables, guesses and all rounds. If these are less than half a batch, "
+    "the first chunk is planned again. The seconds of all workers are added",
     "referee_seconds": "judging, while the next chunk is planned",
     "wall_seconds": "all chunks of all sessions that were not killed, with drawing, checking and "
     "writing; without imports and report",
@@ -46,9 +46,9 @@ _MEASURED = {
 class Record(TypedDict):
     """How the rows of a part were made; the part's metadata hold it."""
 
-    run: str  # the digest of the `Maker`
+    run: str  # digest of the `Maker`
     number: int
-    num: int  # rows
+    num: int  # number of rows
     successes: int
     warm: bool  # whether nothing was compiled
     plan_seconds: float
@@ -69,7 +69,7 @@ class Maker:
     source: Source
     planner: Planner
     makers: Entries  # versions, code and devices that affect the rows
-    description: Entries  # of the source
+    description: Entries  # description of the source
     run: str  # SHA-256 of all that affects the rows, with settings and the files they name
 
     @classmethod

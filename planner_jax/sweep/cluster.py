@@ -33,7 +33,7 @@ from planner_jax.sweep.sweep import sweep_of
 _ADDRESS, _GPUS = "RAY_ADDRESS", "CUDA_VISIBLE_DEVICES"  # environment variables
 _RETRIES = 3  # attempts to repeat a chunk whose worker died
 _AHEAD = 2  # chunks for each worker that are being made or wait to be written
-WORKERS_OF_GPU = 8  # greatest number; a GPU is idle while one worker judges
+WORKERS_OF_GPU = 8  # greatest number; with one worker the GPU is idle while the worker judges
 _MEMORY = 0.6  # share of a GPU for all its workers; each needs more memory to start
 
 
@@ -60,7 +60,7 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
             num = jax.device_count() if on_gpus else 1
-            require(num == 1, "workers", "asked for before JAX starts with several GPUs", num)
+            require(num == 1, "workers", "requested before JAX starts with several GPUs", num)
             yield functools.partial(_make_parts, ray, on_gpus)
         finally:
             ray.shutdown()
@@ -107,12 +107,12 @@ def _make_parts(
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
     run = (maker.sweep.task, maker.source.settings, maker.makers, maker.run)
-    order = ray.put(pickle.dumps((environ, config, run)))
+    job = ray.put(pickle.dumps((environ, config, run)))
     make = ray.remote(num_cpus=1, max_retries=_RETRIES, **how)(_make)
     waiting, started = iter(numbers), deque()
     while True:
         following = itertools.islice(waiting, _AHEAD * num - len(started))
-        started.extend((number, make.remote(order, number)) for number in following)
+        started.extend((number, make.remote(job, number)) for number in following)
         if not started:
             return
         number, promise = started.popleft()
@@ -133,15 +133,15 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
         raise WorkersFailed(f"{rule} {_RETRIES + 1} tries ({reason})") from None
 
 
-def _make(order: bytes, number: int) -> Made:
+def _make(job: bytes, number: int) -> Made:
     """Make a part in a worker."""
-    return _maker_of(order).make(number)
+    return _maker_of(job).make(number)
 
 
 @functools.lru_cache(maxsize=1)
-def _maker_of(order: bytes) -> Maker:
+def _maker_of(job: bytes) -> Maker:
     """Return the maker of a run; a worker keeps it with its compiled programs."""
-    environ, config, (task, settings, makers, run) = pickle.loads(order)
+    environ, config, (task, settings, makers, run) = pickle.loads(job)
     os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)  # JAX rejects both names together
     os.environ.update(environ)
     for name, value in config.items():

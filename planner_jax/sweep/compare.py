@@ -55,7 +55,7 @@ class ComparedRun:
 class Difference(NamedTuple):
     """Difference between a run's success and the success of the first run."""
 
-    difference: float  # of the rates, -1 to 1
+    difference: float  # difference of the rates, -1 to 1
     difference_low: float  # ends of its 95 % interval
     difference_high: float
     # Numbers of cases that one run alone solves, and McNemar's exact p-value; None for other cases.
@@ -123,7 +123,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    if not apart:  # as of no event in `num` trials
+    if not apart:  # upper bound after no event in `num` trials
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
     test = binomtest(theirs, apart)

@@ -22,7 +22,7 @@ from planner_jax.sweep.quadrotor import (
 
 DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
-_SAMPLES = 800  # of a plan
+_SAMPLES = 800  # number of samples of a plan
 CAPTION = (
     "One plan along its time against the limits, beside the other planners' plans for the same "
     "case. Thin: the recovery trajectory behind the last contact, if there is one."
@@ -45,7 +45,7 @@ class Drawn(NamedTuple):
             axes.plot(self.rest.time, values(self.rest), **{**self.look, **_OF_REST})
 
 
-# Panels: label of the axis, title, and the function of motion and gravity that returns values (N,).
+# Panels: label of the axis, title, and a function of motion and gravity with values (N,).
 PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]] = {
     "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
     "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),

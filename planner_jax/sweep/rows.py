@@ -24,7 +24,7 @@ class PlannedRow(NamedTuple):
     """The plan of a row, bit for bit, and the referee's objection."""
 
     plan: Plan  # of the robot's class, such as `QuadrotorPlan`
-    sentence: str  # "" where the referee accepts the plan
+    sentence: str  # "" if the referee accepts the plan
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:

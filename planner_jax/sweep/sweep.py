@@ -30,7 +30,7 @@ from planner_jax.sweep.figures import outcomes_figure
 class RunFigure:
     """One figure of a task's runs."""
 
-    name: str  # of the file
+    name: str  # file name
     caption: str
     size: tuple[float, float]  # width and height [inch]
     draw: Callable[[Figure, RunRows], None]  # draws into an empty figure
@@ -44,7 +44,7 @@ class Sweep(Generic[AnySettings]):
 
     frame: ClassVar[str] = ""  # axes and time of the columns, as text
     own_columns: ClassVar[Sequence[Column]] = ()
-    single_columns: ClassVar[Sequence[Column]] = ()  # of the command `plan`
+    single_columns: ClassVar[Sequence[Column]] = ()  # used by the command `plan`
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure(
             "outcomes.png",
@@ -53,8 +53,8 @@ class Sweep(Generic[AnySettings]):
             outcomes_figure,
         ),
     )
-    counts: ClassVar[type[Tally]] = Tally  # of rows
-    single_figures: ClassVar[Sequence[RunFigure]] = ()  # of the command `plan`
+    counts: ClassVar[type[Tally]] = Tally  # class of the counts
+    single_figures: ClassVar[Sequence[RunFigure]] = ()  # used by the command `plan`
     failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column of the list of failures
         "case": "index",
         "solver's status": "status",

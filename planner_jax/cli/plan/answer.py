@@ -28,7 +28,7 @@ from planner_jax.sweep.sweep import sweep_of
 
 SingleT = TypeVar("SingleT", bound=SingleSettings)
 
-_SAMPLES = 4001  # of a plan
+_SAMPLES = 4001  # number of samples of a plan
 
 # Upper bounds of the flight: name, unit, and function of the value at every time.
 _ABOVE = {
@@ -79,7 +79,7 @@ class Single(abc.ABC, Generic[SingleT]):
         settings: settings of the case, of the task's class, with the planner filled in.
     """
 
-    # Settings by fields of the case; by default a setting has the last name of the dotted path.
+    # Setting for a field of the case, if it is not the last name in the dotted path of the field.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):

@@ -13,7 +13,7 @@ from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
 _OWN = "(default: the robot's)"
-_MOST_BALLS = 6  # all orders are evaluated
+_MOST_BALLS = 6  # all orders of the balls are evaluated
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -26,7 +26,7 @@ class SingleSettings:
         ArgumentError: a value breaks a rule.
     """
 
-    planner: str | None = option(None, "NAME", "")  # None: the task's first
+    planner: str | None = option(None, "NAME", "")  # None selects the first planner of the task
     start: tuple[float, ...] | None = option(None, "X Y Z", "where the quadrotor hovers [m]")
     speed: float | None = option(None, "V", f"greatest speed [m/s] {_OWN}")
     body_rate: float | None = option(None, "W", f"greatest body rate [rad/s] {_OWN}")
@@ -47,7 +47,7 @@ class SingleSettings:
         require_recovery(self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
-            if isinstance(value, list):  # from the parser
+            if isinstance(value, list):  # the parser returns lists
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
             for number in _numbers(value):

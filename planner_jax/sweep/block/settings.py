@@ -9,8 +9,8 @@ from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings, option
 
 REGIMES = ("R1", "R2", "R3")  # keys in `planner_jax.robot.arm`, which imports JAX
-_LONGEST = 60.0  # [s], or [m] of noise; a ball flies for one or two seconds
-_FASTEST = 1000.0  # [Hz]
+_LONGEST = 60.0  # [s], or [m] of noise; greatest value
+_FASTEST = 1000.0  # [Hz], greatest rate
 
 
 def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:

@@ -48,8 +48,8 @@ class SampledCatch(NamedTuple):
     row: Row
     motion: SampledMotion
     axis: np.ndarray  # (K, 3) thrust direction
-    centre: np.ndarray  # (K, 3) [m], of the hoop
-    radius: float  # [m], of the hoop
+    centre: np.ndarray  # (K, 3) [m], centre of the hoop
+    radius: float  # [m], radius of the hoop
     targets: np.ndarray  # (N, K, 3) [m]
     catches: np.ndarray  # (n,) indices of the times of the catches
 
@@ -163,7 +163,7 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
 
 
 _PANELS = ("speed", "body_rate", "thrust", "jerk")
-_LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
+_LEAST_DISTANCE = 1e-3  # [m], start of the logarithmic axis
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:

@@ -10,7 +10,7 @@ from planner_jax.runs.settings import option
 from planner_jax.sweep.quadrotor_settings import QuadrotorSettings
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TRAINED
 
-NET_TESTS = ("plane", "ball")  # of `referee_catches`
+NET_TESTS = ("plane", "ball")  # tests in `referee_catches`
 
 
 @dataclasses.dataclass(frozen=True)

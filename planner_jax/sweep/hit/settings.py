@@ -13,7 +13,7 @@ from planner_jax.runs.settings import option
 from planner_jax.sweep.quadrotor_settings import QuadrotorSettings
 from planner_jax.task.hit.spec import START
 
-_FARTHEST = 1e6  # [m]
+_FARTHEST = 1e6  # [m], greatest coordinate of the start
 
 
 @dataclasses.dataclass(frozen=True)

@@ -157,9 +157,8 @@ class HitSweep(Sweep[HitSettings]):
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
         """Return the source of a sweep's serves; a folder is read and checked completely."""
-        require_one_of(
-            TASK.suites, "suite", str(settings.suite)
-        )  # suites of other packages have no serves
+        # Suites of other packages have no serves.
+        require_one_of(TASK.suites, "suite", str(settings.suite))
         folder = None if settings.serves is None else read_serves(settings.serves)
         if folder is not None and (settings.num or 0) > len(folder):
             rule = f"<= {len(folder)}, the serves that the folder holds"

@@ -16,7 +16,7 @@ from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of, list_of
 
 FRAME = "world, in the plane, headings counter-clockwise from x; times from the car's start"
-WAY_POINTS = 65  # of a target's path
+WAY_POINTS = 65  # number of points of a target's path
 _FLAGS, _POINT = list_of(pa.bool_()), list_of(pa.float32(), 2)
 
 

@@ -30,13 +30,13 @@ class SampledDrive:
     """A row, its obstacles as polygons, and car and target at K times."""
 
     row: Row
-    setting: Entries  # of the manifest
+    setting: Entries  # entry `setting` of the manifest
     walls: list[np.ndarray]  # (V, 2) [m] each
     movers: list[np.ndarray]  # (V, 2) [m] each, at time 0
-    velocities: np.ndarray  # (N, 2) [m/s], of the movers
+    velocities: np.ndarray  # (N, 2) [m/s], velocities of the movers
     time: np.ndarray  # (K,) [s]
-    pose: np.ndarray  # (K, 3), of the rear axle: x, y [m], heading [rad]
-    middle: np.ndarray  # (K, 2) [m], of the body
+    pose: np.ndarray  # (K, 3), rear axle: x, y [m], heading [rad]
+    middle: np.ndarray  # (K, 2) [m], middle of the body
     speed: np.ndarray  # (K,) [m/s]
     acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
@@ -238,7 +238,7 @@ def draw_polygons(
 
 
 _CURVE_SAMPLES = 801
-_LEAST_DISTANCE = 1e-3  # [m], of the logarithmic axis
+_LEAST_DISTANCE = 1e-3  # [m], start of the logarithmic axis
 # Limit, label of the axis, title, and values (K,) of a drive that the limit bounds.
 _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] = (
     ("speed", "v [m/s]", "Speed", lambda d: d.speed),

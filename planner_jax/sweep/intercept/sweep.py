@@ -25,7 +25,7 @@ class InterceptTally(Tally):
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
     READS = (*COUNTED, *MEANS, "mover_clearance")
-    NEAR = 0.1  # [m]
+    NEAR = 0.1  # [m], clearance of an example
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) of possible examples, the preferred ones first."""
