@@ -1,20 +1,27 @@
-"""A batch on several devices has the plans of one device."""
+"""A batch on several devices has the plans of one device.
+
+The test runs this module as a script, because the number of devices is set before JAX starts.
+"""
 
 import os
 import subprocess
 import sys
-from pathlib import Path
 
+import jax
+import numpy as np
 import pytest
+from test_solve import Well, WellPlanner
 
-SCRIPT = Path(__file__).with_name("spread.py")
+from planner_jax.planning.plan import plan
+
+GOALS = np.linspace(-1.0, 5.0, 203).astype(np.float32)
 
 
 @pytest.mark.slow
 def test_several_devices_give_the_plans_of_one():
     flags = "--xla_force_host_platform_device_count=4"
     process = subprocess.run(
-        [sys.executable, str(SCRIPT)],
+        [sys.executable, __file__],
         env={**os.environ, "XLA_FLAGS": flags},
         capture_output=True,
         text=True,
@@ -22,3 +29,36 @@ def test_several_devices_give_the_plans_of_one():
     )
     assert process.returncode == 0, process.stderr[-2000:]
     assert process.stdout.endswith("equal\n")
+
+
+def require_equal(found, expected):
+    for ours, theirs in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        np.testing.assert_allclose(np.asarray(ours), theirs, rtol=1e-5, atol=1e-5)
+
+
+def compare_devices():
+    """Compare plans on all of four devices, on three, and on one other than the first."""
+    devices = jax.local_devices()
+    assert len(devices) == 4
+    alone = plan(WellPlanner(), Well(GOALS), devices=devices[:1])
+    for some in (None, devices[:3], devices[2:3]):
+        for chunk in (None, 16):
+            require_equal(plan(WellPlanner(), Well(GOALS), devices=some, chunk=chunk), alone)
+            resident = Well(jax.numpy.asarray(GOALS))
+            resident = plan(WellPlanner(), resident, devices=some, chunk=chunk)
+            require_equal(resident, alone)
+            assert isinstance(resident.point, jax.Array)
+            assert resident.point.sharding.device_set == {(some or devices)[0]}
+    even = plan(WellPlanner(), Well(jax.numpy.asarray(GOALS[:200])))
+    assert len(even.point.sharding.device_set) == 4
+    broken = GOALS.copy()
+    broken[::100] = np.nan
+    spoiled = plan(WellPlanner(), Well(broken))
+    others = np.isfinite(broken)
+    clean = plan(WellPlanner(), Well(GOALS))
+    np.testing.assert_array_equal(spoiled.point[others], clean.point[others])
+
+
+if __name__ == "__main__":
+    compare_devices()
+    print("equal")
