@@ -31,8 +31,8 @@ test-slow: $(VENV)/.installed-test  ## the tests marked slow
 coverage: $(VENV)/.installed-test  ## the share of planner_jax's lines that default and slow tests run
 	$(PYTEST) -m "not gpu" --cov --cov-report=term:skip-covered --cov-fail-under=90
 
-test-faults: $(VENV)/.installed-test  ## every fault in numbers: kills, twins, damage, full disks, signals; hours on 2 cores
-	$(VENV)/bin/python -m tests.faults --out build/faults.md
+test-faults: $(VENV)/.installed-test  ## every fault in numbers: kills, twins, damage, full disks, signals; an hour on 2 cores
+	$(VENV)/bin/python -m tests.faults --jobs $$(nproc) --out build/faults.md
 
 test-wheel: $(VENV)/.installed-test  ## a wheel in an environment of its own: 1.3 GB, then removed
 	PLANNER_JAX_WHEEL=whole $(VENV)/bin/python -m pytest -m slow -o tmp_path_retention_policy=failed \
