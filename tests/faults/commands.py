@@ -7,6 +7,7 @@ import random
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -81,6 +82,16 @@ def wait_for(process: subprocess.Popen, within: float = 300.0) -> Ended:
         process.kill()
         out, err = process.communicate()
     return Ended(process.returncode, out, err)
+
+
+def wait_until_listening(process: subprocess.Popen) -> None:
+    """Wait until a command handles SIGTERM, or has ended."""
+    caught = 0
+    while process.poll() is None and not caught & 1 << signal.SIGTERM - 1:
+        time.sleep(0.01)
+        with contextlib.suppress(OSError):  # the process has ended meanwhile
+            lines = Path(f"/proc/{process.pid}/status").read_text().splitlines()
+            caught = int(next(line for line in lines if line.startswith("SigCgt")).split()[1], 16)
 
 
 def children_of(parent: int, name: str) -> list[int]:

@@ -6,18 +6,18 @@ python -m tests.faults.quick sweep hit ...
 import contextlib
 from collections.abc import Iterator
 
-import pytest
-
 from planner_jax import __main__ as command
 from planner_jax.host import signals
 
 
 @contextlib.contextmanager
-def quick_sweeps(is_reported: bool = False) -> Iterator[pytest.MonkeyPatch]:
+def quick_sweeps(is_reported: bool = False) -> Iterator[None]:
     """Plan hits and catches in one round, and draw nothing.
 
     With `is_reported` one case is planned by another planner, and one figure is drawn.
     """
+    import pytest
+
     from planner_jax.sweep.catch.sweep import CatchSweep
     from planner_jax.sweep.hit.sweep import HitSweep
     from planner_jax.sweep.sweep import Sweep
@@ -29,7 +29,7 @@ def quick_sweeps(is_reported: bool = False) -> Iterator[pytest.MonkeyPatch]:
             patch.setattr(kind, "planner", lambda *_, planner=planner: planner)
             patch.setattr(kind, "other_planners", lambda *_, others=others: others)
             patch.setattr(kind, "figures", Sweep.figures if is_reported else ())
-        yield patch
+        yield
 
 
 def run() -> None:

@@ -15,7 +15,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import NamedTuple
 
-from tests.faults.commands import children_of, is_one_line, is_stopped, start, wait_for
+from tests.faults.commands import (
+    children_of,
+    is_one_line,
+    is_stopped,
+    start,
+    wait_for,
+    wait_until_listening,
+)
 from tests.faults.quick import quick_sweeps
 from tests.faults.runs import TARGETS, make_runs, verdict
 from tests.sweeps import rows_of
@@ -138,7 +145,8 @@ def interrupt(moment: random.Random, num: int, place: Path, base: Path) -> Survi
         number = moment.choice((signal.SIGINT, signal.SIGINT, signal.SIGTERM, signal.SIGHUP))
         process = sweep(*SWEEPS["hit"], "--out", out, cwd=place, cache=cache)
         late = moment.uniform(0.5, 12.0 if compiles else 6.0)
-        time.sleep(moment.choice((moment.uniform(0.3, 1.0), late)))
+        wait_until_listening(process)
+        time.sleep(moment.choice((moment.uniform(0.0, 1.0), late)))
         times = 1 + 2 * (tried % 3 == 0)
         alive = process.poll() is None
         for _ in range(times):
