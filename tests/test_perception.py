@@ -10,14 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.ball.estimation import EkfModel, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, drag_free_flight
+from planner_jax.sims import segment
 from planner_jax.sims.calibrate import calibrate, hand_eye, pose, rigid_motion
-from planner_jax.sims.segment import (
-    ball_look,
-    colour_mask,
-    hue_saturation_value,
-    noisy_depth,
-    sighting,
-)
 from planner_jax.studies.block.camera import back_project, in_view, looking_at, project
 from planner_jax.studies.block.flight_fit import (
     Sight,
@@ -47,7 +41,7 @@ paths = jax.jit(jax.vmap(drag_free_flight, (None, 0, None)))
 fit_one = jax.jit(fit_flight)
 fit_many = jax.jit(jax.vmap(fit_flight, (0, 0, 0, None)))
 believed = jax.jit(belief_at)
-sighting_one = jax.jit(sighting)
+sighting_one = jax.jit(segment.sighting)
 
 
 @jax.jit
@@ -228,8 +222,7 @@ def test_the_noise_of_depth_grows_with_the_square_of_the_distance():
 
 
 @pytest.mark.parametrize(
-    "noise",
-    [stereo_noise(dropout=0.0, disparity_std=0.02), IsotropicNoise(std=jnp.asarray(0.02))],
+    "noise", [stereo_noise(dropout=0.0, disparity_std=0.02), IsotropicNoise(std=jnp.asarray(0.02))]
 )
 def test_the_information_of_a_sighting_is_the_inverse_of_its_covariance(noise):
     place = jnp.array([4.0, 1.0, 1.5])
@@ -254,7 +247,7 @@ def test_hue_saturation_and_value_are_those_of_the_standard_library():
     rng = np.random.default_rng(0)
     greys, pure = np.repeat([[0], [7], [255]], 3, 1), np.eye(3) * 255
     colours = np.concatenate([rng.integers(0, 256, (300, 3)), greys, pure]).astype(np.float32) / 255
-    found = jax.jit(hue_saturation_value)(colours)
+    found = jax.jit(segment.hue_saturation_value)(colours)
     expected = [colorsys.rgb_to_hsv(*map(float, colour)) for colour in colours]
     np.testing.assert_allclose(found, expected, atol=1e-5)
 
@@ -263,15 +256,15 @@ def test_hue_saturation_and_value_are_those_of_the_standard_library():
 def test_the_mask_compares_hue_saturation_and_value(hues):
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
-    look = ball_look((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
-    hsv = np.asarray(hue_saturation_value(image.astype(np.float32) / 255.0), float)
+    look = segment.ball_look((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
+    hsv = np.asarray(segment.hue_saturation_value(image.astype(np.float32) / 255.0), float)
     edges = np.stack([look.lower, look.upper])
     near = (np.abs(hsv[:, :, None] - edges) < 1e-5).any(axis=(2, 3))  # rounding decides there
     combine = np.logical_or if hues[0] > hues[1] else np.logical_and
     hue = combine(hsv[..., 0] >= hues[0], hsv[..., 0] <= hues[1])
     others = [(hsv[..., k] >= look.lower[k]) & (hsv[..., k] <= look.upper[k]) for k in (1, 2)]
     expected = hue & others[0] & others[1]
-    found = np.asarray(colour_mask(image, look))
+    found = np.asarray(segment.colour_mask(image, look))
     np.testing.assert_array_equal(found[~near], expected[~near])
     assert 20 < expected.sum() < 1000
 
@@ -296,7 +289,7 @@ def ball_frame(place, radius=0.05):
 @pytest.mark.parametrize("place", [(1.5, 0.4, 1.2), (4.0, 1.0, 1.5), (3.0, -2.0, 2.0)])
 def test_a_ball_is_seen_where_it_is(place):
     image, depth = ball_frame(np.array(place))
-    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_look())
     pixel, distance = project(CAMERA, jnp.array(place))
     np.testing.assert_allclose(found.pixel, pixel, atol=0.35)
     assert found.depth == pytest.approx(float(distance), abs=0.02)
@@ -305,7 +298,7 @@ def test_a_ball_is_seen_where_it_is(place):
 def test_pixels_of_little_confidence_or_another_depth_are_dropped():
     place = np.array([2.0, 0.3, 1.3])
     image, depth = ball_frame(place)
-    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_look())
     ball = np.argwhere(depth < 12.0)
     wrong = ball[:: len(ball) // 6]
     spoiled, trust = depth.copy(), np.ones_like(depth)
@@ -313,7 +306,7 @@ def test_pixels_of_little_confidence_or_another_depth_are_dropped():
     spoiled[tuple(wrong[1::2].T)] *= 1.02
     trust[tuple(wrong[1::2].T)] = 0.1
     image[:3, :2] = image[tuple(ball[0])]  # as if something far away had the colour
-    found = sighting_one(image, spoiled, trust, CAMERA, ball_look())
+    found = sighting_one(image, spoiled, trust, CAMERA, segment.ball_look())
     assert found.pixels == clean.pixels - len(wrong)
     np.testing.assert_allclose(found.place, clean.place, atol=0.02)
 
@@ -327,20 +320,20 @@ def test_a_frame_without_the_ball_shows_nothing():
         (image, depth, 0.0 * trust),
         (image, 20.0 * depth, trust),
     ):
-        found = sighting_one(*frame, CAMERA, ball_look())
+        found = sighting_one(*frame, CAMERA, segment.ball_look())
         assert found.pixels == 0 and np.isnan(found.place).all() and np.isnan(found.depth)
 
 
 def test_noisy_depth_images_have_the_noise_that_is_asked_for():
     noise = stereo_noise(disparity_std=0.0, speckle_std=0.05, mismatch=0.02, dropout=0.1)
     depth = jnp.full((192, 320), 3.0)
-    found, trust = jax.jit(noisy_depth)(jax.random.key(0), CAMERA, noise, depth)
+    found, trust = jax.jit(segment.noisy_depth)(jax.random.key(0), CAMERA, noise, depth)
     assert np.isnan(found).mean() == pytest.approx(0.1, abs=0.01)
     believed_in = np.asarray(found)[(np.asarray(trust) > 0.6) & np.isfinite(found)]
     expected = 9.0 * 0.05 / (CAMERA.focal * 0.12)
     assert believed_in.std() == pytest.approx(float(expected), rel=0.05)
     common = stereo_noise(speckle_std=0.0, mismatch=0.0, dropout=0.0)
-    found, _ = jax.jit(noisy_depth)(jax.random.key(0), CAMERA, common, depth)
+    found, _ = jax.jit(segment.noisy_depth)(jax.random.key(0), CAMERA, common, depth)
     assert found.std() < 1e-5 and abs(found[0, 0] - 3.0) > 1e-3
 
 

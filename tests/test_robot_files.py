@@ -14,14 +14,8 @@ import yaml
 import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError, UnknownName
-from planner_jax.robot.quadrotor_file import (
-    UNITS,
-    RobotError,
-    model_of,
-    parse_numbers,
-    to_yaml,
-)
-from planner_jax.robot.quadrotor_models import MODELS, ready_robot
+from planner_jax.robot.quadrotor_file import UNITS, RobotError, model_of, parse_numbers, to_yaml
+from planner_jax.robot.quadrotor_models import MODELS
 from planner_jax.runs.settings import settings_to_resume
 from planner_jax.sims.settings import HitFly
 from planner_jax.sweep.hit.settings import HitSettings
@@ -249,7 +243,7 @@ def test_a_lag_that_mjcf_does_not_have_has_to_be_said(tmp_path):
 def test_an_unknown_robot_is_refused_with_the_nearest_name_and_each_names_its_sources():
     with pytest.raises(UnknownName, match="^robot must be one of paper-catcher, .*mean x500-net?"):
         pj.robot_named("x50-net")
-    assert all(f"`{name}`" in (ready_robot.__doc__ or "") for name in MODELS)
+    assert all(f"`{name}`" in (pj.robot_named.__doc__ or "") for name in MODELS)
     assert all("assumed" in robot.source and len(robot.source) > 40 for robot in MODELS.values())
 
 

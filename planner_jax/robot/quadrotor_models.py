@@ -95,35 +95,24 @@ MODELS = {
 }
 
 
-def ready_robot(name: str) -> QuadrotorModel:
-    """Return a quadrotor of this module by its name.
+def robot_named(word: str) -> QuadrotorModel:
+    """Return a quadrotor by its name, or read it from a file.
 
     The names are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
     `x500-net`; `planner-jax robots` prints their main numbers.
 
     Raises:
-        UnknownName: no quadrotor has this name; one line that lists the names.
-    """
-    if name in MODELS:
-        return MODELS[name]
-    from planner_jax.robot.quadrotor_file import suggestion
-
-    hint = suggestion(str(name), MODELS)
-    raise UnknownName("robot", f"one of {', '.join(MODELS)}", shown=f"{name!r:.60}{hint}")
-
-
-def robot_named(word: str) -> QuadrotorModel:
-    """Return a quadrotor by its name, or read it from a file.
-
-    Raises:
-        UnknownName: there is neither such a name nor such a file; one line.
+        UnknownName: there is neither such a name nor such a file; one line that lists the names.
         RobotError: the file breaks a rule; one line.
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
-    from planner_jax.robot.quadrotor_file import ENDINGS, read_robot
+    if word in MODELS:
+        return MODELS[word]
+    from planner_jax.robot.quadrotor_file import ENDINGS, read_robot, suggestion
 
     if not word.lower().endswith(ENDINGS):
-        return ready_robot(word)
+        shown = f"{word!r:.60}{suggestion(word, MODELS)}"
+        raise UnknownName("robot", f"one of {', '.join(MODELS)}", shown=shown)
     try:
         return read_robot(word)
     except OSError as error:
