@@ -44,6 +44,7 @@ def test_no_time_and_a_target_as_before_give_back_the_motion_of_a_catch(catches)
     again = pj.replan(pj.catch.ReplanCatch(CATCH.planner, rounds=NONE), cases, plans, 0.0, **news)
     assert again.status.shape == (NUM,)
     np.testing.assert_allclose(again.times, plans.times, atol=2e-6)
+    np.testing.assert_allclose(again.cost, plans.cost, rtol=2e-3)
     assert_same_motion(again, plans, plans.times[:, 0], 1e-3)
 
 
