@@ -1,4 +1,4 @@
-"""Decisions on the order and the times of catches, by the estimate of `estimate`.
+"""Decisions on the order and the times of catches, by the rough estimate in `estimate`.
 
 If targets are optional, a decision also chooses which to catch. Every order is then proposed in
 several lengths, and the plan that catches most targets is selected.
@@ -100,8 +100,8 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     if num > MOST_SEARCHED:
         raise ArgumentError("targets", f"at most {MOST_SEARCHED} of a case", num)
     from_all = jax.vmap(estimate.arrivals, (None, 0, 0, None))
-    # The set of taken targets as bits of a few integers. Each of 32 bits also has room for the
-    # index of the last target.
+    # The set of taken targets as bits of a few integers. The last integer, of 32 bits, also has
+    # room for the index of the last target.
     words = np.arange(0, num, _WORD)
     place = np.arange(num) - words[:, None]
     inside = (place >= 0) & (place < _WORD)

@@ -39,10 +39,10 @@ _FEATURE_TIMES = (-0.1, 0.1)  # [s], relative to the decided time, of the ball i
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
 _LEARNED_SIZE = 2.0  # greatest length of the variables of a learned catch point: 0.89 of `_RIM`
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
-# Starting points, best first: factor on the decided times; for the catches before the last, the
-# velocity relative to the mean velocity of the segment, and the thrust, where -1 is the least, 0
-# hover and 1 the greatest; both numbers for the last catch. Optimal plans sink through their
-# catches and brake at the last one.
+# Starting points, best first. Columns: factor on the decided times; velocity, relative to the mean
+# velocity of the segment, at catches before the last one and at the last one; thrust at the same
+# two, where -1 is the least, 0 hover and 1 the greatest. Optimal plans sink through their catches
+# and brake at the last one.
 _GUESSES = np.array(
     [
         (1.0, 0.5, 0.8, -5.0 / 7.0, 0.1),
@@ -60,7 +60,7 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # replaces it after a network
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # replaces `_FIRST` with a network
 # Before Newton's method with several targets, in place of `_FIRST`, which ends too far away.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
@@ -74,7 +74,7 @@ _LEAN = 0.95  # angle between net and ball in a guess, relative to the greatest 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
-    """Plans minimum-snap catches; the decision variables put the ball into the net.
+    """Plans minimum-snap catches whose decision variables put the ball into the net.
 
     Each of N segments has 3 (M - 1) + 12 variables in units of `scale`: whitened waypoint offsets,
     log duration, catch point in the net, and velocity, acceleration and jerk at the catch. The
