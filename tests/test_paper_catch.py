@@ -94,7 +94,7 @@ def test_converged_costs_are_the_published_optima():
     np.testing.assert_allclose(late, 0.0, atol=1e-3)
     gap, late, cases, plans = excess(PLANNER)
     assert np.abs(gap).max() <= 1e-3 and (np.abs(gap) > 1e-4).sum() <= 1
-    first = np.append(np.arange(4), len(gap) // 2 + np.arange(4))  # of both files
+    first = np.append(np.arange(4), len(gap) // 2 + np.arange(4))  # rows of both files
     np.testing.assert_allclose(gap[first], 0.0, atol=1e-4)
     np.testing.assert_allclose(late[first], 0.0, atol=1e-3)
     # The penalties are soft: the protocol's tolerance is 5 %, and its net is a ball.

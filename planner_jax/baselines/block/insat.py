@@ -67,7 +67,7 @@ class Bounds:
 class Splines:
     """Iterates of the optimisation, K of each of A splines with m control points."""
 
-    points: Array  # (A, K, m, 6) [rad]
+    points: Array  # (A, K, m, 6) [rad], control points
     time: Array  # (A, K) [s], t_f
     length: Array  # (A, K) [rad], of the path in joint space
     angles: Array  # (A, K, S, 6) [rad], samples

@@ -32,7 +32,7 @@ _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 class Trial(NamedTuple):
     """One serve of a trial file."""
 
-    line: int  # from 1
+    line: int  # line number, from 1
     scenario: int  # index in court.SCENARIOS
     file: str
     numbers: list[float]  # 12: serve position, serve velocity, landing position, target

@@ -27,7 +27,7 @@ _BEFORE = 0.05  # fraction of the horizon that is projected before its start and
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
-    """Sizes of a projection; static."""
+    """Numbers of runs and slabs of a projection, and its margin; static."""
 
     runs: int = 2  # runs of one obstacle; further runs are joined to the last one
     slabs: int = 4  # slabs of one run

@@ -141,6 +141,6 @@ def _throw_balls(
 
 @jax.jit
 def _move_back(balls: BallState, times: Array) -> BallState:
-    """Return balls (B,) as they were times (B,) [s] earlier."""
+    """Trace balls (B,) back in time by times (B,) [s]."""
     gravity = jnp.asarray(GRAVITY, times.dtype)
     return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

@@ -210,7 +210,7 @@ class StraightPair(PairPlanner):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """The only attempt."""
+        """One attempt, which checks all straight motions."""
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
@@ -278,7 +278,7 @@ class BentPair(PairPlanner):
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """The only search."""
+        """One attempt: the search."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
