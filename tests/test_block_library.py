@@ -70,6 +70,11 @@ def make_library(layout=TINY, regime="R2", homes=1):
     return library_of(pack_rows(row), home, layout, setting(regime))
 
 
+def tunnels_of(layout):
+    scene = paper_scene()
+    return tunnels(layout, scene.inner, scene.outer)
+
+
 def ball_through(outer, inner, speed=8.0, before=0.6):
     """Return a ball through two points, first seen `before` [s] ahead of the first point."""
     outer, inner = np.asarray(outer), np.asarray(inner)
@@ -81,9 +86,8 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 
 @pytest.mark.parametrize("name", LAYOUTS)
 def test_a_point_of_a_cell_is_in_that_cell(name):
-    layout, scene = LAYOUTS[name], paper_scene()
+    layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    tunnel = tunnels(layout, scene.inner, scene.outer)
     whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), *_no_boxes())
     sides = (
         (layout.inner, scene.inner, tunnel.inner[: layout.num_inner]),
@@ -120,8 +124,7 @@ def test_points_on_edges_are_in_exactly_one_cell():
 
 def test_tunnels_are_cut_off_where_no_ball_can_come_from():
     """Every point of a tunnel sees the inner cell from in front, and no other point does."""
-    layout, scene = LAYOUTS["full"], paper_scene()
-    tunnel = tunnels(layout, scene.inner, scene.outer)
+    layout, tunnel = LAYOUTS["full"], tunnels_of(LAYOUTS["full"])
     assert len(tunnel.outer) == layout.num_pairs == 21504
     assert (tunnel.is_feasible | ~tunnel.is_centred).all()
     face = (np.arange(layout.num_pairs) % layout.num_inner) // 28
@@ -134,14 +137,12 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
         )
     # 37.5 and 45.8 % of the pairs of A and B are feasible from the middle of the outer cell.
     for name, share in (("A", 0.375), ("B", 11 / 24)):
-        centred = tunnels(LAYOUTS[name], scene.inner, scene.outer).is_centred
-        assert centred.mean() == pytest.approx(share)
+        assert tunnels_of(LAYOUTS[name]).is_centred.mean() == pytest.approx(share)
 
 
 def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
     """Random balls reach the farthest crossing and do not pass it."""
-    scene, rng = paper_scene(), np.random.default_rng(1)
-    tunnel = tunnels(LAYOUTS["D"], scene.inner, scene.outer)
+    rng, tunnel = np.random.default_rng(1), tunnels_of(LAYOUTS["D"])
     pair = rng.choice(np.flatnonzero(tunnel.is_centred))
     outer, inner = tunnel.outer[pair], tunnel.inner[pair]
     ball, span = nominal_ball(outer, inner)
@@ -169,9 +170,7 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
 
 def test_a_lookup_returns_the_stored_motion_and_its_contact():
     """From both homes; contact time and position follow the parabola."""
-    library = make_library(homes=2)
-    scene = paper_scene()
-    tunnel = tunnels(TINY, scene.inner, scene.outer)
+    library, tunnel = make_library(homes=2), tunnels_of(TINY)
     pairs = np.flatnonzero(tunnel.is_feasible)[:-1]
     shots = [ball_through(tunnel.outer[p].mean(0), tunnel.inner[p].mean(0)) for p in pairs]
     planner = LibraryBlock(library)
@@ -342,7 +341,7 @@ def test_a_resumed_build_gives_the_same_library(tmp_path, counted, monkeypatch):
     assert len(counted) == 2 * num
     assert (tmp_path / "cut").read_bytes() == (tmp_path / "whole").read_bytes()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cut", "whole"]
-    feasible = tunnels(TINY, paper_scene().inner, paper_scene().outer).is_feasible
+    feasible = tunnels_of(TINY).is_feasible
     pairs = np.arange(TINY.num_pairs)
     np.testing.assert_array_equal(whole.found[0], feasible & (pairs % 7 > 0))
     np.testing.assert_array_equal(
@@ -387,7 +386,7 @@ def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
     assert fixed.setting.scene is scene
     counted.clear()
     _, touched = building.repair(library, scene, retry=True, progress=False)
-    feasible = tunnels(LAYOUTS["A"], scene.inner, scene.outer).is_feasible
+    feasible = tunnels_of(LAYOUTS["A"]).is_feasible
     np.testing.assert_array_equal(touched[0], hit | (feasible & ~library.found[0]))
 
 

@@ -182,9 +182,9 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
         possible = feasible.sum(axis=axis)
         share = (found & feasible).sum(axis=axis) / np.maximum(possible, 1)
         values = np.where(possible > 0, 100.0 * share, np.nan)
-        first = 0
+        offset = 0
         for panel, face in zip(row, faces, strict=False):
-            cells = values[first : first + face.num].reshape(face.cells)
+            cells = values[offset : offset + face.num].reshape(face.cells)
             picture = panel.imshow(
                 cells.T,
                 origin="lower",
@@ -196,7 +196,7 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
             first, second = ("xyz"[each] for each in face.across)
             style.label(panel, f"{first} [m]", f"{second} [m]", f"{name} {face.name}")
             panel.grid(False)
-            first += face.num
+            offset += face.num
         for panel in row[len(faces) :]:
             panel.set_axis_off()
     if picture is not None:
