@@ -210,7 +210,8 @@ class _Slab(NamedTuple):
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
     """Make a slab from the distances () of both planes from a segment's start.
 
-    `speed` and `weight` are the segment's length across the slab, and its square.
+    `speed` is the segment's length across the slab, and `weight` its square in a unit that all
+    slabs of a problem share.
     """
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)

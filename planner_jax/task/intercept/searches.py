@@ -32,7 +32,7 @@ class Search(Attempt):
     following: int = 4  # steps of the stage that follows the path of cells
     settling: int = 16  # steps of the last stage, towards less effort or an earlier meeting
     margin: float = 0.03  # [m], distance from obstacles at which hinges start
-    slack: float = 0.015  # share of every limit below it at which hinges start
+    slack: float = 0.015  # hinges start at (1 - slack) times a limit
     discs: int = 3  # that cover the body in least squares
     seed: int = 0  # of the paths
     candidates: int = 4  # paths that are drawn for each path; the smoothest is used

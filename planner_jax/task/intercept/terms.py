@@ -33,7 +33,7 @@ class Weights:
     turning: float = 3e-3  # of the integral of the squared rate of curvature
     follow: float = 0.0  # of the distance at knots from the positions of a guess [1/m^2]
     margin: float = 0.03  # [m], distance from obstacles at which hinges start
-    slack: float = 0.015  # share of every limit below it at which hinges start
+    slack: float = 0.015  # hinges start at (1 - slack) times a limit
 
 
 def wrap(angle: Array) -> Array:
