@@ -28,7 +28,7 @@ def knots():
     return rng.uniform(0.2, 1.5, 9), rng.uniform(-2.0, 2.0, 9)
 
 
-def test_the_motion_is_the_car_s(knots, float64):
+def test_the_motion_follows_the_car_s_kinematics(knots, float64):
     times = np.linspace(0.0, 4.0, 5 * (len(knots[0]) - 1) + 1)[1:]
 
     @jax.jit
