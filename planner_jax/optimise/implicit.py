@@ -17,10 +17,9 @@ from jaxtyping import PyTree
 from planner_jax.core.checks import require_kind
 from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.planner import require_fit
+from planner_jax.core.planner import Planner, require_fit
 from planner_jax.core.protocol import mark_bad_input, status_of
 from planner_jax.optimise.multistart import minimise
-from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, Objective
 
 
@@ -92,7 +91,7 @@ def newton_refine(
 
 
 def optimal_plan(
-    planner: OptimisedPlanner,
+    planner: Planner,
     case: PyTree,
     *,
     solver: LbfgsConfig | None = None,
