@@ -212,9 +212,8 @@ def test_padding_leaves_the_present_targets_alone(name):
     ],
 )
 def test_bad_arguments_are_named_in_one_line(options, says):
-    with pytest.raises(ValueError, match=says) as caught:
+    with pytest.raises(ValueError, match=rf"\A{says}.*\Z"):
         draw(**{"num": 3, **options})
-    assert "\n" not in str(caught.value)
 
 
 def test_the_earliest_throw_leaves_less_time_than_any_other_of_its_suite():

@@ -214,14 +214,12 @@ LIKE_OTHERS = (
 
 def entries(*, on_host=True, slow=()):
     """Parametrise a test by planners."""
-    chosen = {name: entry for name, entry in ENTRIES.items() if on_host or not entry.on_host}
-    return pytest.mark.parametrize(
-        "entry",
-        [
-            pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
-            for name, entry in chosen.items()
-        ],
-    )
+    rows = [
+        pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
+        for name, entry in ENTRIES.items()
+        if on_host or not entry.on_host
+    ]
+    return pytest.mark.parametrize("entry", rows)
 
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
@@ -413,11 +411,8 @@ def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
     planner = entry.planner.inner
     searches_first = isinstance(planner, SpacetimeIntercept)  # plans are then settled anew
     if not (isinstance(planner, OptimisedPlanner) or searches_first):
-        with pytest.raises(
-            TypeError, match=f"^{type(planner).__name__} minimises nothing"
-        ) as caught:
+        with pytest.raises(TypeError, match=rf"\A{type(planner).__name__} minimises nothing.*\Z"):
             pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)
-        assert "\n" not in str(caught.value)
         return
     found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
     if not searches_first:  # the search continues from the plans
@@ -447,10 +442,9 @@ def test_plans_are_read_from_a_file_as_they_were_written(entry, tmp_path):
 @pytest.mark.parametrize("call", [pj.plan, pj.solve], ids=["plan", "solve"])
 def test_cases_of_another_task_are_refused_in_one_line(entry, call):
     stranger = places(2) if not isinstance(entry.batch, Place) else pj.hit.draw(2)
-    names = f"{type(entry.batch).__name__}, got {type(stranger).__name__}$"
-    with pytest.raises(TypeError, match=names) as caught:
+    names = rf"\A.*{type(entry.batch).__name__}, got {type(stranger).__name__}\Z"
+    with pytest.raises(TypeError, match=names):
         call(entry.planner, stranger)
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("only_cpu", [True, False])
@@ -483,6 +477,5 @@ def test_a_planner_that_is_no_pytree_is_told_how_to_become_one(call):
         def solve(self, case, attempt):
             raise AssertionError("it must not come to this")
 
-    with pytest.raises(TypeError, match=r"^Plain must be a pytree: .*register_static") as caught:
+    with pytest.raises(TypeError, match=r"\APlain must be a pytree: .*register_static.*\Z"):
         call(Plain(), places(2))
-    assert "\n" not in str(caught.value)
