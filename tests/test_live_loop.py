@@ -51,6 +51,13 @@ def warm():
     planner.close()
 
 
+@pytest.fixture
+def server(warm):
+    server = Server(warm, 0)
+    yield server
+    server._socket.close()
+
+
 class Throw:
     """One throw; the robot is where the last answer wanted it."""
 
@@ -93,6 +100,10 @@ def balls_of(answers):
     return answers[1::2]
 
 
+def first_column(answers, name):
+    return np.array([answer.column(name)[0] for answer in answers])
+
+
 def last_plan(answers):
     return [answer for answer in answers if answer.motion is Motion.PLAN][-1]
 
@@ -111,11 +122,9 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     at = np.argmin(np.abs(times - contact))
     pos, thrust = answers[at].column("pos")[0], answers[at].column("acc")[0] + [0, 0, 9.81]
     net = pos + 0.2 * thrust / np.linalg.norm(thrust)
-    assert (
-        np.linalg.norm(net - ball) < 0.125 + 0.06
-    )  # the net's radius, and the ball's path in STEP
-    positions = np.array([answer.column("pos")[0] for answer in answers])
-    speeds = np.array([answer.column("vel")[0] for answer in answers])
+    # The net's radius, and the distance that the ball moves in STEP.
+    assert np.linalg.norm(net - ball) < 0.125 + 0.06
+    positions, speeds = first_column(answers, "pos"), first_column(answers, "vel")
     jumps = np.diff(positions, axis=0) - 0.5 * STEP * (speeds[1:] + speeds[:-1])
     assert np.abs(jumps).max() < 0.01
     slowing = np.linalg.norm(speeds[last + 1 :], axis=1)
@@ -177,11 +186,11 @@ def test_bad_packets_are_counted_by_name_without_an_effect(warm, path):
     answers = throw.fly(60)
     spoiled = last_plan(answers)
     names = {fault for fault, num in (warm.report.faults - before).items() if num}
-    wanted = {Fault.DUPLICATE, Fault.CUT, Fault.STRANGE, Fault.NOT_FINITE, Fault.OTHER_CLOCK}
-    assert names >= {*wanted, Fault.UNKNOWN_KIND}
+    expected = {Fault.DUPLICATE, Fault.CUT, Fault.STRANGE, Fault.NOT_FINITE, Fault.OTHER_CLOCK}
+    assert names >= {*expected, Fault.UNKNOWN_KIND}
     assert all(np.isfinite(answer.setpoints).all() for answer in answers)
-    offset = spoiled.begin - clean.begin
-    assert abs(spoiled.contact - offset - clean.contact) < 0.05
+    contacts = [answer.contact - answer.begin for answer in (spoiled, clean)]
+    assert abs(contacts[0] - contacts[1]) < 0.05
 
 
 def test_throws_are_caught_by_plans_with_recoveries(warm):
@@ -216,8 +225,7 @@ def test_a_plan_without_a_recovery_is_not_flown(warm, path, monkeypatch):
     answers = Throw(warm, path, 8).fly(40)
     assert warm.report.counts["endless"] - before > 10 and warm._flight.plan is None
     assert answers[-2].motion is Motion.SAFE  # to a state of the robot
-    positions = np.array([answer.column("pos")[0] for answer in answers])
-    assert np.linalg.norm(positions - HOME, axis=1).max() < 0.02
+    assert np.linalg.norm(first_column(answers, "pos") - HOME, axis=1).max() < 0.02
 
 
 @pytest.mark.parametrize("rate", [2.0, 200.0])
@@ -245,8 +253,7 @@ def test_slow_planning_is_answered_from_the_last_plan(warm, path, monkeypatch):
     warm._job.found.result()
 
 
-def test_the_client_of_the_page_prints_setpoints(warm, capsys):
-    server = Server(warm, 0)
+def test_the_client_of_the_page_prints_setpoints(warm, server, capsys):
     warm._forget()
     warm._arrivals.__init__()
     server._socket.settimeout(0.05)
@@ -261,27 +268,22 @@ def test_the_client_of_the_page_prints_setpoints(warm, capsys):
     finally:
         stopped.set()
         thread.join()
-        server._socket.close()
     assert "PLAN" in capsys.readouterr().out
 
 
-def test_a_packet_arrives_when_the_system_receives_it(warm):
-    server = Server(warm, 0)
+def test_a_packet_arrives_when_the_system_receives_it(server):
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(b"here", ("127.0.0.1", server.port))
     sent = time.perf_counter()
     time.sleep(0.1)
     data, _, received = server._receive()
-    server._socket.close()
     assert data == b"here" and abs(received - sent) < 0.05
 
 
-def test_foreign_packets_get_one_warning_a_kind_and_no_answer(warm, capsys):
-    server, sender = Server(warm, 0), ("127.0.0.1", 9)
+def test_foreign_packets_get_one_warning_a_kind_and_no_answer(server, capsys):
     ours = request(BALL, 1, 5.0, 5.0, (0.0, 0.0, 1.0))
     for data in (b"GET / HTTP/1.1", ours[:30], b"", ours[:4] + b"\x02" + ours[5:], b"PJLV", b"x"):
-        server._answer(data, sender, time.perf_counter())
-    server._socket.close()
+        server._answer(data, ("127.0.0.1", 9), time.perf_counter())
     lines = capsys.readouterr().err.splitlines()
     start = "planner-jax: warning: a packet from 127.0.0.1:9 "
     assert [line.startswith(start) for line in lines] == [True] * 3
@@ -292,23 +294,17 @@ def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
     stroke = CatchServe(robot="x500-net").stroke()
     assert float(stroke.case.net.radius) == pytest.approx(0.2)
     assert CatchServe().stroke().case.net.radius == CatchStroke().case.net.radius
-    for settings, robot, rule in (
-        (HitServe, "x500-net", "robot must carry a racket"),
-        (CatchServe, "nobody", "robot must be one of"),
-        (CatchServe, "gone.yaml", "robot must be a file that can be read"),
-    ):
-        with pytest.raises(ArgumentError, match=rule):
-            settings(robot=robot)
+    with pytest.raises(ArgumentError, match="robot must carry a racket"):
+        HitServe(robot="x500-net")
+    for robot, rule in (("nobody", "one of"), ("gone.yaml", "a file that can be read")):
+        with pytest.raises(ArgumentError, match=f"robot must be {rule}"):
+            CatchServe(robot=robot)
 
 
-def test_a_port_that_is_taken_ends_the_command_with_a_line(warm, capsys):
-    server = Server(warm, 0)
-    try:
-        assert main(["serve", "catch", "--port", str(server.port)]) == 1
-    finally:
-        server._socket.close()
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"port {server.port}: Address already in use" in said
+def test_a_port_in_use_ends_the_command_with_one_line(server, capsys):
+    assert main(["serve", "catch", "--port", str(server.port)]) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and f"port {server.port}: Address already in use" in error
 
 
 @pytest.mark.slow

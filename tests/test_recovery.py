@@ -1,6 +1,7 @@
 """Recoveries: trajectories from the last contact to standstill, of quadrotors, cars and arms."""
 
 import dataclasses
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -53,6 +54,11 @@ def here(tmp_path, monkeypatch):
 @pytest.fixture(scope="module")
 def braked(hits):
     return pj.plan(pj.hit.planner("exact", recovery="brake"), hits)
+
+
+def assert_refused(rule, function, *arguments, **options):
+    with pytest.raises(ArgumentError, match=rule):
+        function(*arguments, **options)
 
 
 def states(path, time=None):
@@ -177,10 +183,9 @@ def test_rows_of_a_sweep_have_the_judged_recovery(swept, braked):
 
 def test_a_sweep_is_resumed_with_its_recovery_alone(swept):
     out, _ = swept
-    with pytest.raises(
-        ArgumentError, match="^recovery must be brake as in the run that is resumed"
-    ):
-        run.resume_sweep(pj.task_named("hit"), out, progress=False, recovery="home")
+    rule = "^recovery must be brake as in the run that is resumed"
+    task = pj.task_named("hit")
+    assert_refused(rule, run.resume_sweep, task, out, progress=False, recovery="home")
 
 
 def test_the_samples_of_one_plan_include_its_recovery(braked):
@@ -190,22 +195,22 @@ def test_the_samples_of_one_plan_include_its_recovery(braked):
 
 @pytest.mark.parametrize("settings", [HitSettings, CatchSettings])
 def test_settings_refuse_another_recovery_and_leave_none_to_the_planner(settings):
-    with pytest.raises(
-        ArgumentError, match="^recovery must be one of none, brake, home, got 'land'"
-    ):
-        settings(recovery="land")
+    rule = "^recovery must be one of none, brake, home, got 'land'"
+    assert_refused(rule, settings, recovery="land")
     assert "recovery" not in settings().planner_options()
     assert settings(recovery="home").planner_options()["recovery"] == "home"
 
 
 def test_another_recovery_is_refused_in_one_line():
-    with pytest.raises(ValueError, match="^recovery must be one of brake, home, got 'land'$"):
-        pj.hit.planner("exact", recovery="land")
-    with pytest.raises(ValueError, match="^to must be one of brake, home, got 'land'$"):
-        RecoveryPlanner(to="land")
+    rule = "must be one of brake, home, got 'land'$"
+    assert_refused(f"^recovery {rule}", pj.hit.planner, "exact", recovery="land")
+    assert_refused(f"^to {rule}", RecoveryPlanner, to="land")
 
 
 # Exports of single plans.
+
+
+export = functools.partial(pj.export, to="csv", out="a.csv")
 
 
 def test_an_exported_plan_has_a_recovery(hit, here):
@@ -231,30 +236,26 @@ def test_a_plan_is_exported_with_its_own_recovery_or_without_one(hit, here):
 
 def test_without_its_case_a_plan_is_refused_in_one_line(here):
     says = "^case must be given, .* or recovery=None to omit it, got neither$"
-    with pytest.raises(ArgumentError, match=says):
-        pj.export(quadrotor(), to="csv", out="a.csv")
-    with pytest.raises(ArgumentError, match="^recovery must be one of brake, home, got 'land'$"):
-        pj.export(quadrotor(), to="csv", out="a.csv", recovery="land")
+    assert_refused(says, export, quadrotor())
+    rule = "^recovery must be one of brake, home, got 'land'$"
+    assert_refused(rule, export, quadrotor(), recovery="land")
     assert not list(here.iterdir())
 
 
 def test_the_case_of_another_plan_and_a_batch_of_cases_are_refused(hit, here):
     case, plan = hit
-    with pytest.raises(
-        ArgumentError, match="^case must be the case of a quadrotor, got InterceptCase$"
-    ):
-        pj.export(plan, to="csv", out="a.csv", case=driving()[0])
+    rule = "^case must be the case of a quadrotor, got InterceptCase$"
+    assert_refused(rule, export, plan, case=driving()[0])
     many = jax.tree.map(lambda leaf: leaf[None], case)
-    with pytest.raises(ArgumentError, match=r"^case must be one, .* got a batch of shape \(1,\)$"):
-        pj.export(plan, to="csv", out="a.csv", case=many)
+    rule = r"^case must be one, .* got a batch of shape \(1,\)$"
+    assert_refused(rule, export, plan, case=many)
 
 
 def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here):
     case, plan = hit
     slow = dataclasses.replace(case.limits, speed=np.float32(0.1))
     says = "^recovery must be none .* keeps every limit, got 'brake' .speed: .* above its limit"
-    with pytest.raises(ArgumentError, match=says):
-        pj.export(plan, to="csv", out="a.csv", case=dataclasses.replace(case, limits=slow))
+    assert_refused(says, export, plan, case=dataclasses.replace(case, limits=slow))
     assert not list(here.iterdir())
 
 
@@ -350,10 +351,8 @@ def test_a_car_steers_past_what_stands_in_its_way_and_says_where_it_cannot():
 
 def test_only_quadrotors_go_home(here):
     case, plan = driving()
-    with pytest.raises(
-        ArgumentError, match="^recovery must be brake, as only quadrotors go home, got"
-    ):
-        pj.export(plan, to="csv", out="a.csv", case=case, recovery="home")
+    rule = "^recovery must be brake, as only quadrotors go home, got"
+    assert_refused(rule, export, plan, case=case, recovery="home")
     assert not list(here.iterdir())
 
 

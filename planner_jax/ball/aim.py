@@ -2,6 +2,7 @@
 
 Derivatives are computed in forward mode, and reverse mode only multiplies by them. Otherwise
 reverse mode would go back through every step of a flight for the derivatives of a few numbers.
+Shapes and units are as in `ball.flight`.
 """
 
 from collections.abc import Sequence
@@ -21,32 +22,18 @@ Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
-    """Return the velocity (3,) [m/s] of a drag-free ball that reaches a target.
-
-    Args:
-        pos: (3,) [m].
-        target: (3,) [m].
-        flight_time: () [s], > 0.
-        gravity: () [m/s^2], magnitude.
-    """
+    """Return the velocity of a drag-free ball that reaches a target after a time > 0."""
     return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
 
 def aim_with_drag(
     pos: Array, target: Array, flight_time: Array, drag: Array, gravity: Array
 ) -> Array:
-    """Return the velocity (3,) [m/s] of a ball with quadratic drag that reaches a target.
+    """Return the velocity of a ball with quadratic drag that reaches a target after a time > 0.
 
     Newton's method starts from the drag-free velocity. Two steps integrate a coarse flight, and two
     further steps integrate a fine flight with the last Jacobian. The root is differentiated by the
     implicit function theorem.
-
-    Args:
-        pos: (3,) [m].
-        target: (3,) [m].
-        flight_time: () [s], > 0.
-        drag: () K_D [1/m].
-        gravity: () [m/s^2], magnitude.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 

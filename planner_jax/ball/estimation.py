@@ -1,7 +1,6 @@
 """Extended Kalman filter of a ball's state [Yu2023bat, eq. 5; Yu2023catch, Section V-A].
 
-World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many. An observation with
-a NaN leaves the state unchanged.
+World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
 """
 
 from collections.abc import Callable
@@ -109,10 +108,8 @@ def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel)
     H = [I 0]. The covariance has Joseph's form, which stays positive definite in float32 even if a
     wide prior meets a precise observation.
 
-    Args:
-        state: belief at the time of the observation.
-        observation: (3,) Z [m]. If a coordinate is not finite, the belief is returned unchanged.
-        model: only `observation_std` is used.
+    Of the model only `observation_std` is used. If a coordinate of the observation Z (3,) [m] is
+    not finite, the belief is returned unchanged.
     """
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype

@@ -1,6 +1,8 @@
 """Ball flight with quadratic drag [Yu2023bat, eq. 2] or linear drag, and impacts on a racket.
 
-World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
+World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many. Positions and
+velocities are (3,) [m] and [m/s], durations () [s], `gravity` () is a magnitude [m/s^2], and `drag`
+is K_D () [1/m] if quadratic, or K_i (3,) [1/s] if linear, both >= 0.
 """
 
 import math
@@ -49,15 +51,10 @@ def gravity_vector(gravity: Array) -> Array:
 
 
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
-    """Return the acceleration g - K_D |v| v of a ball in flight [Yu2023bat, eq. 2].
+    """Return the acceleration g - K_D |v| v [m/s^2] of a ball in flight [Yu2023bat, eq. 2].
 
-    Args:
-        vel: (3,) [m/s], or a tuple of its components.
-        drag: () K_D [1/m], >= 0.
-        gravity: () [m/s^2], magnitude.
-
-    Returns:
-        (3,) [m/s^2], or a tuple like the velocity. The gradient is finite for zero velocity.
+    The velocity may be a tuple of its components, as the result is then. The gradient is finite for
+    zero velocity.
     """
     x, y, z = components(vel)
     speed_squared = x * x + y * y + z * z
@@ -127,13 +124,8 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
     """Return the ball after a flight with drag -K_i v_i on each axis, in closed form.
 
     [Yu2023bat, eq. 4a], with the constant that is missing in the paper:
-    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K on each axis, with signed g.
-
-    Args:
-        ball: one ball.
-        duration: () [s].
-        drag: (3,) K_i [1/s], >= 0, zero included.
-        gravity: () [m/s^2], magnitude.
+    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K on each axis, with signed g. The result is
+    exact to rounding for any K >= 0.
     """
     x = drag * duration
     phi_1, phi_2 = _phi(x)
@@ -159,13 +151,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
-    """Return the ball after a free fall [Natarajan2024, eqs 5 to 7].
-
-    Args:
-        ball: one ball.
-        duration: () [s].
-        gravity: () [m/s^2], magnitude.
-    """
+    """Return the ball after a free fall [Natarajan2024, eqs 5 to 7]."""
     g = gravity_vector(gravity)
     return BallState(
         pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2, vel=ball.vel + g * duration
@@ -183,16 +169,8 @@ def drag_free_apex(ball: BallState, gravity: Array) -> Array:
 def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple[Array, Array]:
     """Return the time at which a drag-free ball falls through a horizontal plane.
 
-    It is the later root t of z + v_z t - g t^2 / 2 = height.
-
-    Args:
-        ball: one ball.
-        height: () [m], of the plane.
-        gravity: () [m/s^2], magnitude, > 0.
-
-    Returns:
-        time: () [s]; 0 if the ball never reaches the plane.
-        reached: () bool.
+    It is the later root t of z + v_z t - g t^2 / 2 = height, for g > 0. Returns the time () [s] and
+    whether () the ball reaches the plane; if not, the time is 0.
     """
     discriminant = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - height)
     real = discriminant > 0.0
@@ -209,10 +187,10 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
     definition of beta and its eq. 12 need the plus sign. The tangential velocity is unchanged.
 
     Args:
-        ball_vel: (3,) v- [m/s].
-        racket_vel: (3,) u [m/s].
-        normal: (3,) z, unit normal of the racket.
-        restitution: () beta, 0 to 1.
+        ball_vel: v-.
+        racket_vel: u.
+        normal: z (3,), unit normal of the racket.
+        restitution: beta (), 0 to 1.
     """
     return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
 
@@ -220,16 +198,8 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
 def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:
     """Return the racket's normal and normal speed for a change of the ball's velocity.
 
-    [Yu2023bat, eqs 11 and 12]; the normal points along v+ - v-, and is reversed in the paper.
-
-    Args:
-        ball_vel: (3,) v- [m/s].
-        ball_vel_after: (3,) v+ [m/s], different from v-.
-        restitution: () beta.
-
-    Returns:
-        normal: (3,) unit vector.
-        normal_speed: () [m/s], of the racket along `normal`.
+    [Yu2023bat, eqs 11 and 12]; the normal points along v+ - v-, and is reversed in the paper. The
+    two velocities must differ. Returns the unit normal (3,), and the racket's speed () along it.
     """
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)

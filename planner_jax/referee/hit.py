@@ -116,7 +116,7 @@ def referee_hits(
         an effect on the others. Limits may be infinite.
 
     Raises:
-        ValueError: a leaf has the wrong shape, `samples` < 200 or `chunk` < 1.
+        ValueError: an array has the wrong shape, `samples` < 200 or `chunk` < 1.
     """
     leaves = read_flight(cases, plans)
     leaves |= read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
