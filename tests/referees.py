@@ -1,4 +1,4 @@
-"""What the tests of all referees share: leaves by name, batches of them, and verdicts compared."""
+"""Helpers of the referees' tests: cases and plans from named leaves, batches, and comparisons."""
 
 from types import SimpleNamespace
 
@@ -7,7 +7,7 @@ import pytest
 
 
 def tree(leaves, root="", **optional):
-    """Return the object whose fields are the leaves named `root<field>`, and so on inwards."""
+    """Build nested objects from leaves by dotted names that start with `root`."""
     inside = {k.removeprefix(root): v for k, v in leaves.items() if k.startswith(root)}
     parts = {k.split(".")[0] for k in inside if "." in k}
     plain = {k: v for k, v in inside.items() if "." not in k}
@@ -16,7 +16,7 @@ def tree(leaves, root="", **optional):
 
 
 def flight(leaves, **optional):
-    """Return the case and plan of a quadrotor from leaves; `optional` are fields of the case."""
+    """Build an object with the fields of a quadrotor's case and of its plan from leaves."""
     case = tree(leaves, extras=(), **optional)
     limits = dict.fromkeys(("acceleration", "min_thrust", "max_thrust", "rotors"))
     case.limits = SimpleNamespace(**limits | vars(case.limits))
@@ -43,7 +43,7 @@ def assert_same(left, right):
 
 
 def checks(judge):
-    """Return `assert_good` and `assert_fails`, which judge the first of some plans."""
+    """Return `assert_good` and `assert_fails`, which check the verdict on the first plan."""
 
     def assert_good(leaves, **options):
         verdict = judge(leaves, **options)

@@ -1,4 +1,4 @@
-"""One ball in flight and its constants, which the tests of `planner_jax.ball` share."""
+"""A served ball, its constants and helpers, for the tests of `planner_jax.ball`."""
 
 import jax
 import numpy as np

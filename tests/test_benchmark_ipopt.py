@@ -1,4 +1,4 @@
-"""The problems that IPOPT gets are the planners': objective, limits and derivatives."""
+"""Objective, limits and derivatives of the problems for IPOPT, compared with the planners."""
 
 import dataclasses
 import functools
@@ -32,7 +32,7 @@ def setup(name):
 
 @functools.cache
 def points(name):
-    """Return points near first guesses, some of which exceed limits."""
+    """Return points near first guesses; some exceed limits."""
     starts = setup(name).batches["smooth"].starts
     return starts + 0.6 * np.random.default_rng(0).normal(size=starts.shape)
 

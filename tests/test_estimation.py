@@ -17,7 +17,7 @@ NUM = 121
 PERIOD = 0.01  # [s]
 NOISE = 0.02  # [m]
 
-# Compiled once for all tests of equal shapes and dtype; "many" have a row of observations a ball.
+# Compiled once for all tests of equal shapes and dtype; "many" means many balls.
 predict_one = jax.jit(ekf_predict, static_argnames="flight")
 update_one = jax.jit(ekf_update)
 fly_one = jax.jit(fly, static_argnames="num_steps")
@@ -49,7 +49,7 @@ def linear_flight(ball, elapsed, drag):
     return jax.vmap(lambda t: linear_drag_flight(ball, t, drag, GRAVITY))(elapsed)
 
 
-# The data are NumPy arrays: no operation on them is compiled, and the dtype is stated.
+# The data are NumPy arrays, so operations on them are not compiled.
 
 
 def times(dtype=np.float32):
@@ -102,7 +102,7 @@ def without(positions, *rows):
 
 
 def textbook_kalman(mean, covariance, observations, drag, density, std):
-    """Affine Kalman filter of the linear-drag flight in NumPy, with matrix inverses."""
+    """Filter a flight with linear drag by an affine Kalman filter in NumPy, with inverses."""
     e, K = np.exp(-drag * PERIOD), drag
     ramp = (1.0 - e) / K
     F = np.block([[np.eye(3), np.diag(ramp)], [np.zeros((3, 3)), np.diag(e)]])
@@ -155,7 +155,7 @@ def test_exact_observations_give_the_state_in_float32():
 
 
 def test_errors_agree_with_the_covariances():
-    """Over 100 balls drawn from the prior, the NEES (6 degrees) has its mean."""
+    """Check the mean NEES, 6 for 6 degrees of freedom, over 100 balls from the prior."""
     rng = np.random.default_rng(2)
     balls = jax.tree.map(lambda x: (x + rng.normal(size=(100, 3))).astype(x.dtype), serve())
     prior = ekf_init(serve().pos, serve().vel, pos_std=1.0, vel_std=1.0)
@@ -169,7 +169,7 @@ def test_errors_agree_with_the_covariances():
         return np.mean(np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], -1))
 
     error = np.concatenate([path.pos, path.vel], axis=-1) - np.asarray(states.mean)
-    # The standard deviation of the mean of 100 is 0.35 at one instant.
+    # The standard deviation of the mean over 100 balls is 0.35.
     assert mean_square(error[:, -1], states.covariance[:, -1]) == pytest.approx(6.0, abs=1.0)
     raw = np.sqrt(np.mean((observations - path.pos)[:, -1] ** 2))
     filtered = np.sqrt(np.mean(error[:, -1, :3] ** 2))
@@ -229,7 +229,7 @@ def test_prediction_error_grows_with_the_horizon_and_stays_finite():
 @pytest.mark.slow
 @float64
 def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
-    """With respect to the model and the observations, where the first three are missing."""
+    """Differentiate by the model and the observations, the first three of them missing."""
     observations = without(noisy(quadratic_path(np.float64).pos, seed=4), slice(3))
     belief = model(DRAG, density=0.1, dtype=np.float64)
 
@@ -255,7 +255,7 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
         np.testing.assert_allclose(slope, (forward - backward) / (2.0 * step), rtol=1e-6)
 
 
-# K_D by the loss of energy
+# Estimation of K_D from the loss of energy
 
 
 @float64
@@ -270,7 +270,7 @@ def test_energy_is_kept_without_drag_and_lost_with_it():
 
 @float64
 def test_recursive_least_squares_is_the_batch_solution():
-    """The start counts as one measurement more."""
+    """Count the prior as one additional measurement."""
     rng = np.random.default_rng(8)
     h, y = rng.normal(size=30), rng.normal(size=30)
     estimate, variance = 0.3, 2.0
@@ -283,7 +283,7 @@ def test_recursive_least_squares_is_the_batch_solution():
     np.testing.assert_allclose(state.variance, 1.0 / information, rtol=1e-12)
 
 
-# One ball or many
+# Batches
 
 
 def test_batch_equals_loop():

@@ -1,4 +1,4 @@
-"""Ball flight: eq. 2 against its closed forms and SciPy, linear drag, apex and fall."""
+"""Ball flight with quadratic drag [Yu2023bat, eq. 2] and with linear drag, apex and fall."""
 
 import functools
 
@@ -80,7 +80,7 @@ def with_quadratic_drag(vel):
 
 
 def test_a_ball_feels_its_weight_and_a_drag_against_its_velocity():
-    """|(3, 4, 12)| = 13. At rest there is no drag, and the gradient is finite."""
+    """Check a ball of speed |(3, 4, 12)| = 13, and one at rest with its gradient."""
 
     def accelerate(vel):
         acceleration = ball_acceleration(vel, 0.1, GRAVITY)
@@ -102,7 +102,7 @@ def test_one_runge_kutta_step_without_drag_is_the_closed_form():
 
 @float64
 def test_a_fall_from_rest_follows_its_closed_form():
-    """v = -c tanh(g t / c) and z = -(c^2 / g) log cosh(g t / c), c the terminal speed."""
+    """Check v = -c tanh(g t / c), z = -(c^2 / g) log cosh(g t / c) with terminal speed c."""
     final = fly_steps(ball((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0)
     terminal = np.sqrt(GRAVITY / DRAG)
     x = GRAVITY * 2.0 / terminal
@@ -113,7 +113,7 @@ def test_a_fall_from_rest_follows_its_closed_form():
 
 @float64
 def test_a_ball_without_weight_follows_its_closed_form():
-    """Speed v / (1 + K v t) after a way of log(1 + K v t) / K, straight on. |(2, -3, 6)| = 7."""
+    """Check speed v / (1 + K v t) and distance log(1 + K v t) / K; |(2, -3, 6)| = 7."""
     start = ball((1.0, 2.0, 3.0), (2.0, -3.0, 6.0))
     x = DRAG * 7.0 * 2.0
     expected = BallState(start.pos + start.vel * np.log1p(x) / (7.0 * DRAG), start.vel / (1.0 + x))
@@ -171,7 +171,7 @@ def test_energy_decays_with_drag_and_is_kept_without():
 
 @float64
 def test_flight_gradient_matches_finite_differences():
-    """With respect to the ball, the duration, the drag and gravity."""
+    """Differentiate by the ball, the duration, the drag and gravity."""
 
     def landing(args):
         final, _ = fly(*args, num_steps=2)
@@ -210,7 +210,7 @@ def test_linear_drag_goes_over_into_the_drag_free_flight():
 
 @float64
 def test_the_slope_in_linear_drag_at_no_drag_is_the_first_term_of_its_series():
-    """s = s_0 + v t + g t^2 / 2 - K (v t^2 / 2 + g t^3 / 6) + ..."""
+    """Check s = s_0 + v t + g t^2 / 2 - K (v t^2 / 2 + g t^3 / 6) + ..."""
     t = 1.6
     _, _, slope = linear_drag_and_rates(ball(), t, np.zeros(3))
     expected = -(ball().vel * t**2 / 2.0 + WEIGHT * t**3 / 6.0)
@@ -218,7 +218,7 @@ def test_the_slope_in_linear_drag_at_no_drag_is_the_first_term_of_its_series():
 
 
 @float64
-@pytest.mark.parametrize("product", [0.5, -0.5])  # K t where the series hands over
+@pytest.mark.parametrize("product", [0.5, -0.5])  # K t at which the formula changes
 def test_linear_drag_and_its_slopes_have_no_jump_where_the_formula_changes(product):
     below, above = (
         linear_drag_and_rates(ball(), 1.0, np.full(3, product * (1.0 + e))) for e in (-1e-13, 1e-13)
@@ -263,7 +263,7 @@ def test_a_falling_ball_is_highest_now_and_the_apex_has_no_kink(vz):
 @float64
 @pytest.mark.parametrize("height", [0.0, 2.0, 3.5])
 def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
-    """A plane that is higher by dh is met earlier by dh / |v_z|."""
+    """Check the derivative of the time by the height, 1 / v_z."""
     (time, reached), slopes = fall_and_slope(ball(), height, GRAVITY)
     there = drag_free(ball(), float(time), GRAVITY)
     assert reached and there.vel[2] < 0.0
@@ -271,7 +271,7 @@ def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
     np.testing.assert_allclose(slopes[1], 1.0 / there.vel[2], rtol=1e-12)
 
 
-# Too slow to rise so far; grazing it; below and falling; in the plane and falling.
+# The ball is too slow to reach the plane, touches it, falls below it, or falls from it.
 @pytest.mark.parametrize(("height", "vz"), [(2.25, 1.0), (2.25, 2.0), (2.25, -6.0), (2.0, -6.0)])
 def test_a_plane_that_is_not_fallen_through_is_flagged_with_a_finite_gradient(height, vz):
     start = ball(vel=(0.0, 0.0, vz), dtype=np.float32)
@@ -280,7 +280,7 @@ def test_a_plane_that_is_not_fallen_through_is_flagged_with_a_finite_gradient(he
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(slopes))
 
 
-# One ball or many
+# Batches
 
 
 @float64

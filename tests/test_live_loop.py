@@ -1,4 +1,4 @@
-"""The live loop: from observations of a ball to setpoints, with any other packets between."""
+"""The live loop, from packets with observations to setpoints."""
 
 import re
 import signal
@@ -59,7 +59,7 @@ def server(warm):
 
 
 class Throw:
-    """One throw; the robot is where the last answer wanted it."""
+    """One throw; the robot follows the setpoints of the last answer exactly."""
 
     def __init__(self, planner, path, number, disturb=lambda step, data: [data], home=HOME):
         self.planner, self.path, self.number = planner, path, number
@@ -116,7 +116,7 @@ def test_a_throw_is_caught_along_a_smooth_course_and_nothing_is_compiled(warm, p
     motions = [answer.motion for answer in answers]
     first, last = motions.index(Motion.PLAN), 179 - motions[::-1].index(Motion.PLAN)
     assert 2 <= first <= 12 and set(motions[first : last + 1]) == {Motion.PLAN}
-    assert set(motions[last + 1 :]) == {Motion.SAFE}  # and never planned for again
+    assert set(motions[last + 1 :]) == {Motion.SAFE}  # without another plan
     contact, times = answers[last].contact, np.arange(180) * STEP + answers[0].begin
     ball = np.array([np.interp(contact, times, path[:180, k]) for k in range(3)])
     at = np.argmin(np.abs(times - contact))

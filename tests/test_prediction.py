@@ -96,7 +96,7 @@ def test_a_drag_free_path_is_exact_at_any_time():
 
 @float64
 def test_interpolation_converges_with_order_three():
-    """Of position and of velocity, as Keys has it for his kernel."""
+    """Check position and velocity; the order is given in [Keys1981]."""
     resolutions = np.array([0.08, 0.04, 0.02])
     errors = []
     for resolution in resolutions:
@@ -115,7 +115,7 @@ def test_a_path_in_float32_is_right_to_some_micrometres(float64):
     assert_close(single, many_targets(path(), times), atol=1e-5)
 
 
-# Derivatives in time
+# Derivatives by time
 
 
 @float64
@@ -144,7 +144,7 @@ def test_the_slope_is_the_finite_difference_to_either_side(position):
 @float64
 @pytest.mark.parametrize(("end", "outwards"), [(0.0, -1.0), (HORIZON, 1.0)])
 def test_at_both_ends_the_value_is_continuous_and_the_target_keeps_its_velocity(end, outwards):
-    """The slope of the position is continuous but for the interpolation, of order two there."""
+    """Check also the slope of the position, up to an interpolation error of order two."""
     table = path()
     inside, at, outside = (target_and_rate(table, end + outwards * e) for e in (-1e-9, 0.0, 1e-9))
     assert_close(inside[0], at[0], atol=1e-7)
@@ -177,7 +177,7 @@ def test_a_time_outside_the_table_continues_at_constant_velocity(time, end):
     np.testing.assert_allclose(state.pos, last.pos + last.vel * (time - end), rtol=1e-14)
 
 
-# Derivatives in everything else
+# Derivatives by other arguments
 
 
 def somewhere_on_the_path(point):
@@ -194,7 +194,7 @@ def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(p
     assert_gradient_matches_differences(somewhere_on_the_path, point, step=1e-6, rtol=1e-6)
 
 
-# One ball or many
+# Batches
 
 
 @float64
@@ -240,7 +240,7 @@ def test_the_kernel_gives_the_same_table():
 
 @pytest.mark.slow
 def test_the_kernel_gives_the_same_derivatives_of_the_table():
-    """By velocity and drag, in that order, of moving balls."""
+    """Check derivatives by velocity and drag, in that order, of moving balls."""
     args, nodes, moving = kernel_arguments(), 6, (1, 3)
     args[1] = args[1].at[:, 3].set(1.0)
     found = table_kernel(nodes, moving, interpret=True)(None, args)

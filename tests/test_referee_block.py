@@ -134,7 +134,7 @@ def test_an_arm_that_swings_to_the_balls_place_blocks_it():
 
 
 def test_rates_and_accelerations_are_those_of_the_fastest_joint_between_the_ends():
-    """Rest to rest by a fifth-order polynomial: 15/8 d/T halfway, 10/sqrt(3) d/T^2 beside it."""
+    """Check the greatest rate 15/8 d/T and acceleration 10/sqrt(3) d/T^2 of REST_TO_REST."""
     verdict = assert_good(good())
     limits, change = REGIMES["R2"].limits, np.abs(GOAL - HOME)
     rates, accelerations = 1.875 * change / SPAN, 10.0 / np.sqrt(3.0) * change / SPAN**2
@@ -173,11 +173,11 @@ def shift(index, value):
     return change
 
 
-WAY = GOAL - HOME
-FASTEST = int(np.argmax(np.abs(WAY) / np.asarray(REGIMES["R2"].limits.velocity)))
-STEEPEST = int(np.argmax(np.abs(WAY)))  # all joints have one limit
+CHANGE = GOAL - HOME
+FASTEST = int(np.argmax(np.abs(CHANGE) / np.asarray(REGIMES["R2"].limits.velocity)))
+STEEPEST = int(np.argmax(np.abs(CHANGE)))  # all joints have one limit
 TURN = Rotation.from_rotvec(0.1 * ROTATION[:, 1]).as_matrix()
-TIP = 27.0 / 4.0 * 0.4  # u (1 - u)^2 is 4 / 27 at its greatest, a third of the way
+TIP = 27.0 / 4.0 * 0.4  # u (1 - u)^2 has its maximum 4 / 27 at u = 1/3
 
 
 def overshoot(**edits):
@@ -197,7 +197,8 @@ def fold_wrist():
     return good(end=end)
 
 
-PEAK, JOINT = 2.0 * abs(WAY[STEEPEST]), DELAY + PIECES[0]  # rate x duration; time of the joint
+PEAK = 2.0 * abs(CHANGE[STEEPEST])  # final rate x duration of a motion by FROM_REST
+JOINT = DELAY + PIECES[0]  # time at which the two pieces join
 STEEP, FAST = f"joint {STEEPEST + 1}", f"joint {FASTEST + 1}"
 # Limit and case: leaves, (excess, time, part of the arm); None is not compared.
 FAILURES = {
@@ -225,7 +226,7 @@ FAILURES = {
         (0.25, DELAY + 0.5 * SPAN, FAST),
     ),
     "acceleration: 2/3": (
-        edit({"limits.acceleration": 10.0 / np.sqrt(3.0) * abs(WAY[STEEPEST]) / SPAN**2 / 1.5}),
+        edit({"limits.acceleration": 10.0 / np.sqrt(3.0) * abs(CHANGE[STEEPEST]) / SPAN**2 / 1.5}),
         (0.5, None, STEEP),
     ),
     "rest: required": (good(FROM_REST, regime="R3"), (PEAK / SPAN, None, STEEP)),
@@ -398,7 +399,7 @@ def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
     leaves = good()
     verdict = judge(leaves)
     shares = np.linspace(0.0, 1.0, 201)
-    angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * WAY
+    angles = HOME + np.polynomial.polynomial.polyval(shares, REST_TO_REST)[:, None] * CHANGE
     poses = judge(stack(*(still(each) for each in angles)))
     for kind in ("floor", "pole", "rig", "base", "self"):
         name = f"{kind}_clearance"
@@ -553,12 +554,12 @@ def unequal_lanes():
     ]
 
 
-# What `test_referees` judges, and how.
+# Arguments of the tests in `test_referees`.
 FAILED = ["", "tilt", "velocity", "velocity", "time", "self", ""]
-UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}  # of dynamics, and a pose of waiting
+UNREAD = {"arm.home", "arm.mass", "arm.centre", "arm.inertia"}  # for dynamics, and the home pose
 UNKNOWN = ("miss", "pole_clearance")
 PLANNED = ("plan.motion.coeffs", "plan.motion.durations", "plan.contact_time")
-ABSURD, AWAY = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"
+ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"
 READ = {name for name, leaf in good().items() if leaf.dtype == float} - UNREAD
 WRONG = [
     ({}, {"step": 0.0}, "step must be > 0 and <= 0.002, got 0.0"),

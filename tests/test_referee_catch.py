@@ -455,7 +455,7 @@ def test_caught_targets_are_counted_and_none_is_caught_by_a_broken_plan():
     assert not judge(lanes).caught[0].any()
 
 
-# What `test_referees` judges, and how.
+# Arguments of the tests in `test_referees`.
 FAILED = ["", "speed", "", "head state", "net", "net"]
 ABSURD = ("coeffs", "durations", "times", "targets.drag", "net.height")
 WRONG = [

@@ -379,7 +379,7 @@ def unequal_lanes():
     return [volley(), fast, volley(flight_time=1.6), shifted, missed, volley(target=(3.5, 1, 0))]
 
 
-# What `test_referees` judges, and how.
+# Arguments of the tests in `test_referees`.
 good = volley
 OPTIONS = ({}, {"drag_after_impact": True})
 FAILED = ["", "speed", "", "head state", "landing", ""]

@@ -160,7 +160,7 @@ def test_acceleration_is_that_of_the_steepest_piece_and_the_root_mean_square_of_
 
 
 def test_lateral_acceleration_peaks_inside_of_a_piece():
-    """v = v_0 (1 - u), kappa = kappa_0 u: v^2 kappa has its maximum 4/27 v_0^2 kappa_0 at 1/3."""
+    """Check v = v_0 (1 - u), kappa = kappa_0 u: max v^2 kappa = 4/27 v_0^2 kappa_0 at u = 1/3."""
     speed, curvature = np.zeros(KNOTS), np.zeros(KNOTS)
     speed[:4], curvature[4:] = 1.5, -2.0
     leaves = good(speed, curvature)
@@ -179,7 +179,7 @@ def test_lateral_acceleration_peaks_inside_of_a_piece():
     [(-0.5, 1.5, 0.0, 0.25), (0.4, 1.2, 0.4, 0.0), (-1.2, -0.4, 0.4, 1.0)],
 )
 def test_steering_is_fastest_where_the_curvature_is_least(first, second, least, place):
-    """delta = atan(L kappa): delta' = L kappa' / (1 + (L kappa)^2)."""
+    """Check the rate of delta = atan(L kappa), L kappa' / (1 + (L kappa)^2)."""
     h = TIME / (KNOTS - 1)
     curvature = np.array([first] * 3 + [second] * (KNOTS - 3))
     leaves = good(SPEED, curvature)
@@ -242,7 +242,7 @@ def random_polygon(random, most=6):
 
 
 def test_clearances_are_the_greatest_gap_in_any_direction():
-    """Distance and depth of convex sets: max over unit u of (min u.b - max u.a)."""
+    """Check distance and depth of convex sets, max over unit u of (min u.b - max u.a)."""
     random = np.random.default_rng(0)
     lanes, samples, num = 40, 5, 3
     half = np.tile([0.2, 0.125], (lanes, 1))
@@ -287,7 +287,7 @@ def test_corners_may_be_in_either_sense_and_repeated_and_absent_obstacles_hold_a
 
 
 def failures():
-    """Return, for each limit: its name, leaves that exceed it, the excess and the time."""
+    """Return rows of a limit, leaves that exceed it, the excess and the time."""
     h = TIME / (KNOTS - 1)
     fast, bent, turned = good(), good(SPEED, 0.5), good()
     fast["limits.speed"][:] = 0.64
@@ -393,11 +393,11 @@ def unequal_lanes():
     ]
 
 
-# What `test_referees` judges, and how.
+# Arguments of the tests in `test_referees`.
 FAILED = ["", "wall", "mover", "meeting", "time", ""]
 UNKNOWN = ("miss",)
 ABSURD = ("plan.speed", "plan.curvature", "plan.time", "plan.start", "target.vel", "walls.centre")
-AWAY = "walls.centre"
+HARMLESS = "walls.centre"
 WRONG = [
     ({}, {"step": 0.05}, "step must be > 0 and <= 0.02, got 0.05"),
     ({}, {"step": 0.0}, "step must be > 0 and <= 0.02, got 0.0"),
@@ -438,7 +438,7 @@ def test_referee_and_planner_agree_where_a_target_is():
         assert position_setting(path) == {}
         with jax.enable_x64(True):
             theirs = jax.vmap(lambda path, time: path.at(time).pos)(path, times)
-        # The planner's series of sin(x) / x for small angles is right to 1e-10.
+        # The planner's series of sin(x) / x for small angles has errors up to 1e-10.
         np.testing.assert_allclose(target_positions_of(path, times), theirs, rtol=0, atol=1e-9)
 
 

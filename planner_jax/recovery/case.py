@@ -41,7 +41,10 @@ class RecoveryPlan(QuadrotorPlan):
 
 
 def end_state(path: PiecewisePolynomial) -> Array:
-    """Return position to jerk (4, 3) at the end of the last piece with a positive duration."""
+    """Return position to jerk (4, 3), rows as in `head_state`, at the end of a trajectory.
+
+    Pieces of zero duration are ignored.
+    """
     last = jnp.max(jnp.where(path.durations > 0.0, jnp.arange(path.durations.size), 0))
     piece = PiecewisePolynomial(path.coeffs[last][None], path.durations[last][None])
     return jnp.stack([evaluate(piece, path.durations[last], order) for order in range(4)])

@@ -322,7 +322,8 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
 
     An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n! over
     the mean duration h of a piece, at least `SHORTEST_PIECE`. The scale is the largest coordinate
-    at the ends of the pieces, at least 1 m. The head state is (B, 4, 3), position to jerk.
+    at the ends of the pieces, at least 1 m. The head state (B, 4, 3) is position, velocity,
+    acceleration and jerk.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)
