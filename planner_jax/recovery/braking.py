@@ -129,7 +129,8 @@ _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
     """Extend a plan of an arm until the arm is at standstill.
 
-    Each joint has a constant deceleration. The joints stop together, or each as soon as it can.
+    Each joint has a constant deceleration. Candidates are that all joints stop together in the
+    shortest time, that each stops as soon as it can, and that all stop together but later.
 
     Args:
         case: a `BlockCase`, of one case.

@@ -23,8 +23,8 @@ _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3),
 
 
 @struct.dataclass
-class RestContext:
-    """One case."""
+class RecoveryContext:
+    """A case in the form that `ChainPlanner` reads."""
 
     case: RecoveryCase
 
@@ -66,11 +66,11 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         if self.to not in RECOVERIES:
             raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
 
-    def prepare(self, case: RecoveryCase) -> RestContext:
-        """Return the case as it is."""
-        return RestContext(case)
+    def prepare(self, case: RecoveryCase) -> RecoveryContext:
+        """Return the context of a case; nothing else is computed."""
+        return RecoveryContext(case)
 
-    def guess_ends(self, context: RestContext, num: int) -> Array:
+    def guess_ends(self, context: RecoveryContext, num: int) -> Array:
         """Return guesses of log duration and position of standstill, (num, 1, 4)."""
         case = context.case
         pos, vel = case.head_state[0], case.head_state[1]
@@ -84,7 +84,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         duration = base + distance / (0.5 * case.limits.speed)
         return jnp.concatenate([jnp.log(duration), end - pos], axis=1)[:, None]
 
-    def meet(self, natural: Array, context: RestContext) -> ChainEnds:
+    def meet(self, natural: Array, context: RecoveryContext) -> ChainEnds:
         """Return duration and final state for the variables (1, 4); no limit applies at the end."""
         case, duration = context.case, jnp.exp(natural[:, 0])
         at_rest = case.head_state[:1] + natural[:, 1:] if self.to == "brake" else case.home[None]
@@ -100,7 +100,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         trajectory: PiecewisePolynomial,
         ends: ChainEnds,
         violation: Array,
-        context: RestContext,
+        context: RecoveryContext,
     ) -> RecoveryPlan:
         """Return the plan of a trajectory."""
         return RecoveryPlan(

@@ -104,8 +104,8 @@ def referee_hits(
         drag_after_impact: the ball has drag after the impact too.
         tolerance: relative, of every limit of the case.
         landing_tolerance: [m], of the horizontal distance between landing and target.
-        contact_tolerance: [m], of the distance between racket centre and ball at the impact. It is
-            reduced to `RIM` times the racket's radius if the case has a smaller racket.
+        contact_tolerance: [m], of the distance between racket centre and ball at the impact. If
+            the case has `racket_radius`, the distance may also not exceed `RIM` times the radius.
         continuity_tolerance: of the displacement of head state and joints, relative to the largest
             coordinate at the ends of the pieces (at least 1 m).
         samples: least number of samples of a trajectory, >= 200.
