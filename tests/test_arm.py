@@ -63,21 +63,14 @@ def everything_at(arm, angles, velocity, acceleration):
     branches, found = inverse_kinematics(arm, rotation, middle)
     turned, place = jax.vmap(lambda q: shield_pose(arm, q))(branches)
     turned_off, place_off = jnp.abs(turned - rotation), jnp.abs(place - middle)
-    return Everything(
-        frames=link_frames(arm, angles),
-        pose=(rotation, middle),
-        jacobian=shield_jacobian(arm, angles),
-        torques=inverse_dynamics(arm, angles, velocity, acceleration),
-        branches=branches,
-        found=found,
-        off=jnp.maximum(jnp.max(turned_off, axis=(1, 2)), jnp.max(place_off, axis=1)),
-    )
+    off = jnp.maximum(jnp.max(turned_off, axis=(1, 2)), jnp.max(place_off, axis=1))
+    torques = inverse_dynamics(arm, angles, velocity, acceleration)
+    frames, pose = link_frames(arm, angles), (rotation, middle)
+    return Everything(frames, pose, shield_jacobian(arm, angles), torques, branches, found, off)
 
 
-one_at, many_at = (
-    jax.jit(function)
-    for function in (everything_at, jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
-)
+one_at = jax.jit(everything_at)
+many_at = jax.jit(jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
 
 
 def everything(arm, angles, velocity=0.0, acceleration=0.0):
@@ -92,13 +85,12 @@ def everything(arm, angles, velocity=0.0, acceleration=0.0):
 def move_branches(arm, rotation, middle, velocity, spin):
     """Return the branches of poses (N, ...), and their rates as the poses move and turn."""
 
-    def of_one(rotation, middle, velocity, spin):
+    def move(rotation, middle, velocity, spin):
+        solve = lambda rotation, middle: inverse_kinematics(arm, rotation, middle)  # noqa: E731
         turning = jnp.cross(spin, rotation.T).T
-        return jax.jvp(
-            lambda r, m: inverse_kinematics(arm, r, m), (rotation, middle), (turning, velocity)
-        )
+        return jax.jvp(solve, (rotation, middle), (turning, velocity))
 
-    (branches, found), (rates, _) = jax.vmap(of_one)(rotation, middle, velocity, spin)
+    (branches, found), (rates, _) = jax.vmap(move)(rotation, middle, velocity, spin)
     return branches, found, rates
 
 

@@ -1,4 +1,4 @@
-"""Robots from files: units, MJCF, ready ones, the way back, and what is refused in one line."""
+"""Robots from files and by name: units, YAML, MJCF, round trips, and one-line errors."""
 
 import copy
 import dataclasses
@@ -95,7 +95,7 @@ def change_fields(**fields):
     return yaml.safe_dump(description)
 
 
-# field | its value in YAML, ~ to leave it out | the message
+# field | value in YAML, ~ removes the field | message
 BAD = """
 mass | 800 gg | mass must be in kg, g, got '800 gg'; did you mean g?
 mass | 3 m | mass must be in kg, g, got '3 m'
