@@ -56,13 +56,7 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return a regime of the IRB 1600-6/1.2.
-
-    Args:
-        factor: joint speeds over those in the data sheet.
-        acceleration: [rad/s^2], limit of every joint.
-        ends_at_rest: whether a motion has to end at rest.
-    """
+    """Return a regime of the IRB 1600-6/1.2; `factor` scales the joint speeds of its data sheet."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     accelerations = np.full(6, acceleration, np.float32)
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))

@@ -69,9 +69,10 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
     _require_known(root, {"model"}, {"compiler", "worldbody", "keyframe", *_AROUND})
     reader = _Reader(root)
     base, links = _chain(_one(root, "worldbody"))
-    frames = [reader.frame(link) for link in links]
-    joints = [reader.joint(_one(link, "joint")) for link in links]
-    inertials = [reader.inertial(_one(link, "inertial")) for link in links]
+    origin, turns = zip(*(reader.frame(link) for link in links), strict=True)
+    axis, limits = zip(*(reader.joint(_one(link, "joint")) for link in links), strict=True)
+    inertials = (reader.inertial(_one(link, "inertial")) for link in links)
+    mass, centre, inertia = zip(*inertials, strict=True)
     shield, shield_centre, shield_half = _shield(links[5])
     box, base_box = _base_box(base)
     shapes = [
@@ -81,15 +82,15 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
         if geom is not shield and geom is not box
     ]
     leaves = {
-        "origin": [origin for origin, _ in frames],
-        "turn": [turn.as_quat(canonical=True, scalar_first=True) for _, turn in frames],
-        "axis": [axis for axis, _ in joints],
-        "lower": [limits[0] for _, limits in joints],
-        "upper": [limits[1] for _, limits in joints],
-        "home": _home(root, np.array([limits for _, limits in joints])),
-        "mass": [mass for mass, _, _ in inertials],
-        "centre": [centre for _, centre, _ in inertials],
-        "inertia": [inertia for _, _, inertia in inertials],
+        "origin": origin,
+        "axis": axis,
+        "mass": mass,
+        "centre": centre,
+        "inertia": inertia,
+        "turn": [turn.as_quat(canonical=True, scalar_first=True) for turn in turns],
+        "lower": np.array(limits)[:, 0],
+        "upper": np.array(limits)[:, 1],
+        "home": _home(root, np.array(limits)),
         "capsule_ends": np.reshape([ends for _, ends, _ in shapes], (-1, 2, 3)),
         "capsule_radius": [radius for _, _, radius in shapes],
         "base_box": base_box,
