@@ -196,7 +196,7 @@ def test_a_dropped_observation_leaves_the_prediction(missing):
     np.testing.assert_array_equal(after.covariance, predicted.covariance)
 
 
-def test_uncertainty_grows_in_a_gap_and_the_estimate_flies_on():
+def test_uncertainty_grows_in_a_gap_and_the_estimate_continues():
     path = linear_path()
     gap = slice(60, 80)
     states = filter_one(wide_prior(), times(), without(path.pos, gap), model(density=0.1, std=1e-3))
@@ -205,7 +205,7 @@ def test_uncertainty_grows_in_a_gap_and_the_estimate_flies_on():
     np.testing.assert_allclose(states.ball.pos[gap], path.pos[gap], atol=1e-2)
 
 
-def test_no_time_passed_changes_nothing():
+def test_a_prediction_over_zero_time_changes_nothing():
     state = wide_prior()
     for flight, drag in ((linear_drag_flight, LINEAR_DRAG), (rk4_step, DRAG)):
         after = predict_one(state, 0.0, model(drag, density=1.0), flight=flight)

@@ -273,7 +273,7 @@ def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
 
 # The ball is too slow to reach the plane, touches it, falls below it, or falls from it.
 @pytest.mark.parametrize(("height", "vz"), [(2.25, 1.0), (2.25, 2.0), (2.25, -6.0), (2.0, -6.0)])
-def test_a_plane_that_is_not_fallen_through_is_flagged_with_a_finite_gradient(height, vz):
+def test_a_plane_that_is_not_reached_is_flagged_with_a_finite_gradient(height, vz):
     start = ball(vel=(0.0, 0.0, vz), dtype=np.float32)
     (time, reached), slopes = fall_and_slope(start, height, 8.0)
     assert not reached and time == 0.0

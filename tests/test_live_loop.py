@@ -208,7 +208,7 @@ def test_throws_are_caught_by_plans_with_recoveries(warm):
         assert warm.report.counts[name] == before[name]
 
 
-def test_a_robot_that_is_off_its_course_is_brought_to_rest_from_where_it_is(warm, path):
+def test_a_robot_off_its_course_gets_a_recovery_from_its_position(warm, path):
     throw = Throw(warm, path, 5)
     throw.fly(30)
     before = warm.report.counts["astray"]
@@ -290,7 +290,7 @@ def test_foreign_packets_get_one_warning_a_kind_and_no_answer(server, capsys):
     assert "PJLV" in lines[0] and "length" in lines[1] and "version" in lines[2]
 
 
-def test_a_robot_is_served_by_its_name_and_has_to_carry_the_tool():
+def test_a_robot_is_selected_by_name_and_must_carry_the_tool():
     stroke = CatchServe(robot="x500-net").stroke()
     assert float(stroke.case.net.radius) == pytest.approx(0.2)
     assert CatchServe().stroke().case.net.radius == CatchStroke().case.net.radius

@@ -84,7 +84,7 @@ def test_the_contact_is_where_it_was_without_a_recovery(hits, braked):
     np.testing.assert_array_equal(braked.trajectory.durations, plain.trajectory.durations)
 
 
-def test_setpoints_go_on_until_the_quadrotor_rests(braked):
+def test_setpoints_continue_to_standstill(braked):
     plan = pj.take(braked, 0)
     setpoints = plan.sample(100.0)
     assert setpoints.time[-1] > plan.stroke.time + 0.2
@@ -106,7 +106,7 @@ def test_a_recovery_that_does_not_rest_fails_by_name(hits, braked):
     assert "does not end at standstill" in verdict.sentence(0)
 
 
-def test_limits_hold_behind_the_contact_too(hits, braked):
+def test_limits_apply_to_the_recovery(hits, braked):
     least = 0.5 * pj.hit.judge(hits, braked).max_speed.astype(np.float32)
     slow = dataclasses.replace(hits, limits=dataclasses.replace(hits.limits, speed=least))
     still = jax.tree.map(np.array, braked)
@@ -118,7 +118,7 @@ def test_limits_hold_behind_the_contact_too(hits, braked):
 
 
 @pytest.mark.parametrize("to", ["brake", "home"])
-def test_from_a_fast_flight_it_comes_to_rest_where_it_should(to):
+def test_a_fast_flight_ends_at_the_requested_position(to):
     head = np.zeros((NUM, 4, 3), np.float32)
     head[:, 0, 2] = 1.5
     head[:, 1] = np.random.default_rng(0).uniform(-2.0, 2.0, (NUM, 3))
@@ -267,13 +267,13 @@ def bare(tmp_path_factory):
     return sweep(tmp_path_factory.mktemp("runs") / "bare")[0]
 
 
-def test_the_command_says_that_a_row_goes_on_to_rest(bare, here, capsys):
+def test_the_command_reports_the_recovery_of_a_row(bare, here, capsys):
     assert main(["export", str(bare), "--row", "1", "--to", "csv", "--out", "a.csv"]) == 0
     out, err = capsys.readouterr()
-    told = (
+    expected = (
         "planner-jax: row 1 is extended by a recovery trajectory (brake) within its case's limits"
     )
-    assert out == "a.csv\n" and err.startswith(told) and err.count("\n") == 1
+    assert out == "a.csv\n" and err.startswith(expected) and err.count("\n") == 1
     assert np.linalg.norm(table(here / "a.csv")[1][-1, 4:7]) < 0.1
     options = ["--row", "1", "--to", "csv", "--out", "b.csv", "--recovery", "none"]
     assert main(["export", str(bare), *options]) == 0
@@ -337,7 +337,7 @@ def test_a_car_brakes_on_its_path(here):
     assert_stops(case, append_recovery(case, plan, "brake"))
 
 
-def test_a_car_steers_past_what_stands_in_its_way_and_says_where_it_cannot():
+def test_a_car_steers_past_a_wall_or_names_the_wall_that_it_hits():
     beside = box(2.7, 4.06, 3.4, 4.4)  # blocks the straight path, but not a path to the right
     case, plan = driving(beside)
     stands = append_recovery(case, plan, "brake")

@@ -274,7 +274,7 @@ def test_each_limit_has_a_failure_here():
 
 
 @pytest.mark.parametrize("kind", NEARER)
-def test_what_comes_nearer_is_touched_by_as_much_as_it_comes_too_near(kind):
+def test_an_obstacle_moved_beyond_its_clearance_is_hit_by_the_difference(kind):
     leaves, (name, place) = good(), NEARER[kind]
     room = getattr(judge(leaves), f"{kind}_clearance")[0]
     leaves[name][place] += room - 0.002
@@ -286,7 +286,7 @@ def test_what_comes_nearer_is_touched_by_as_much_as_it_comes_too_near(kind):
     assert f"{verdict.failed_part[0]} is 0.02 m " in verdict.sentence(0)
 
 
-def test_an_absent_pole_is_in_nobodys_way():
+def test_an_absent_pole_is_ignored():
     leaves = good()
     leaves["scene.pole"][:] = CONTACT[:2]
     assert_fails(leaves, "pole", part="link 4")
@@ -296,14 +296,14 @@ def test_an_absent_pole_is_in_nobodys_way():
     assert_good(leaves)
 
 
-def test_a_rig_without_beams_is_in_nobodys_way():
+def test_a_rig_without_beams_has_infinite_clearance():
     leaves = good()
     for name in ("scene.beam_ends", "scene.beam_radius"):
         leaves[name] = leaves[name][:, :0]
     assert np.isposinf(assert_good(leaves).rig_clearance[0])
 
 
-def test_an_arm_that_may_pass_through_must_not_stop_at_once_nor_has_to_rest():
+def test_an_arm_may_move_at_the_contact_if_the_case_does_not_require_rest():
     leaves = good(FROM_REST, regime="R1")
     assert_good(leaves)
     leaves["ends_at_rest"][:] = True
@@ -313,7 +313,7 @@ def test_an_arm_that_may_pass_through_must_not_stop_at_once_nor_has_to_rest():
         assert_good(good(regime=regime, durations=(0.2, 0.4)))
 
 
-def test_a_motion_that_ends_a_little_off_the_contact_is_where_it_is_then():
+def test_a_motion_that_ends_near_the_contact_is_evaluated_at_the_contact():
     leaves = good(FROM_REST, regime="R1")
     assert_good(leaves, contact_tolerance=1e-7)
     for early in (-5e-5, 5e-5):

@@ -132,7 +132,7 @@ def test_a_hover_under_a_falling_ball_catches_it():
     assert verdict.sentence(0).startswith("success: 1 caught, at most ")
 
 
-def test_two_targets_are_caught_in_sequence_and_an_absent_one_is_not_looked_at():
+def test_two_targets_are_caught_in_sequence_and_an_absent_one_is_ignored():
     verdict = assert_good(good())
     np.testing.assert_array_equal(verdict.caught, [[True, True, False]])
     np.testing.assert_allclose(verdict.catch_times, [[*TIMES, np.nan]])
@@ -142,7 +142,7 @@ def test_two_targets_are_caught_in_sequence_and_an_absent_one_is_not_looked_at()
     assert verdict.head_error[0] < 1e-12 and verdict.continuity_error[0] < 1e-12
 
 
-def test_pieces_that_are_not_flown_may_hold_anything():
+def test_pieces_that_are_not_flown_are_ignored():
     leaves = good()
     leaves["coeffs"][0, 4:] = np.nan
     leaves["times"][0, 2] = np.nan
@@ -198,7 +198,7 @@ def test_an_order_that_misses_a_present_target_fails(order, wrong):
     assert verdict.num_caught[0] == (2 if order[1] == 0 else 1)
 
 
-def test_targets_named_in_another_order_are_missed():
+def test_targets_in_a_wrong_order_are_missed():
     leaves = good()
     leaves["order"][0], leaves["horizon"][0] = [0, 2, 1], 3.0
     verdict = assert_fails(leaves, "net")
@@ -224,7 +224,7 @@ def test_a_catch_after_the_targets_own_horizon_fails():
 
 
 @pytest.mark.parametrize("piece, duration", [(1, 0.0), (2, 0.0), (3, -0.3), (4, -0.3)])
-def test_a_piece_that_does_not_go_on_in_time_fails(piece, duration):
+def test_a_piece_without_positive_duration_fails(piece, duration):
     leaves = good()
     leaves["durations"][0, piece] = duration
     leaves["times"] = np.cumsum(leaves["durations"], axis=1)[:, 1::2]
@@ -405,7 +405,7 @@ def test_a_table_is_read_by_cubic_convolution(time):
     assert verdict.angle[0, 0] == pytest.approx(math.acos(-end_vel[2] / np.linalg.norm(end_vel)))
 
 
-def test_beyond_its_table_a_target_goes_straight_on():
+def test_a_target_keeps_its_velocity_beyond_its_table():
     nodes = (np.arange(8) - 1.0)[:, None] * 0.1  # to 0.5 s
     way = np.array([0.1, 0.0, -2.0])
     table = {"pos": [3.0, 0.0, 4.0] + nodes * way, "vel": np.tile(way, (8, 1)), "resolution": 0.1}
@@ -413,7 +413,7 @@ def test_beyond_its_table_a_target_goes_straight_on():
     assert judge(with_targets(leaves, table)).success[0]
 
 
-def test_a_class_of_the_users_own_answers_through_a_function():
+def test_targets_of_a_users_class_are_followed_by_a_function():
     leaves = good()
     known = judge(leaves)
     plans = flight(leaves, optional=False)

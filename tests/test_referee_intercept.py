@@ -191,7 +191,7 @@ def test_steering_is_fastest_where_the_curvature_is_least(first, second, least, 
     assert_fails(leaves, "steering rate", excess=0.25, time=(2.0 + place) * h)
 
 
-def test_a_car_that_stops_too_late_is_as_deep_in_the_wall_as_it_is_late():
+def test_a_car_that_stops_late_is_inside_the_wall():
     end = START[0] + SPEED * TIME + FRONT
     wall = [[end - 0.07, 3.0], [end + 2.0, 3.0], [end + 2.0, 5.0], [end - 0.07, 5.0]]
     verdict = assert_fails(good(walls=[square(7, 1, 0.2), wall]), "wall", excess=0.07, time=TIME)
@@ -217,7 +217,7 @@ def test_corners_graze_at_the_distance_of_their_diagonals():
     assert_fails(wedged, "wall", excess=0.02, time=TIME)
 
 
-def test_a_mover_is_met_where_and_when_it_is():
+def test_a_mover_is_hit_at_its_position_and_time():
     """Move a square of side 0.4 m along the side of a car at rest; it is abreast at 2 s."""
     still, way = {"speed": 0.0, "time": 4.0}, [(0.5, 0.0)]
     x, y = START[0] + MIDDLE - 1.0, START[1] + 0.5 * WIDTH + 0.2
@@ -274,7 +274,7 @@ def test_clearances_are_the_greatest_gap_in_any_direction():
     assert (nearest[~found] == -1).all()
 
 
-def test_corners_may_be_in_either_sense_and_repeated_and_absent_obstacles_hold_anything():
+def test_polygons_may_have_either_orientation_and_repeated_corners():
     wall = square(3.0, 4.5, 0.3)
     plain, turned = good(walls=[wall]), good(walls=[wall[::-1]])
     tight = good()
@@ -328,7 +328,7 @@ def test_every_failure_has_its_name_size_and_time(k):
     assert_fails(leaves, name, excess=excess, time=time)
 
 
-def test_a_plan_may_end_before_the_cases_time_and_is_held_against_the_target_there():
+def test_a_plan_may_end_before_the_cases_time():
     leaves = good()
     leaves["time"][:] = 10.0
     assert assert_good(leaves).meeting_time[0] == TIME
@@ -353,7 +353,7 @@ def test_targets_turn_or_follow_polynomials():
     assert assert_good(other).miss[0] < 1e-12
 
 
-def test_the_truth_takes_the_place_of_what_was_expected():
+def test_the_true_path_replaces_the_expected_one():
     leaves = good()
     truth = SimpleNamespace(
         pos=leaves["target.pos"] + [[0.3, 0.0]],
@@ -366,7 +366,7 @@ def test_the_truth_takes_the_place_of_what_was_expected():
     assert_good(leaves, truth=truth)
 
 
-def test_a_class_of_the_users_own_answers_through_a_function():
+def test_targets_of_a_users_class_are_followed_by_a_function():
     case = tree(good())
     known, case.target = case.target, "hovering"
 
@@ -416,7 +416,7 @@ def test_a_broken_plan_has_no_nearest_wall():
     assert judge(leaves).nearest_wall[0] == -1
 
 
-def test_there_may_be_no_room_for_obstacles():
+def test_arrays_of_obstacles_may_be_empty():
     leaves = good()
     leaves |= {f"walls.{k}": leaf for k, leaf in group(room=(0, 4)).items()}
     assert np.isposinf(assert_good(leaves).wall_clearance[0])
