@@ -1,4 +1,4 @@
-"""The velocity that takes a ball to a target in a numbers time, and the apex of its flight.
+"""The velocity that takes a ball to a target in a specified time, and the apex of its flight.
 
 Derivatives are computed in forward mode, and reverse mode only multiplies by them. Otherwise
 reverse mode would go back through every step of a flight for the derivatives of a few numbers.

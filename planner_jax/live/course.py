@@ -96,7 +96,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk at a time [s] after the start of a course, on the host."""
+    """Return position, velocity, acceleration and jerk at a time [s] of a course, on the host."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:
@@ -105,5 +105,5 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 
 
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk at a time [s] of a trajectory, on the host."""
+    """Return position, velocity, acceleration and jerk at a time [s] of a trajectory."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)

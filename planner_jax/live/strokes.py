@@ -94,7 +94,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return position to jerk (4, 3) of the previous plan at the elapsed time."""
+    """Return the state (4, 3), position to jerk, of the previous plan at the elapsed time."""
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 

@@ -41,7 +41,7 @@ class RecoveryPlan(QuadrotorPlan):
 
 
 def end_state(path: PiecewisePolynomial) -> Array:
-    """Return position to jerk (4, 3), rows as in `head_state`, at the end of a trajectory.
+    """Return position, velocity, acceleration and jerk (4, 3) at the end of a trajectory.
 
     Pieces of zero duration are ignored.
     """

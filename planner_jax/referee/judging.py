@@ -73,7 +73,7 @@ class FlightVerdict(Verdict):
 
 CONTACT_TIME_TOLERANCE = 1e-4  # [s], between the claimed time of a contact and the planned one
 SMALLEST_LIMIT = 1e-3  # smallest divisor of a relative excess, in the limit's own unit
-_FEWEST_LANES = 256  # of a thread: fewer do not repay it
+_FEWEST_LANES = 256  # that are worth a thread
 _MANY_LANES, _MANY_CORES = 16384, 4  # least numbers for which processes judge instead of threads
 
 
@@ -125,8 +125,8 @@ def judge_in_chunks(
 ) -> dict[str, np.ndarray]:
     """Judge arrays with leading axis B in chunks, and return the fields of the verdict.
 
-    One thread a core judges the chunks, since NumPy releases the interpreter inside its loops.
-    Processes judge them if there are many lanes and many cores, and `judge` can be pickled.
+    Threads judge the chunks, one for each core, since NumPy releases the interpreter in its loops.
+    If there are many lanes and many cores, and `judge` can be pickled, processes judge instead.
 
     Raises:
         ValueError: `chunk` < 1.
