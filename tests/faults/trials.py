@@ -24,7 +24,6 @@ from tests.faults.commands import (
     wait_until_listening,
 )
 from tests.faults.quick import quick_sweeps
-from tests.faults.runs import TARGETS, make_runs, verdict
 from tests.sweeps import rows_of
 
 QUICK = "tests.faults.quick"
@@ -122,6 +121,8 @@ def kill_workers(moment: random.Random, num: int, place: Path, base: Path) -> Su
 
 def damage_files(what: str, moment: random.Random, num: int, place: Path, base: Path) -> Survived:
     """Damage a file of a run, and check what its readers say."""
+    from tests.faults.runs import TARGETS, verdict  # needs the simulators
+
     with quick_sweeps():
         for _ in range(num):
             target, name = moment.choice(TARGETS[what])
@@ -217,6 +218,8 @@ TRIALS = [
 def make_whole(name: str, base: Path) -> None:
     """Write the undisturbed runs that trials compare with; their programs are cached then."""
     if not name:
+        from tests.faults.runs import make_runs  # needs the simulators
+
         with quick_sweeps():
             return make_runs(base / "runs")
     module = "planner_jax" if name == "many" else QUICK
