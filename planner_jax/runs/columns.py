@@ -53,21 +53,23 @@ VECTOR, LIST = list_of(pa.float32(), 3), list_of(pa.float32())
 INDEX = Column("index", "", "index of the case in the run", pa.int64(), lambda b: b.chunk.index)
 
 
-def leaves_of(part: str, *rows: tuple) -> list[Column]:
+def leaves_of(part: str, *rows: tuple, optional: bool = False) -> list[Column]:
     """Return columns that are leaves of one part of a batch.
 
     Args:
         part: dotted path of the part in a `RefereedBatch`.
         *rows: name, unit and meaning of a column; optionally its type, by default NUMBER, and the
             dotted path of the leaf in the part, by default the name.
+        optional: whether a missing leaf makes the column null.
     """
-    return [_leaf_column(part, *row) for row in rows]
 
+    def column(
+        name: str, unit: str, meaning: str, kind: pa.DataType = NUMBER, path: str = ""
+    ) -> Column:
+        place = f"{part}.{path or name}"
+        return Column(name, unit, meaning, kind, lambda b: _leaf(b, place, optional))
 
-def _leaf_column(
-    part: str, name: str, unit: str, meaning: str, kind: pa.DataType = NUMBER, path: str = ""
-) -> Column:
-    return Column(name, unit, meaning, kind, lambda b: _leaf(b, f"{part}.{path or name}"))
+    return [column(*row) for row in rows]
 
 
 _STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
@@ -164,9 +166,10 @@ def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(offsets), flat, type=kind)
 
 
-def _leaf(tree: PyTree, path: str) -> ArrayLike:
+def _leaf(tree: PyTree, path: str, optional: bool = False) -> Values:
+    default = (None,) if optional else ()
     for name in path.split("."):
-        tree = tree[name] if isinstance(tree, dict) else getattr(tree, name)
+        tree = tree[name] if isinstance(tree, dict) else getattr(tree, name, *default)
     return tree
 
 

@@ -31,24 +31,18 @@ MOTION = leaves_of(
 )
 
 
-def _of_recovery(name: str, unit: str, meaning: str) -> Column:
-    """Return a column of a leaf of the recovery trajectories; null if plans have none."""
-
-    def values(batch: RefereedBatch) -> np.ndarray | None:
-        recovery = batch.plans.recovery
-        return None if recovery is None else vars(recovery)[name]
-
-    return Column(f"recovery_{name}", unit, meaning, LIST, values)
-
-
 TRAJECTORY = [
     *leaves_of(
         "plans.trajectory",
         ("durations", "s", "of the pieces", LIST),
         ("coeffs", "m/s^k", "pieces x powers k = 0..D x 3 axes, flat", LIST),
     ),
-    _of_recovery("durations", "s", "of the recovery trajectory's pieces; null without one"),
-    _of_recovery("coeffs", "m/s^k", "of the recovery trajectory, as `coeffs`; null without one"),
+    *leaves_of(
+        "plans.recovery",
+        ("recovery_durations", "s", "of the recovery's pieces, if any", LIST, "durations"),
+        ("recovery_coeffs", "m/s^k", "of the recovery, as `coeffs`", LIST, "coeffs"),
+        optional=True,
+    ),
 ]
 
 _RESTS = {

@@ -16,33 +16,25 @@ FRAME = "world, z up; times from the start of planning"
 _WHICH, _FLAGS = list_of(pa.int32()), list_of(pa.bool_())
 
 
-def _target(name: str, unit: str, meaning: str, path: str) -> Column:
-    """Return the column of a leaf of the targets; null if their class does not have it."""
-
-    def values(batch: known.RefereedBatch) -> known.Values:
-        leaf = batch.cases.targets
-        for step in path.split("."):
-            leaf = None if leaf is None else vars(leaf).get(step)
-        return leaf
-
-    return Column(name, unit, meaning, LIST, values)
-
-
 def _time_ratio(batch: known.RefereedBatch) -> np.ndarray:
     return optimal_time_ratio(batch.cases, batch.plans)
 
 
 COLUMNS = [
     known.INDEX,
-    _target("ball_pos", "m", "targets at time 0, N x 3", "ball.pos"),
-    _target("ball_vel", "m/s", "targets at time 0, N x 3", "ball.vel"),
-    _target("drag", "1/s", "linear, on each axis, N x 3", "drag"),
-    _target("ball_gravity", "m/s^2", "of the targets", "gravity"),
-    _target("swing_pos", "m", "middle of a swinging target at time 0, N x 3", "pos"),
-    _target("swing_vel", "m/s", "drift of a swinging target, N x 3", "vel"),
-    _target("swing_amplitude", "m", "of a swinging target, N x 3", "amplitude"),
-    _target("swing_rate", "rad/s", "of a swinging target", "rate"),
-    _target("swing_phase", "rad", "of a swinging target at time 0", "phase"),
+    *leaves_of(
+        "cases.targets",
+        ("ball_pos", "m", "targets at time 0, N x 3", LIST, "ball.pos"),
+        ("ball_vel", "m/s", "targets at time 0, N x 3", LIST, "ball.vel"),
+        ("drag", "1/s", "linear, on each axis, N x 3", LIST, "drag"),
+        ("ball_gravity", "m/s^2", "of the targets", LIST, "gravity"),
+        ("swing_pos", "m", "middle of a swinging target at time 0, N x 3", LIST, "pos"),
+        ("swing_vel", "m/s", "drift of a swinging target, N x 3", LIST, "vel"),
+        ("swing_amplitude", "m", "of a swinging target, N x 3", LIST, "amplitude"),
+        ("swing_rate", "rad/s", "of a swinging target", LIST, "rate"),
+        ("swing_phase", "rad", "of a swinging target at time 0", LIST, "phase"),
+        optional=True,
+    ),
     *leaves_of(
         "cases",
         ("present", "", "whether each target exists", _FLAGS),

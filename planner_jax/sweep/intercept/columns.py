@@ -20,12 +20,6 @@ WAY_POINTS = 65  # number of points of a target's path
 _FLAGS, _POINT = list_of(pa.bool_()), list_of(pa.float32(), 2)
 
 
-def _target(name: str, unit: str, meaning: str, kind: pa.DataType) -> Column:
-    """Return the column of a leaf of targets with constant turn rate; null for other classes."""
-    values = lambda b: vars(b.cases.target).get(name)  # noqa: E731
-    return Column(f"target_{name}", unit, meaning, kind, values)
-
-
 def _target_way(batch: RefereedBatch) -> np.ndarray:
     times = np.asarray(batch.cases.time)[:, None] * np.linspace(0.0, 1.0, WAY_POINTS)
     return np.asarray(_positions(batch.cases.target, jnp.asarray(times, jnp.float32)))
@@ -59,9 +53,13 @@ COLUMNS = [
         ("end_heading", "rad", "prescribed at the meeting"),
         ("heading_tolerance", "rad", "tolerance of this heading; pi leaves it free"),
     ),
-    _target("pos", "m", "predicted target at time 0, if its turn rate is constant", _POINT),
-    _target("vel", "m/s", "of this target at time 0", _POINT),
-    _target("turn_rate", "rad/s", "of this target, to the left", known.NUMBER),
+    *leaves_of(
+        "cases.target",
+        ("target_pos", "m", "target with constant turn rate at time 0", _POINT, "pos"),
+        ("target_vel", "m/s", "of this target at time 0", _POINT, "vel"),
+        ("target_turn_rate", "rad/s", "of this target, to the left", known.NUMBER, "turn_rate"),
+        optional=True,
+    ),
     Column(
         "target_way",
         "m",
