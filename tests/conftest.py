@@ -49,6 +49,17 @@ def float64():
         yield
 
 
+@pytest.fixture(scope="module", autouse=True)
+def strict_types(request):
+    """Raise where JAX would convert a type implicitly, except in modules with MJX or Brax."""
+    stem = request.path.stem.removeprefix("test_")
+    is_mixed = stem.startswith("sims_") or stem in MIXED
+    usual = jax.config.jax_numpy_dtype_promotion
+    jax.config.update("jax_numpy_dtype_promotion", usual if is_mixed else "strict")
+    yield
+    jax.config.update("jax_numpy_dtype_promotion", usual)
+
+
 @pytest.fixture(scope="module")
 def finished(request, tmp_path_factory):
     """Return folder and manifest of a complete sweep of the module's TASK and SETTINGS."""
@@ -69,6 +80,8 @@ SLOW = (
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
+# Modules beside `test_sims_*` with MJX, Brax or optax, which convert types implicitly.
+MIXED = ("policy", "training", "stack", "speed", "bench")
 # Modules that take longest, or compile programs that others find in the cache: test_exact the hit
 # planner's, test_decide the catch planner's. Workers get whole modules in this order, so that none
 # ends with a long module, and no two compile the same program.

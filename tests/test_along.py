@@ -12,7 +12,7 @@ from planner_jax.baselines.hit.common import motion_excess
 from planner_jax.cost.along import Along, _greatest, greatest_along, integrate_along
 from planner_jax.cost.along_kernel import MODES, along_kernel
 from planner_jax.cost.peaks_kernel import peaks_kernel
-from planner_jax.cost.penalty import crest, greatest_by_tangents, smooth_hinge
+from planner_jax.cost.penalty import greatest_by_tangents, peak_above, smooth_hinge
 from planner_jax.lanes import over_lanes
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.trajectory.proportional_minco import proportional_minco, sample_motion
@@ -120,10 +120,12 @@ def test_the_crest_is_the_peak_of_a_parabola_between_three_samples(float64):
     for peak, height in ((0.02, 1.0), (-0.29, 2.0), (0.49, 0.5), (-0.31, 3.0), (0.51, 1.0)):
         left, middle, right = (height - 7.0 * (t - peak) ** 2 for t in (-before, 0.0, after))
         expected = height - middle if -before < peak < after else 0.0
-        np.testing.assert_allclose(crest(left, middle, right, before, after), expected, atol=1e-12)
+        np.testing.assert_allclose(
+            peak_above(left, middle, right, before, after), expected, atol=1e-12
+        )
     for values in ((1.0, 1.0, 1.0), (0.0, 1.0, 2.0), (1.0, 0.0, 1.0), (-np.inf,) * 3):
-        slopes = jax.grad(lambda x: crest(*x, before, after))(jnp.array(values))
-        assert crest(*map(jnp.array, values), before, after) == 0.0
+        slopes = jax.grad(lambda x: peak_above(*x, before, after))(jnp.array(values))
+        assert peak_above(*map(jnp.array, values), before, after) == 0.0
         assert np.isfinite(slopes).all() or np.isinf(values).any()
 
 

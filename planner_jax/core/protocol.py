@@ -221,7 +221,7 @@ class Decision(Protocol):
 Tree = TypeVar("Tree")
 
 
-def out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
+def mark_out_of_time(plans: PlanT, left: Numbers | bool) -> PlanT:
     """Return the plans with the status `OUT_OF_TIME` where `left` is true."""
     status = numpy_of(plans.status).where(left, Status.OUT_OF_TIME, plans.status).astype(np.int32)
     return dataclasses.replace(plans, status=status)  # type: ignore[type-var]
@@ -332,7 +332,7 @@ def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
     return xp.where(good.any(axis=0), by_cost, by_violation).argmin(axis=0)
 
 
-def first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
+def select_first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, best: PlanT) -> PlanT:
     """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
 
     `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is

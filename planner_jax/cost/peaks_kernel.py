@@ -22,7 +22,7 @@ from planner_jax.cost.along_kernel import (
     sample_excess,
     unit_motion,
 )
-from planner_jax.cost.penalty import crest
+from planner_jax.cost.penalty import peak_above
 from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import grid_index
 
@@ -69,7 +69,7 @@ def _call(
             values = sample_excess(along, unit, duration, given)
             gaps = steps_ref[jnp.maximum(k - 2, 0)], steps_ref[jnp.maximum(k - 1, 0)]
             for i, value in enumerate(values):
-                rise = crest(before[i], middle[i], value, *gaps)
+                rise = peak_above(before[i], middle[i], value, *gaps)
                 peak = jnp.where(k >= first + 2, middle[i] + rise, value)
                 most = [*most[:i], jnp.maximum(most[i], jnp.maximum(value, peak)), *most[i + 1 :]]
             return most, middle, list(values)

@@ -45,11 +45,11 @@ def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
     For a smooth quantity the error is of third order in the step. `times` (K,) are in any unit.
     """
     before, after = np.diff(times)[:-1], np.diff(times)[1:]
-    rise = crest(values[:-2], values[1:-1], values[2:], before, after)
+    rise = peak_above(values[:-2], values[1:-1], values[2:], before, after)
     return jnp.max(values + jnp.pad(rise, 1))
 
 
-def crest(
+def peak_above(
     left: Array, middle: Array, right: Array, before: Array | np.ndarray, after: Array | np.ndarray
 ) -> Array:
     """Return the height >= 0 of a parabola's peak above the middle one of three samples on it.

@@ -101,7 +101,8 @@ def continue_search(
         if config.hope is None:
             return is_open
         behind = state.steps - config.trial
-        bound = config.hope * config.fade ** jnp.maximum(behind, 0)
+        fade = jnp.asarray(config.fade, state.model.cost.dtype)
+        bound = config.hope * lax.pow(fade, jnp.maximum(behind, 0))
         return is_open & ((behind < 0) | (state.model.cost <= bound))
 
     return lax.while_loop(is_unfinished, lambda state: _step(evaluate, state, config), state)

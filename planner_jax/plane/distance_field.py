@@ -25,7 +25,10 @@ class DistanceField:
         most = self.values.shape[0] - 2
         at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
         below = [jnp.clip(jnp.floor(each), 0, most).astype(jnp.int32) for each in at]
-        (u, v) = (jnp.clip(each - low, 0.0, 1.0) for each, low in zip(at, below, strict=True))
+        (u, v) = (
+            jnp.clip(each - low.astype(each.dtype), 0.0, 1.0)
+            for each, low in zip(at, below, strict=True)
+        )
         index = below[1] * self.values.shape[1] + below[0]
         flat = self.values.reshape(-1)
         corners = [

@@ -229,7 +229,7 @@ def reach_set(
     # The same for turns: their whole bins add up to the angle that the turn rates allow.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most + 0.1), axis=0)  # (layers, levels)
-    span = jnp.abs(jnp.arange(-SPAN, SPAN + 1))
+    span = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))
     turns = span <= whole[..., None]
     walls = _pack(field < vehicle.radius)
     stencils = _stencils(grid, movers, vehicle.radius)
@@ -301,7 +301,7 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
     """Return the bits at time 0: the start, at the levels of speed next to the vehicle's own."""
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
-    near = jnp.abs(jnp.arange(lattice.levels) - level) < 1.0
+    near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
     indices = jnp.arange(lattice.cells)
     at = (indices[:, None] == cell[1]) & (indices == cell[0])
     bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]

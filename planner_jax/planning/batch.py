@@ -26,7 +26,7 @@ from planner_jax.core.protocol import (
     is_resident,
     is_unsolved,
     mark_bad_input,
-    out_of_time,
+    mark_out_of_time,
     select,
     select_into,
 )
@@ -34,15 +34,15 @@ from planner_jax.host.machine import as_here, usable_cores
 from planner_jax.planning.programs import (
     LANES,
     Sizes,
-    apart,
     compiled,
+    count_lanes,
     is_one_cpu,
-    length,
-    number,
+    lane_sharding,
     on_devices,
     place_lanes,
     program_key,
-    sharding,
+    put_number,
+    run_per_device,
     sizes_of,
     solve_on_devices,
     with_unsolved,
@@ -105,7 +105,7 @@ class Watch:
         """Whether the time limit has passed."""
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
-    def tell(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
+    def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
         """Report on a round: always at its start and end, in between once a second."""
         if self._progress is None:
             return
@@ -147,14 +147,14 @@ def plan_batch(
     """
     planner, mesh = on_devices(planner, devices)
     batch = _Batch(planner, chunk, mesh, watch)
-    resident, num = is_resident(cases), length(cases)
+    resident, num = is_resident(cases), count_lanes(cases)
     # One CPU shares its memory with the host: there a thread for each core plans chunks, and NumPy
     # cuts and joins them, because programs for that would be compiled for every new size.
     if resident and (num == batch.sizes(attempts[0]).next(num) or not is_one_cpu(mesh)):
         return batch.plan_resident(attempts, cases)
     cases = jax.tree.map(np.asarray, cases)
     plans, unsolved = _try_in_turn(attempts, num, watch, functools.partial(batch.try_lanes, cases))
-    return (jax.device_put(plans, sharding(mesh)) if resident else plans), unsolved
+    return (jax.device_put(plans, lane_sharding(mesh)) if resident else plans), unsolved
 
 
 def plan_on_host(
@@ -165,13 +165,13 @@ def plan_on_host(
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
     def try_lanes(attempt: Attempt, lanes: np.ndarray, plans: PyTree) -> PyTree:
-        watch.tell(planner, attempt, 0, lanes.size)
+        watch.report(planner, attempt, 0, lanes.size)
         some = jax.tree.map(lambda leaf: leaf[lanes], cases)
         later = mark_bad_input(planner.solve_on_host(some, attempt), some)
-        watch.tell(planner, attempt, lanes.size, lanes.size)
+        watch.report(planner, attempt, lanes.size, lanes.size)
         return jax.tree.map(np.array, later) if plans is None else select_into(plans, later, lanes)
 
-    plans, unsolved = _try_in_turn(attempts, length(cases), watch, try_lanes)
+    plans, unsolved = _try_in_turn(attempts, count_lanes(cases), watch, try_lanes)
     return jax.tree.map(lambda leaf: leaf[0], plans) if alone else plans, unsolved
 
 
@@ -194,7 +194,7 @@ def _try_in_turn(
         if not lanes.size:
             continue
         if watch.is_over:
-            plans = out_of_time(plans, due)
+            plans = mark_out_of_time(plans, due)
             break
         plans = try_lanes(attempt, lanes, plans)
     return plans, np.sum(is_unsolved(plans.status))
@@ -219,14 +219,14 @@ class _Batch:
         """Return the plans after one attempt at some lanes of cases in NumPy arrays."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
-        self.watch.tell(self.planner, attempt, 0, lanes.size)
+        self.watch.report(self.planner, attempt, 0, lanes.size)
         for one, (_, num) in zip(
             self._results(attempt, cases, calls, plans is not None), calls, strict=True
         ):
             found.append(one)
             if one is not None:
                 tried += num
-                self.watch.tell(self.planner, attempt, tried, lanes.size)
+                self.watch.report(self.planner, attempt, tried, lanes.size)
         if plans is None:
             trimmed = [
                 jax.tree.map(lambda leaf, n=num: np.asarray(leaf)[:n], part)
@@ -239,7 +239,7 @@ class _Batch:
                 untried[call[:num]] = True
             else:
                 plans = select_into(plans, later, call[:num])
-        return out_of_time(plans, untried) if untried.any() else plans
+        return mark_out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
         """Return the calls for some lanes."""
@@ -258,7 +258,7 @@ class _Batch:
         One more thread prepares the next call while the others compute. If `may_end`, calls that
         did not start before the time limit yield None.
         """
-        watch, spec = self.watch, sharding(self.mesh)
+        watch, spec = self.watch, lane_sharding(self.mesh)
         threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
 
         def solve(call: _Call) -> PyTree:
@@ -285,27 +285,27 @@ class _Batch:
 
         Every device plans its own share, and takes no lanes of other shares.
         """
-        planner, mesh, watch, num = self.planner, self.mesh, self.watch, length(cases)
+        planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
         if num % mesh.size:  # the last lane is repeated until all shares are equal
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
         cases = place_lanes(cases, mesh)
         first, *others = attempts
-        watch.tell(planner, first, 0, num)
+        watch.report(planner, first, 0, num)
         plans, unsolved = self._first_plans(first, cases)
         for attempt in others:
             before, due = plans.status, unsolved
             if attempt.within is not None:
-                before, due = _due(mesh, attempt.within, plans)
+                before, due = _mark_due(mesh, attempt.within, plans)
             due.copy_to_host_async()  # starts as soon as it is known
             most = np.asarray(due).max()  # among the devices
             if most == 0:
                 continue
             if watch.is_over:
-                plans = out_of_time(plans, attempt.is_due(plans))
+                plans = mark_out_of_time(plans, attempt.is_due(plans))
                 break
-            watch.tell(planner, attempt, 0, np.asarray(due).sum())
+            watch.report(planner, attempt, 0, np.asarray(due).sum())
             for begin, size in self.sizes(attempt).cuts(most):
-                part, lanes = _cut_unsolved(mesh, size, cases, before, number(mesh, begin))
+                part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
                 later, _ = solve_on_devices(planner, attempt, mesh, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
         if num % mesh.size:  # JAX has no arrays of unequal shares
@@ -314,13 +314,13 @@ class _Batch:
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
         """Return the results of `solve_on_devices` for all lanes of each device, chunk by chunk."""
-        mesh, sizes, share = self.mesh, self.sizes(attempt), length(cases) // self.mesh.size
+        mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)
         cuts = list(sizes.cuts(share))
 
         def solve(begin: int, size: int) -> PyTree:
-            part = _cut(mesh, size, cases, number(mesh, begin))
+            part = _cut(mesh, size, cases, put_number(mesh, begin))
             return solve_on_devices(self.planner, attempt, mesh, part)[0]
 
         firsts = {size: begin for begin, size in reversed(cuts)}
@@ -348,7 +348,7 @@ def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
     def cut(tree: PyTree, begin: Array) -> PyTree:
         return _take(tree, begin + jnp.arange(size))
 
-    return apart(mesh, cut, LANES, PartitionSpec())(tree, begin)
+    return run_per_device(mesh, cut, LANES, PartitionSpec())(tree, begin)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
@@ -366,11 +366,11 @@ def _cut_unsolved(
         lanes = _take(unsolved, begin + jnp.arange(size))
         return _take(tree, lanes), lanes
 
-    return apart(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
+    return run_per_device(mesh, cut, LANES, LANES, PartitionSpec())(tree, status, begin)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
-def _due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
+def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
     """Return statuses, and the number of unsolved ones, (devices,).
 
     Plans with a violation above `within` count as solved.
@@ -381,7 +381,7 @@ def _due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
         status = jnp.where(near, plans.status, jnp.full_like(plans.status, Status.FEASIBLE))
         return status, jnp.sum(is_unsolved(status), keepdims=True)
 
-    return apart(mesh, due)(plans)
+    return run_per_device(mesh, due)(plans)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
@@ -391,7 +391,7 @@ def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, 
     def join(*parts: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
 
-    return apart(mesh, join)(*parts)
+    return run_per_device(mesh, join)(*parts)
 
 
 @functools.partial(jax.jit, static_argnames="mesh")
@@ -406,4 +406,4 @@ def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> t
 
         return with_unsolved(jax.tree.map(replace, plans, kept))
 
-    return apart(mesh, merge)(plans, later, lanes)
+    return run_per_device(mesh, merge)(plans, later, lanes)

@@ -14,7 +14,7 @@ from planner_jax.core.protocol import (
     Attempt,
     is_better,
     is_unsolved,
-    out_of_time,
+    mark_out_of_time,
     select,
     select_into,
 )
@@ -65,7 +65,7 @@ class Driver:
         if not lanes.size:
             return plans
         if self.is_over:
-            return out_of_time(plans, left)
+            return mark_out_of_time(plans, left)
         return select_into(plans, plan_of(jax.tree.map(lambda leaf: leaf[lanes], cases)), lanes)
 
 
@@ -76,10 +76,10 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
         if best is not None and not attempt.is_due(best):
             continue
         if best is not None and watch.is_over:
-            return out_of_time(best, True)
-        watch.tell(planner, attempt, 0, 1)
+            return mark_out_of_time(best, True)
+        watch.report(planner, attempt, 0, 1)
         plan = solve_one(planner, case, attempt)
-        watch.tell(planner, attempt, 1, 1)
+        watch.report(planner, attempt, 1, 1)
         if best is None or is_better(plan, best):
             best = plan
         if not is_unsolved(int(best.status)):  # an int is checked faster than an array

@@ -85,11 +85,11 @@ def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[
     """Return a planner with its arrays on the devices, by default all local ones, and a mesh."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):
-        planner = jax.device_put(planner, whole(mesh))
+        planner = jax.device_put(planner, replicated_sharding(mesh))
     return planner, mesh
 
 
-def length(tree: PyTree) -> int:
+def count_lanes(tree: PyTree) -> int:
     """Return the number of lanes of all leaves."""
     return jax.tree.leaves(tree)[0].shape[0]
 
@@ -99,23 +99,23 @@ def is_one_cpu(mesh: Mesh) -> bool:
     return mesh.size == 1 and mesh.devices[0].platform == "cpu"
 
 
-def sharding(mesh: Mesh) -> Sharding:
+def lane_sharding(mesh: Mesh) -> Sharding:
     """Return the sharding into equal shares of lanes; for one device JAX's fastest form."""
     return NamedSharding(mesh, LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
 
 
-def whole(mesh: Mesh) -> Sharding:
+def replicated_sharding(mesh: Mesh) -> Sharding:
     """Return the sharding of arrays that every device has in full."""
-    return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else sharding(mesh)
+    return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else lane_sharding(mesh)
 
 
 @functools.lru_cache(maxsize=4096)
-def number(mesh: Mesh, value: int) -> Array:
+def put_number(mesh: Mesh, value: int) -> Array:
     """Return a number on every device, cached because each transfer takes time."""
-    return jax.device_put(np.int32(value), whole(mesh))
+    return jax.device_put(np.int32(value), replicated_sharding(mesh))
 
 
-def apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
+def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
     """Return the function that every device computes for its own share of the lanes.
 
     `function` takes arrays with the lanes first. `specs` are the shardings of its arguments; by
@@ -131,7 +131,7 @@ def apart(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
 
 def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
     """Return the tree with equal shares of its lanes on every device."""
-    target = sharding(mesh)
+    target = lane_sharding(mesh)
 
     def is_there(leaf: Array) -> bool:
         own = leaf.sharding  # == is the faster comparison
@@ -169,7 +169,7 @@ def solve_on_devices(
     def solve(planner: Planner, cases: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(solve_cases(planner, cases, attempt))
 
-    return apart(mesh, solve, PartitionSpec(), LANES)(planner, cases)
+    return run_per_device(mesh, solve, PartitionSpec(), LANES)(planner, cases)
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:

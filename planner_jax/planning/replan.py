@@ -29,7 +29,7 @@ class Replanning(Generic[CaseT, PlanT]):
         return self.case.batch_shape
 
 
-def moment_of(cases: Case, elapsed: PyTree) -> np.ndarray:
+def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
     """Return the time since plans started, () or (B,) [s], in the cases' floating type.
 
     Raises:

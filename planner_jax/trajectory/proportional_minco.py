@@ -302,7 +302,7 @@ def proportional_trajectory(
         jnp.concatenate([rows, offsets]),
         precision=lax.Precision.HIGHEST,
     )
-    powers = piece_duration ** jnp.arange(2 * maps.order)
+    powers = lax.pow(piece_duration, jnp.arange(2 * maps.order))
     return PiecewisePolynomial(
         coeffs=unit / powers[None, :, None],
         durations=piece_duration * jnp.asarray(maps.proportions, rows.dtype),

@@ -15,7 +15,7 @@ from jax import Array
 
 from planner_jax.baselines.parts.bang_bang import bang_bang, least_times
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, first_solved, require_settings, status_of
+from planner_jax.core.protocol import Attempt, require_settings, select_first_solved, status_of
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
@@ -71,7 +71,7 @@ class DirectBlock(Planner):
             index = order[k]
             return self.plan_to(case, poses.angles[index], poses.time[index], times[index])
 
-        best = first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
+        best = select_first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
         return dataclasses.replace(best, status=explain_status(case, poses, best.status))
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:

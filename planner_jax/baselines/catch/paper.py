@@ -73,7 +73,7 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
     """
     inside = jnp.clip(x, 0.0, width)
     beyond = jnp.maximum(x - width, 0.0)
-    return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width)
+    return inside**3 + beyond**2 * (beyond + width) / width**4 * (x > width).astype(x.dtype)
 
 
 def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:

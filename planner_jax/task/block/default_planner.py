@@ -24,10 +24,10 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
-    first_solved,
     is_solved,
     require_settings,
     select,
+    select_first_solved,
     status_of,
 )
 from planner_jax.optimise.levenberg import (
@@ -238,7 +238,7 @@ class OnlineBlock(Planner):
         if self.brisk:
             best = lax.fori_loop(0, straight, keep_quicker, best)
         else:
-            best = first_solved(plan_straight, straight, best)
+            best = select_first_solved(plan_straight, straight, best)
         if not attempt.tries:
             return flight, poses, best, jnp.zeros((0, 6 * self.pieces + 1), case.angles.dtype)
         starts = jax.vmap(lambda rank: self.encode_straight(case, poses, order[rank]))(ranks)
@@ -260,7 +260,7 @@ class OnlineBlock(Planner):
         """Refine the starts (N, n) one by one until one leads to a plan."""
         tries = jnp.where(flight.comes, attempt.tries, 0)
         refine = lambda k: self.refine(case, flight, starts[k], attempt.solver)  # noqa: E731
-        return first_solved(refine, tries, best)
+        return select_first_solved(refine, tries, best)
 
     def refine_cheapest_first(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan

@@ -20,7 +20,7 @@ from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.core.planner import Drive, Planner
 from planner_jax.core.protocol import Attempt, is_unsolved
 from planner_jax.optimise.levenberg import LevenbergConfig
-from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.arm import shield_pose
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.default_planner import OnlineBlock
@@ -111,7 +111,7 @@ class ReplanBlock(Planner):
         `rates` [rad/s] at the start of the new motion are (6,) or (B, 6). By default they are the
         states of the previous plan, which brakes after its end.
         """
-        elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
+        elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         if ball is not None:
             require_kind("ball", ball, BallState)
             require_beginning("ball", ball, batch, f"the batch shape {batch}")

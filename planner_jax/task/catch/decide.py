@@ -159,7 +159,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
     taken = position < num
     rising = jnp.where(taken, times, 0.0)[order]
     behind = jnp.maximum(jnp.arange(num) - jnp.sum(taken) + 1, 0)
-    rising = lax.cummax(rising) + estimate.INSTANT * behind
+    rising = lax.cummax(rising) + estimate.INSTANT * behind.astype(times.dtype)
     return CatchChoice(order=order.astype(jnp.int32), times=rising, taken=taken)
 
 
@@ -184,7 +184,9 @@ class CatchDecision:
 
     def rank(self, plans: CatchPlan) -> Array:
         """Return the time of the last catch of each plan [s], plus 100 s for each target left."""
-        return plans.times[..., -1] + 100.0 * (plans.times.shape[-1] - plans.num_taken)
+        left = plans.times.shape[-1] - plans.num_taken
+        dtype = plans.times.dtype if isinstance(left, jax.Array) else np.float64
+        return plans.times[..., -1] + 100.0 * left.astype(dtype)
 
     def explain(self, case: CatchCase, status: Array) -> Array:
         """Return OUT_OF_REACH for unsolved cases with a target that `closest_approach` rules out.

@@ -19,7 +19,7 @@ from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import require_path
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.quadrotor import body_z
 from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.context import CatchContext, targets_at
@@ -101,7 +101,7 @@ class ReplanCatch(OptimisedPlanner):
         targets, and their time 0 is the present. The quadrotor's `head_state`, (4, 3) or (B, 4, 3),
         is by default the state in the plan.
         """
-        elapsed = moment_of(cases, elapsed)
+        elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
         own = states_at(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)

@@ -32,7 +32,7 @@ def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
     node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
     # Below the last node above the ground the ball is taken to sink at the speed of that node.
     sinking = jnp.maximum(-path.vel[node, 2], 0.1)
-    landing = (node - 1) * path.resolution + path.pos[node, 2] / sinking
+    landing = (node - 1).astype(sinking.dtype) * path.resolution + path.pos[node, 2] / sinking
     return HitContext(case=case, path=path, landing_time=lax.stop_gradient(landing))
 
 

@@ -18,7 +18,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.core.checks import require_beginning, require_kind
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Round
-from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.quadrotor import net_thrust, tangent_basis
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.context import HitContext
@@ -72,7 +72,7 @@ class ReplanHit(OptimisedPlanner):
         has leaves (3,) or (B, 3). The `drag` K_D [1/m], () or (B,), is by default the drag of the
         cases, and the quadrotor's `head_state`, (4, 3) or (B, 4, 3), the state in the plan.
         """
-        elapsed = moment_of(cases, elapsed)
+        elapsed = check_elapsed(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
         head_state = resolve_argument("head_state", head_state, own, elapsed)
         drag = resolve_argument("drag", drag, cases.drag, elapsed)

@@ -19,7 +19,7 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.plane.target import PlanePath
-from planner_jax.planning.replan import Replanning, moment_of, resolve_argument
+from planner_jax.planning.replan import Replanning, check_elapsed, resolve_argument
 from planner_jax.robot.car import pose_at
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -80,7 +80,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             speed: () or (B,) [m/s]; by default the plan's; clipped to the car's limits.
             curvature: () or (B,) [1/m]; by default the plan's; clipped to the car's limits.
         """
-        elapsed, batch = moment_of(cases, elapsed), cases.batch_shape
+        elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         require_path("target", target, batch, 2)
         if movers is not None:
             require_kind("movers", movers, Obstacles)

@@ -26,7 +26,7 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import pieces_of, unpack_rows
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner
-from planner_jax.core.protocol import Attempt, Status, first_solved
+from planner_jax.core.protocol import Attempt, Status, select_first_solved
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import clearances, num_of_pole
@@ -118,11 +118,11 @@ class AdaptBlock(Planner):
         def refine_one(k: Array) -> BlockPlan:
             return online.refine(case, flight, candidates.points[k], attempt.solver)
 
-        best = first_solved(check_one, tries, make_empty_plan(case, online.pieces))
+        best = select_first_solved(check_one, tries, make_empty_plan(case, online.pieces))
         if attempt.refined:
             there = jnp.sum(jnp.isfinite(candidates.penalty))
             most = jnp.where(is_possible, jnp.minimum(there, attempt.refined), 0)
-            best = first_solved(refine_one, most, best)
+            best = select_first_solved(refine_one, most, best)
         status = explain_status(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
         return dataclasses.replace(best, status=status)
 
