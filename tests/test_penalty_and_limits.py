@@ -7,11 +7,7 @@ import pytest
 from derivatives import assert_gradient_matches_differences
 
 from planner_jax.baselines.catch.paper import steep_hinge
-from planner_jax.cost.penalty import (
-    join_trapezoid_weights,
-    smooth_hinge,
-    trapezoid_weights,
-)
+from planner_jax.cost.penalty import join_trapezoid_weights, smooth_hinge, trapezoid_weights
 from planner_jax.cost.quadrotor import (
     acceleration_excess,
     body_rate_excess,

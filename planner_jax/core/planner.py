@@ -138,7 +138,7 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
-        """Return the remainders of cases some time into their plans; see `pj.replan`.
+        """Return cases as they remain some time into their plans; see `pj.replan`.
 
         A re-planner takes the cases, the previous plans, the time since those started, and changed
         quantities by name.

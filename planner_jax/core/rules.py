@@ -37,8 +37,7 @@ FINITE = Rule("finite", lambda value, part: abs(value) < np.inf)
 POSITIVE = Rule("> 0", lambda value, part: value > 0.0)
 NOT_NEGATIVE = Rule(">= 0", lambda value, part: value >= 0.0)
 NOT_ZERO = Rule(  # for a vector
-    "other than zero",
-    lambda value, part: (value != 0.0) | (value != 0.0).any(-1, keepdims=True),
+    "other than zero", lambda value, part: (value != 0.0) | (value != 0.0).any(-1, keepdims=True)
 )
 POSITIVE_OR_NONE = Rule(
     "> 0", lambda value, part: value > 0.0, infinite=True

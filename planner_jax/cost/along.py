@@ -35,6 +35,7 @@ Rate = Callable[[Motion, PyTree], Array]
 class Along:
     """The integrand and the quadrature of penalties: constants of a planner.
 
+    h is the mean duration of a segment's pieces.
     A segment's penalty is the integral, by the trapezoid rule, of the weighted smoothed hinges of
     excess + margin, plus the integral of the rate if there is one.
     """

@@ -122,10 +122,7 @@ class SpeedZone:
     The limit is speed / (u^2 (3 - 2 u)), where u falls from one to zero: continuous with its slope.
     """
 
-    rules: ClassVar[Table] = (
-        Field("radius", None, POSITIVE),
-        Field("speed", None, POSITIVE),
-    )
+    rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("speed", None, POSITIVE))
 
     centre: Numbers  # (3,) [m]
     radius: Numbers  # () [m], > 0
@@ -141,10 +138,7 @@ class SpeedZone:
 class Dislike:
     """A sphere with a cost, which the quadrotor avoids if it can."""
 
-    rules: ClassVar[Table] = (
-        Field("radius", None, POSITIVE),
-        Field("weight", None, NOT_NEGATIVE),
-    )
+    rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("weight", None, NOT_NEGATIVE))
 
     centre: Numbers  # (3,) [m]
     radius: Numbers  # () [m], > 0

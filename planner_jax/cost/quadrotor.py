@@ -19,11 +19,7 @@ from jaxtyping import PyTree
 from planner_jax.core.arithmetic import Components, components, reciprocal
 from planner_jax.cost.along import Along, greatest_along
 from planner_jax.cost.extras import Extra, extra_excess, extra_rate, greatest_extras, num_limits
-from planner_jax.robot.quadrotor import (
-    QuadrotorLimits,
-    body_rate_squared,
-    rotor_thrusts,
-)
+from planner_jax.robot.quadrotor import QuadrotorLimits, body_rate_squared, rotor_thrusts
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco
 

@@ -15,11 +15,7 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.cost.along import BETWEEN_NODES, Along
-from planner_jax.cost.along_curvature import (
-    block_and_diagonal,
-    columns_columns,
-    curvature_along,
-)
+from planner_jax.cost.along_curvature import block_and_diagonal, columns_columns, curvature_along
 from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy

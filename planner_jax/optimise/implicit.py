@@ -15,7 +15,6 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.checks import require_kind
-from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.planner import Planner, require_fit
 from planner_jax.core.protocol import mark_bad_input, status_of
@@ -95,7 +94,6 @@ def optimal_plan(
     case: PyTree,
     *,
     solver: LbfgsConfig | None = None,
-    newton_steps: int = 100,
 ) -> PyTree:
     """Return the plan at the optimum of the first guess's basin, differentiable by the case.
 
@@ -109,7 +107,6 @@ def optimal_plan(
             derivatives.
         case: one case; derivatives are by its leaves.
         solver: settings of the search before the refinement; 200 iterations by default.
-        newton_steps: greatest number of iterations of the refinement.
 
     Returns:
         The planner's plan. If its status is not CONVERGED, the point is not stationary or breaks a
@@ -117,10 +114,9 @@ def optimal_plan(
 
     Raises:
         TypeError: the planner does not minimise, or the case is of another task.
-        ValueError: the case is a batch, or `newton_steps` < 0.
+        ValueError: the case is a batch.
     """
     require_fit(planner, case)
-    require_size("newton_steps", newton_steps, 0)
     if solver is not None:
         require_kind("solver", solver, LbfgsConfig)
     if case.batch_shape != ():
@@ -142,9 +138,7 @@ def optimal_plan(
 
         found = minimise(objective, start, solver)
         tolerance = stationarity * jnp.abs(found.evaluation.cost)
-        point, slope = newton_refine(
-            objective, found.point, max_steps=newton_steps, stationarity=tolerance
-        )
+        point, slope = newton_refine(objective, found.point, max_steps=100, stationarity=tolerance)
         return point, slope / tolerance
 
     def tangent_solve(hessian_product: Callable[[Array], Array], rhs: Array) -> Array:

@@ -136,9 +136,7 @@ def step(
     move = jnp.matmul(chosen, steps, precision=_HIGHEST)
     point = state.point + jnp.where(going, move, 0.0)
     return NewtonState(
-        point=point,
-        best_point=jnp.where(is_best, point, state.best_point),
-        numbers=numbers,
+        point=point, best_point=jnp.where(is_best, point, state.best_point), numbers=numbers
     )
 
 

@@ -81,9 +81,7 @@ class Watch:
     """
 
     def __init__(
-        self,
-        time_limit: float | None = None,
-        progress: Callable[[Progress], object] | None = None,
+        self, time_limit: float | None = None, progress: Callable[[Progress], object] | None = None
     ) -> None:
         if time_limit is not None:
             if isinstance(time_limit, str | bool) or np.ndim(time_limit) != 0:
