@@ -89,7 +89,7 @@ def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
     """Return the integral () of the squared `order`-th derivative, in closed form."""
     coeffs, durations = trajectory.coeffs, trajectory.durations
     form, exponents = energy_form(coeffs.shape[1] - 1, order)
-    powers = lax.pow(jnp.asarray(durations)[:, None, None], jnp.asarray(exponents)[None])
+    powers = durations[:, None, None] ** jnp.asarray(exponents, durations.dtype)
     gram = jnp.asarray(form, coeffs.dtype) * powers
     return jnp.einsum("mki,mkl,mli->", coeffs, gram, coeffs, precision=lax.Precision.HIGHEST)
 

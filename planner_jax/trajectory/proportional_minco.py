@@ -302,7 +302,7 @@ def proportional_trajectory(
         jnp.concatenate([rows, offsets]),
         precision=lax.Precision.HIGHEST,
     )
-    powers = lax.pow(piece_duration, jnp.arange(2 * maps.order))
+    powers = piece_duration ** jnp.arange(2 * maps.order, dtype=jnp.result_type(piece_duration))
     return PiecewisePolynomial(
         coeffs=unit / powers[None, :, None],
         durations=piece_duration * jnp.asarray(maps.proportions, rows.dtype),
