@@ -194,6 +194,6 @@ def test_a_distance_field_interpolates_distances_and_returns_its_own_derivatives
 def test_the_last_layer_is_at_the_horizon_and_a_cell_at_the_start():
     start, time, speed = jnp.array([0.8, 4.0, 0.3]), jnp.array(4.37), jnp.array(1.5)
     grid = reach.grid_of(LATTICE, start, time, speed, jnp.zeros(2), jnp.full(2, 8.0))
-    np.testing.assert_allclose((grid.num + 0.5) * grid.step, 4.37, rtol=1e-6)
+    np.testing.assert_allclose((float(grid.num) + 0.5) * grid.step, 4.37, rtol=1e-6)
     offset = (np.array([0.8, 4.0]) - grid.corner) / grid.cell
     np.testing.assert_allclose(offset, np.round(offset), atol=1e-4)

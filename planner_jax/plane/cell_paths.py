@@ -40,17 +40,18 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
     return PathNoise(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
 
 
-def _velocity(level: Array, heading: Array, lattice: Lattice) -> Array:
+def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
     """Return velocities (..., 2) at levels and bins (...), in levels, along bin 0 and across it."""
-    angle = (2.0 * np.pi / lattice.headings) * heading
-    return level[..., None] * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
+    dtype = grid.cell.dtype
+    angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
+    return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
-def _roughness(path: CellPath, lattice: Lattice, num: Array) -> Array:
+def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
     """Return the sum of squared changes of velocity over two layers each, in levels."""
-    velocity = _velocity(path.level, path.bin, lattice)
+    velocity = _velocity(path.level, path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
-    return jnp.sum(jnp.where(jnp.arange(2, lattice.layers) < num, change, 0.0))
+    return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))
 
 
 def draw_path(
@@ -74,7 +75,7 @@ def draw_path(
         directness: cost of the squared difference, in levels, between a velocity and the mean
             velocity from the start to that cell. A greater value makes paths straight and even.
     """
-    lattice = grid.lattice
+    lattice, dtype = grid.lattice, grid.cell.dtype
     choices = np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij")
     choices = jnp.asarray(np.stack(choices, axis=-1).reshape(-1, 2), jnp.int32)
 
@@ -95,13 +96,14 @@ def draw_path(
             bits = reach.bits[n]
             is_step = jax.vmap(lambda v, h: bit_at(bits, v, h, before))(from_level, heading - turn)
             is_step &= reach.turns[n, level, turn + SPAN]
-            rough = _TURNING * (jnp.abs(turn) + jnp.abs(turn - last))
-            rough += _UNEVEN * jnp.abs(choices[:, 0])
-            rate = (before - grid.start) / (n + 0.5)
+            turning, uneven = jnp.abs(turn) + jnp.abs(turn - last), jnp.abs(choices[:, 0])
+            rough = _TURNING * turning.astype(dtype)
+            rough += _UNEVEN * uneven.astype(dtype)
+            rate = (before - grid.start).astype(dtype) / (n.astype(dtype) + 0.5)
             mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
-            velocity = _velocity(from_level, heading - turn, lattice)
+            velocity = _velocity(from_level, heading - turn, grid)
             rough += directness * jnp.sum((velocity - mean) ** 2, axis=-1)
-            chosen = jnp.argmax(jnp.where(is_step, steps[n] - rough, -jnp.inf))
+            chosen = jnp.argmax(jnp.where(is_step, steps[n].astype(dtype) - rough, -jnp.inf))
             after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
             new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)
             return new, (level, heading, cell)
@@ -112,5 +114,5 @@ def draw_path(
         return CellPath(level=levels, bin=bins, cell=passed)
 
     paths = jax.vmap(draw)(noise.ends, noise.steps)
-    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, lattice, num))(paths))
+    best = jnp.argmin(jax.vmap(lambda path: _roughness(path, grid, num))(paths))
     return jax.tree.map(lambda leaf: leaf[best], paths)

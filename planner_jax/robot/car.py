@@ -90,7 +90,9 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     """
     num = speed.shape[0] - 1
     step = end / num
-    length = jnp.clip(time - step * jnp.arange(num), 0.0, step)  # time driven in each piece
+    length = jnp.clip(
+        time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step
+    )  # time driven in each piece
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step
     v, c = speed[:-1], curvature[:-1]
@@ -113,7 +115,7 @@ def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[A
     num = speed.shape[0] - 1
     position = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(position.astype(jnp.int32), 0, num - 1)
-    share = position - k
+    share = position - k.astype(position.dtype)
     v = (1.0 - share) * speed[k] + share * speed[k + 1]
     c = (1.0 - share) * curvature[k] + share * curvature[k + 1]
     return v, c, (speed[k + 1] - speed[k]) * num / end

@@ -97,7 +97,7 @@ def joint_terms(
     def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
         """Return the residuals of shares above `most`, and their derivatives."""
         over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
-        sign = weights.limits * jnp.sign(share) * (over > 0.0)
+        sign = weights.limits * jnp.sign(share) * (over > 0.0).astype(over.dtype)
         return row(over, by_steps, by_time, sign)
 
     of_rate = jnp.eye(pieces, dtype=dtype) / (duration * case.limits.velocity[:, None, None])
@@ -161,7 +161,8 @@ def speed_up(
     pace = jnp.maximum(jnp.max(jnp.abs(rates)), jnp.sqrt(jnp.max(jnp.abs(rises))))
     pace = jnp.clip(pace, 1e-3, 1.0)
     return PiecewisePolynomial(
-        coeffs=motion.coeffs / (pace ** jnp.arange(3))[:, None], durations=pace * motion.durations
+        coeffs=motion.coeffs / (pace ** jnp.arange(3, dtype=pace.dtype))[:, None],
+        durations=pace * motion.durations,
     ), pace
 
 

@@ -119,15 +119,16 @@ class MotionProblem:
         """Return a guess that follows a path of cells up to a layer () int32."""
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
-        steps = layer + 0.5
-        at = jnp.arange(1, self.pieces + 1) * (steps / self.pieces)  # in steps
+        steps = layer.astype(pace.dtype) + 0.5
+        at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)  # in steps
 
         def interpolate(values: Array, first: Array, at: Array) -> Array:
             """Interpolate values on the path: `first` at time 0, then one value at every step."""
-            at = jnp.clip(at - 1.0, -1.0, layer - 1.0)
+            at = jnp.clip(at - 1.0, -1.0, layer.astype(at.dtype) - 1.0)
             below = jnp.floor(at).astype(jnp.int32)
             share, is_first = (
-                each.reshape(-1, *[1] * (values.ndim - 1)) for each in (at - below, below < 0)
+                each.reshape(-1, *[1] * (values.ndim - 1))
+                for each in (at - below.astype(at.dtype), below < 0)
             )
             low = jnp.where(is_first, first, values[jnp.maximum(below, 0)])
             return (1.0 - share) * low + share * values[jnp.minimum(below + 1, layer - 1)]

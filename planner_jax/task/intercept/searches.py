@@ -167,10 +167,10 @@ def _meeting_cells(
     case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
 ) -> tuple[Array, Array]:
     """Return the cells of a layer at which the target is met; see `reach.goal_cells`."""
-    goal = case.target.at((layer + 0.5) * grid.step).pos
+    goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
     width = 2.0 * np.pi / num
-    angle = grid.heading + width * jnp.arange(num)
+    angle = grid.heading + width * jnp.arange(num, dtype=grid.heading.dtype)
     headings = jnp.abs(wrap(angle - case.end_heading)) <= case.heading_tolerance + width
     return reach.goal_cells(grid, found.bits[layer], goal, case.body.middle, headings)
 
