@@ -53,7 +53,7 @@ def assert_rejected(path, rule, kind=HitPlan):
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
 
 
-def test_what_is_read_is_what_was_written_bit_for_bit(plans, path):
+def test_plans_are_read_as_written_bit_for_bit(plans, path):
     again = HitPlan.load(str(path))
     assert jax.tree.structure(again) == jax.tree.structure(plans)
     for ours, theirs in zip(jax.tree.leaves(again), jax.tree.leaves(plans), strict=True):
@@ -61,11 +61,11 @@ def test_what_is_read_is_what_was_written_bit_for_bit(plans, path):
         np.testing.assert_array_equal(ours, theirs)
 
 
-def test_the_file_has_the_name_that_was_asked_for_and_nothing_is_left_beside_it(path):
+def test_the_file_has_the_requested_name_and_no_other_file_remains(path):
     assert [file.name for file in path.parent.iterdir()] == ["three"]
 
 
-def test_numpy_alone_reads_the_arrays_by_the_names_of_their_places(plans, path):
+def test_numpy_reads_the_arrays_by_dotted_names(plans, path):
     with np.load(path, allow_pickle=False) as file:
         assert {"cost", "status", "trajectory.coeffs", "stroke.ball_vel_after"} < set(file)
         np.testing.assert_array_equal(file["stroke.normal"], plans.stroke.normal)
@@ -79,7 +79,7 @@ def test_jax_arrays_and_single_plans_are_written_too(plans, tmp_path):
     assert again.cost.shape == () and again.status == 1
 
 
-def test_a_write_that_fails_leaves_the_old_file_as_it_was(plans, path):
+def test_a_failed_write_leaves_the_old_file_unchanged(plans, path):
     before = path.read_bytes()
     with pytest.raises(OSError):
         plans.save(path.parent / "no folder" / "plans")

@@ -55,7 +55,7 @@ NESTED = {
 
 
 @pytest.mark.parametrize("nest", NESTED.values(), ids=NESTED)
-def test_a_product_of_less_precision_is_found_wherever_it_hides(nest):
+def test_a_product_of_less_precision_is_found_in_any_nesting(nest):
     assert assert_full_precision(nest(full), MATRIX, MATRIX) > 0
     for precision in (None, lax.Precision.DEFAULT, lax.Precision.HIGH):
         less = lambda a, b, p=precision: jnp.matmul(a, b, precision=p)  # noqa: E731
@@ -63,7 +63,7 @@ def test_a_product_of_less_precision_is_found_wherever_it_hides(nest):
             assert_full_precision(nest(less), MATRIX, MATRIX)
 
 
-def test_the_equal_duration_maps_and_their_gradients_ask_for_full_precision():
+def test_the_equal_duration_maps_and_their_gradients_request_full_precision():
     given = ROWS, ROWS[:3], np.float32(0.4)
     assert assert_full_precision(proportional_values, *given) > 0
     assert assert_full_precision(jax.grad(proportional_values, argnums=(0, 1, 2)), *given) > 0

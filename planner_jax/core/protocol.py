@@ -52,7 +52,7 @@ _MESSAGES = {
     Status.INFEASIBLE: "stationary with a limit exceeded; try more starts, or relax the limit",
     Status.MAX_STEPS: "out of iterations with a limit exceeded; allow more iterations or starts",
     Status.NON_FINITE: "the cost of the plan is not finite; bring the case's numbers nearer to one",
-    Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` says by how much",
+    Status.OUT_OF_REACH: "a target never comes within reach; `closest_approach` has the distance",
     Status.NO_PATH: "no path through the obstacles was found in time; allow more time",
     Status.BLOCKED: "the start or the goal lies in an obstacle or off the map; move it",
     Status.BAD_INPUT: "a number of the case breaks its rule; `pj.require_sound(cases)` names it",
