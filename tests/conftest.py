@@ -51,11 +51,11 @@ def float64():
 
 @pytest.fixture(scope="module", autouse=True)
 def strict_types(request):
-    """Raise where JAX would convert a type implicitly, except in modules with MJX or Brax."""
-    stem = request.path.stem.removeprefix("test_")
-    is_mixed = stem.startswith("sims_") or stem in MIXED
+    """In default runs raise where JAX would convert a type, except in modules with MJX or Brax."""
+    stem, marks = request.path.stem.removeprefix("test_"), request.config.option.markexpr
+    is_strict = "not slow" in marks and not stem.startswith("sims_") and stem not in MIXED
     usual = jax.config.jax_numpy_dtype_promotion
-    jax.config.update("jax_numpy_dtype_promotion", usual if is_mixed else "strict")
+    jax.config.update("jax_numpy_dtype_promotion", "strict" if is_strict else usual)
     yield
     jax.config.update("jax_numpy_dtype_promotion", usual)
 
@@ -80,8 +80,12 @@ SLOW = (
     "cluster",
     *("bench", "benchmark_ipopt", "intercept_oracle"),
 )
-# Modules beside `test_sims_*` with MJX, Brax or optax, which convert types implicitly.
-MIXED = ("policy", "training", "stack", "speed", "bench")
+# Modules beside `test_sims_*` that convert types implicitly, mostly in MJX, Brax or optax.
+MIXED = (
+    *("policy", "training", "stack", "speed", "bench", "live_loop", "perception", "robot_files"),
+    *("sweep", "sweep_catch", "sweep_intercept", "cli", "snippets", "notebooks", "export_command"),
+    *("plane_prediction", "intercept_gradient", "referee_block", "referee_intercept"),
+)
 # Modules that take longest, or compile programs that others find in the cache: test_exact the hit
 # planner's, test_decide the catch planner's. Workers get whole modules in this order, so that none
 # ends with a long module, and no two compile the same program.

@@ -23,6 +23,7 @@ from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_weights
 from planner_jax.task.block.scene import entry_time, paper_scene
 from planner_jax.trajectory.polynomial import evaluate
+from tests.derivatives import double
 
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
@@ -140,7 +141,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     moved["beam_ends"] = scene.beam_ends + rng.uniform(-0.3, 0.3, (num, 1, 1, 3))
     angles = rng.uniform(arm.lower, arm.upper, (num, 6))
     case = pj.block.case(np.full((num, 3), 9.0), np.ones(3), angles=angles)
-    case = dataclasses.replace(case, scene=dataclasses.replace(case.scene, **moved))
+    case = double(dataclasses.replace(case, scene=dataclasses.replace(case.scene, **moved)))
     each = jax.jit(jax.vmap(lambda case: clearances(case.arm, case.scene, case.angles[None])[:, 0]))
     least = each(case).min(axis=1)
     leaves = {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(case).items()}

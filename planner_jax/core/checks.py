@@ -195,4 +195,6 @@ def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> t
         at = jax.vmap(at)
     kinds = [(shape, jax.dtypes.canonicalize_dtype(dtype)) for shape, dtype in layout]
     path = jax.tree.unflatten(tree, [jax.ShapeDtypeStruct(*each) for each in kinds])
-    return jax.eval_shape(at, path, jax.ShapeDtypeStruct(axes, np.float32)).shape
+    floating = (dtype for _, dtype in kinds if jnp.issubdtype(dtype, np.floating))
+    time = jax.ShapeDtypeStruct(axes, next(floating, np.float32))
+    return jax.eval_shape(at, path, time).shape

@@ -174,7 +174,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
     at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
 
     def draw_one(stencil: Array, at: Array) -> Array:
-        y = jnp.arange(cells) - at[1]
+        y = jnp.arange(cells, dtype=at.dtype) - at[1]
         row = jnp.where(
             (y >= 0) & (y < _STENCIL), stencil[jnp.clip(y, 0, _STENCIL - 1)], jnp.uint32(0)
         )
@@ -302,7 +302,7 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
-    indices = jnp.arange(lattice.cells)
+    indices = jnp.arange(lattice.cells, dtype=cell.dtype)
     at = (indices[:, None] == cell[1]) & (indices == cell[0])
     bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]
     return jnp.where(bits, _pack(at)[:, None, None], jnp.uint32(0))
@@ -355,8 +355,8 @@ def goal_cells(
     angle = grid.heading + width * bins.astype(grid.cell.dtype)
     axle = goal - ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     nearest = jnp.round((axle - grid.corner) / grid.cell).astype(jnp.int32)
-    around = np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), axis=-1).reshape(-1, 2)
-    cells = nearest[:, None] + around
+    around = jnp.asarray(np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), axis=-1).reshape(-1, 2))
+    cells = nearest[:, None].astype(around.dtype) + around
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))
     is_reached = of_all(layer, jnp.arange(lattice.levels), bins, cells)

@@ -155,11 +155,12 @@ def search_reach(
     coarse = field.values[::by, ::by]
     found = reach.reach_set(grid, coarse, case.movers, vehicle, case.speed, needed)
     numbers = jnp.arange(search.lattice.layers + 1)
+    num = grid.num.astype(numbers.dtype)
     is_met = jax.vmap(lambda n: jnp.any(_meeting_cells(case, grid, found, n)[1]))
     if is_time_free:
-        reached = is_met(numbers) & (numbers >= 1) & (numbers <= grid.num)
+        reached = is_met(numbers) & (numbers >= 1) & (numbers <= num)
     else:
-        reached = is_met(grid.num[None])[0] & (numbers == grid.num)
+        reached = is_met(grid.num[None])[0] & (numbers == num)
     return Reachability(grid=grid, field=field, reach=found, layers=reached)
 
 
