@@ -129,7 +129,7 @@ def test_the_jacobian_is_that_of_the_moving_shield(model):
 
 @pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
 def simulated(request):
-    """MuJoCo, a model in it, the arm, and angles, velocities and accelerations (9, 6)."""
+    """Return MuJoCo, its model, the arm, and angles, velocities and accelerations (9, 6)."""
     mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
     arm, rng = read_arm(request.param, dtype=np.float64), np.random.default_rng(1)
     motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)

@@ -135,7 +135,7 @@ def test_fields_of_a_task_are_left_out_and_files_of_something_else_are_refused(t
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A working folder with a run, a saved batch and a saved plan."""
+    """Make a working folder with runs, a saved batch and a saved plan."""
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "run")
     write_run(tmp_path / "arms", "block")

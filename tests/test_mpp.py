@@ -21,7 +21,7 @@ MPP = MppCatch()
 
 @pytest.fixture(scope="module")
 def throws():
-    """Throws of two suites, half of them hard, with two absent targets each, and their plans."""
+    """Draw throws of two suites, half of them hard, with two absent targets each; plan them."""
     suites = [draw(NUM // 2, name, 4, num_targets=3) for name in ("throws", "hard")]
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
     return cases, plan(MPP, cases)
@@ -29,7 +29,7 @@ def throws():
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Two throws and an absent target each, the first two in reversed order, and their plans."""
+    """Draw two throws and an absent target each, two cases in reversed order; plan them."""
     cases = draw(NUM, "parabola2", 4, num_targets=3)
     order = np.tile([0, 1, 2], (NUM, 1))
     order[:2] = [1, 0, 2]
