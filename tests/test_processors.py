@@ -1,7 +1,6 @@
 """Cores, threads and kind of the processor; rows do not depend on the number of cores."""
 
 import os
-import subprocess
 import sys
 
 import pytest
@@ -10,6 +9,7 @@ from planner_jax import __main__ as process
 from planner_jax.cli import main as cli
 from planner_jax.host import machine
 from planner_jax.host import signals as stopping
+from tests.faults.commands import start, wait_for
 from tests.sweeps import rows_of
 
 
@@ -79,17 +79,14 @@ def test_the_command_sweep_computes_with_one_thread_on_a_cpu(
 @pytest.mark.slow
 @pytest.mark.skipif(machine.usable_cores() < 2, reason="needs two cores")
 @pytest.mark.parametrize("task", ["hit", "catch"])
-def test_rows_do_not_depend_on_the_number_of_cores(tmp_path, task):
+def test_rows_do_not_depend_on_the_number_of_cores(tmp_path, monkeypatch, task):
+    for name in ("NPROC", "PJRT_NPROC"):
+        monkeypatch.delenv(name, raising=False)
     rows = []
-    for cores in (sorted(os.sched_getaffinity(0))[:1], os.sched_getaffinity(0)):
-        out = tmp_path / str(len(rows))
-        command = [sys.executable, "-m", "planner_jax", "sweep", task, "--num", "60"]
-        subprocess.run(
-            [*command, "--batch", "20", "--out", out],
-            check=True,
-            capture_output=True,
-            env={name: value for name, value in os.environ.items() if "NPROC" not in name},
-            preexec_fn=lambda cores=cores: os.sched_setaffinity(0, cores),
-        )
+    for cores in (1, None):
+        out = tmp_path / str(cores)
+        command = ("sweep", task, "--num", "60", "--batch", "20", "--out", out)
+        ended = wait_for(start(*command, cwd=tmp_path, cores=cores))
+        assert ended.code == 0, ended.err
         rows.append(rows_of(out))
     assert rows[0] == rows[1]
