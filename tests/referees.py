@@ -25,6 +25,27 @@ def flight(leaves, **optional):
     return case
 
 
+def edit(leaves, edits):
+    """Replace leaves, or their entry (0, *index) of a key (name, *index), and return all leaves.
+
+    A replacement is a value, or a function of the leaf or entry.
+    """
+    for key, change in edits.items():
+        name, *index = [key] if isinstance(key, str) else key
+        leaf, entry = leaves[name], (0, *index) if index else ...
+        leaf[entry] = change(leaf[entry]) if callable(change) else change
+    return leaves
+
+
+def add(value):
+    return lambda leaf: leaf + value
+
+
+def failure(leaves, excess=None, time=None, *accepted, **found):
+    """Return a row of FAILURES: leaves, expected failure, and options that accept the plan."""
+    return leaves, {"excess": excess, "time": time, **found}, accepted
+
+
 def stack(*lanes):
     return {name: np.concatenate([lane[name] for lane in lanes]) for name in lanes[0]}
 

@@ -55,10 +55,7 @@ OTHER = [0] * 40 + [2] * 9 + [0] * 3 + [1] * 8
 
 @pytest.fixture
 def pair(tmp_path):
-    return (
-        write_run(tmp_path / "one", ONE),
-        write_run(tmp_path / "other", OTHER, planner="bat"),
-    )
+    return (write_run(tmp_path / "one", ONE), write_run(tmp_path / "other", OTHER, planner="bat"))
 
 
 def test_of_the_same_cases_only_those_count_that_one_run_alone_solves(pair):

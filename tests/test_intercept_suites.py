@@ -80,10 +80,7 @@ def test_shapes_follow_the_suite_and_starts_the_paper(batches, name):
 @each_suite
 def test_numbers_of_obstacles_are_in_their_ranges_and_all_occur(batches, name):
     cases, suite = batches[name].cases, SUITES[name]
-    for group, (fewest, most) in (
-        (cases.movers, suite.num_movers),
-        (cases.walls, suite.num_walls),
-    ):
+    for group, (fewest, most) in ((cases.movers, suite.num_movers), (cases.walls, suite.num_walls)):
         if not (suite.is_maze and group is cases.walls):
             assert set(group.present.sum(axis=1)) == set(range(fewest, most + 1))
         for leaf in (group.centre, group.corners, group.velocity):

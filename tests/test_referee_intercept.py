@@ -8,22 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from flax import struct
-from referees import checks, tree
+from referees import add, checks, edit, failure, tree
 from scipy.integrate import solve_ivp
 
 from planner_jax.plane.target import LaterPath, PointState, PolynomialPath, TurningPath
 from planner_jax.referee.clearance import clearances
-from planner_jax.referee.intercept import (
-    InterceptVerdict,
-    referee_intercepts,
-    target_positions_of,
-)
+from planner_jax.referee.intercept import InterceptVerdict, referee_intercepts, target_positions_of
 from planner_jax.task.intercept.api import position_setting
 
 LENGTH, WIDTH, WHEELBASE, REAR = 0.4, 0.25, 0.3, 0.05
 MIDDLE, FRONT = 0.5 * LENGTH - REAR, LENGTH - REAR  # ahead of the rear axle
 START = (0.8, 4.0, 0.0)
 TIME, SPEED, KNOTS = 5.0, 0.8, 11
+H = TIME / (KNOTS - 1)  # duration of a piece
 
 
 def square(x, y, half, sense=1):
@@ -148,15 +145,14 @@ def test_the_end_of_any_plan_is_where_integration_puts_it(seed):
 
 def test_acceleration_is_that_of_the_steepest_piece_and_the_root_mean_square_of_all():
     speed = SPEED + 0.1 * np.array([0, 1, 3, 3, 2, 0, 0, 0, 0, 0, 0])
-    h = TIME / (KNOTS - 1)
-    end = np.array(START[:2]) + [h * (speed.sum() - SPEED) + MIDDLE, 0.0]
+    end = np.array(START[:2]) + [H * (speed.sum() - SPEED) + MIDDLE, 0.0]
     verdict = assert_good(good(speed, end=end))
-    rise = np.diff(speed) / h
+    rise = np.diff(speed) / H
     assert verdict.max_acceleration[0] == pytest.approx(0.4)
     assert verdict.rms_acceleration[0] == pytest.approx(math.sqrt(np.mean(rise**2)))
     leaves = good(speed, end=end)
     leaves["limits.acceleration"][:] = 0.32
-    assert_fails(leaves, "acceleration", excess=0.25, time=h)
+    assert_fails(leaves, "acceleration", excess=0.25, time=H)
 
 
 def test_lateral_acceleration_peaks_inside_of_a_piece():
@@ -170,8 +166,7 @@ def test_lateral_acceleration_peaks_inside_of_a_piece():
     peak = 4.0 / 27.0 * 1.5**2 * 2.0
     assert verdict.max_lateral_acceleration[0] == pytest.approx(peak)
     leaves["limits.lateral_acceleration"][:] = 0.5 * peak
-    h = TIME / (KNOTS - 1)
-    assert_fails(leaves, "lateral acceleration", excess=1.0, time=(3.0 + 1.0 / 3.0) * h)
+    assert_fails(leaves, "lateral acceleration", excess=1.0, time=(3.0 + 1.0 / 3.0) * H)
 
 
 @pytest.mark.parametrize(
@@ -180,15 +175,14 @@ def test_lateral_acceleration_peaks_inside_of_a_piece():
 )
 def test_steering_is_fastest_where_the_curvature_is_least(first, second, least, place):
     """Check the rate of delta = atan(L kappa), L kappa' / (1 + (L kappa)^2)."""
-    h = TIME / (KNOTS - 1)
     curvature = np.array([first] * 3 + [second] * (KNOTS - 3))
     leaves = good(SPEED, curvature)
     for name in ("limits.lateral_acceleration", "tolerance"):
         leaves[name][:] = np.inf
-    rate = WHEELBASE * abs(second - first) / h / (1.0 + (WHEELBASE * least) ** 2)
+    rate = WHEELBASE * abs(second - first) / H / (1.0 + (WHEELBASE * least) ** 2)
     assert assert_good(leaves).max_steering_rate[0] == pytest.approx(rate)
     leaves["limits.steering_rate"][:] = 0.8 * rate
-    assert_fails(leaves, "steering rate", excess=0.25, time=(2.0 + place) * h)
+    assert_fails(leaves, "steering rate", excess=0.25, time=(2.0 + place) * H)
 
 
 def test_a_car_that_stops_late_is_inside_the_wall():
@@ -286,46 +280,27 @@ def test_polygons_may_have_either_orientation_and_repeated_corners():
     assert assert_good(plain).wall_clearance[0] == pytest.approx(0.2 - 0.5 * WIDTH)
 
 
-def failures():
-    """Return rows of a limit, leaves that exceed it, the excess and the time."""
-    h = TIME / (KNOTS - 1)
-    fast, bent, turned = good(), good(SPEED, 0.5), good()
-    fast["limits.speed"][:] = 0.64
-    backwards = good(np.array([SPEED] * 6 + [-0.15] + [SPEED] * 4))
-    backwards["limits.acceleration"][:] = np.inf
-    bent["limits.curvature"][:], bent["plan.curvature"][0, 4] = 0.5, 0.6
-    late, long, early = good(), good(), good()
-    late["time"][:] = TIME - 0.5
-    early["plan.time"][:] = -1.0
-    long["plan.time"][:] = long["time"][:] = 4000.0
-    turned["plan.start"][0, 2] += 2.0 * math.pi + 0.02
-    elsewhere, slow, straight = good(), good(), good()
-    elsewhere["start"][0, :2] += [0.3, 0.4]
-    slow["speed"][:] += 0.1
-    straight["curvature"][:] += 0.2
-    off, missed = good(), good()
-    off["upper"][0, 0] = START[0] + MIDDLE + SPEED * TIME - 0.4
-    missed["target.pos"][0, 1] += 0.2
-    return [
-        ("time", late, 0.5, TIME),
-        ("time", early, 1.0, -1.0),
-        ("time", long, 400.0, 4000.0),
-        ("start", elsewhere, 0.5, 0.0),
-        ("start", turned, 0.02, 0.0),
-        ("start", slow, 0.1, 0.0),
-        ("start", straight, 0.2, 0.0),
-        ("speed", fast, 0.25, 0.0),
-        ("speed", backwards, 0.1, 6 * h),
-        ("curvature", bent, 0.2, 4 * h),
-        ("map", off, 0.4, TIME),
-        ("meeting", missed, 0.2, TIME),
-    ]
-
-
-@pytest.mark.parametrize("k", range(len(failures())), ids=[name for name, *_ in failures()])
-def test_every_failure_has_its_name_size_and_time(k):
-    name, leaves, excess, time = failures()[k]
-    assert_fails(leaves, name, excess=excess, time=time)
+BACKWARDS = [SPEED] * 6 + [-0.15] + [SPEED] * 4
+FAILURES = {
+    "time: late": failure(edit(good(), {"time": TIME - 0.5}), 0.5, TIME),
+    "time: negative": failure(edit(good(), {"plan.time": -1.0}), 1.0, -1.0),
+    "time: an hour": failure(edit(good(), {"plan.time": 4000.0, "time": 4000.0}), 400.0, 4000.0),
+    "start: position": failure(edit(good(), {("start", (0, 1)): add([0.3, 0.4])}), 0.5, 0.0),
+    "start: heading": failure(
+        edit(good(), {("plan.start", 2): add(2.0 * math.pi + 0.02)}), 0.02, 0.0
+    ),
+    "start: speed": failure(edit(good(), {"speed": add(0.1)}), 0.1, 0.0),
+    "start: curvature": failure(edit(good(), {"curvature": add(0.2)}), 0.2, 0.0),
+    "speed: too fast": failure(edit(good(), {"limits.speed": 0.64}), 0.25, 0.0),
+    "speed: backwards": failure(edit(good(BACKWARDS), {"limits.acceleration": np.inf}), 0.1, 6 * H),
+    "curvature: at a knot": failure(
+        edit(good(SPEED, 0.5), {"limits.curvature": 0.5, ("plan.curvature", 4): 0.6}), 0.2, 4 * H
+    ),
+    "map: beyond its edge": failure(
+        edit(good(), {("upper", 0): START[0] + MIDDLE + SPEED * TIME - 0.4}), 0.4, TIME
+    ),
+    "meeting: missed": failure(edit(good(), {("target.pos", 1): add(0.2)}), 0.2, TIME),
+}
 
 
 def test_a_plan_may_end_before_the_cases_time():
@@ -388,7 +363,7 @@ def unequal_lanes():
         good(walls=[wall, square(4.0, 4.0, 0.2)]),
         good(1.3, time=3.0, movers=([square(2.0, 4.0, 0.3), mover], [(0.0, 0.0), (0.1, 0.0)])),
         good(np.linspace(0.5, 1.2, KNOTS), np.linspace(0.0, 0.4, KNOTS)),
-        failures()[0][1],
+        FAILURES["time: late"][0],
         good(),
     ]
 

@@ -94,6 +94,16 @@ def test_wrong_arguments_are_named(tests, changes, options, says):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("tests", "key"), [(module, key) for module in MODULES for key in module.FAILURES]
+)
+def test_every_failure_has_its_limit_size_and_time(tests, key):
+    leaves, found, accepted = tests.FAILURES[key]
+    tests.assert_fails(leaves, key.split(":")[0], **found)
+    for options in accepted:
+        tests.assert_good(leaves, **options)
+
+
 @pytest.mark.parametrize("tests", MODULES)
 def test_every_limit_has_its_sentence(tests):
     kind = tests.judge.__annotations__["return"]

@@ -391,10 +391,7 @@ def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, ca
             lambda: BlockFly(perception=True, planner="library:some.lib"),
             "planner must be one that plans for the very ball, got 'library:some.lib'",
         ),
-        (
-            lambda: BlockFly(encoders="no"),
-            "encoders must be one of none, fine, coarse, got 'no'",
-        ),
+        (lambda: BlockFly(encoders="no"), "encoders must be one of none, fine, coarse, got 'no'"),
         (lambda: BlockFly(regime="R4"), "regime must be one of R1, R2, R3, got 'R4'"),
         (lambda: BlockFly(suite="hail"), "suite must be one of pole, open, short, got 'hail'"),
         (lambda: BlockFly(observe=-0.1), "observe must be finite and >= 0, got -0.1"),

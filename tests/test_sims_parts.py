@@ -16,14 +16,7 @@ from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import awaited, ready, require_plan, require_world
 from planner_jax.sims.loop import expected
 from planner_jax.sims.loop_state import Loop
-from planner_jax.sims.model import (
-    BALL_MASS,
-    at_rest,
-    ball_states,
-    mujoco_model,
-    placed,
-    step,
-)
+from planner_jax.sims.model import BALL_MASS, at_rest, ball_states, mujoco_model, placed, step
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
@@ -31,14 +24,7 @@ from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
-from planner_jax.sims.sensing import (
-    anchored,
-    first_estimate,
-    look,
-    observed,
-    predicted,
-    with_drag,
-)
+from planner_jax.sims.sensing import anchored, first_estimate, look, observed, predicted, with_drag
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
@@ -316,10 +302,7 @@ def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
         flights = awaited(loop, flights, coming, drag, ball=1, ahead=0.8)
         then = [
             jax.vmap(lambda known, ahead=ahead: expected(loop, known, ahead))(estimates)
-            for estimates, ahead in (
-                (flights.estimates, 0.8),
-                (flights.earlier, 0.8 + loop.period),
-            )
+            for estimates, ahead in ((flights.estimates, 0.8), (flights.earlier, 0.8 + loop.period))
         ]
         return then, flights.estimates.drag
 

@@ -184,13 +184,7 @@ def _load(place: Path, out: Path) -> str | None:
     return IDENTICAL if same else None
 
 
-_READERS = {
-    "report": _report,
-    "resume": _resume,
-    "view": _view,
-    "curves": _curves,
-    "load": _load,
-}
+_READERS = {"report": _report, "resume": _resume, "view": _view, "curves": _curves, "load": _load}
 # Kind of damage -> runs with their reader, and files.
 TARGETS = {
     "manifest": [("whole:report", "manifest.json"), ("whole:resume", "manifest.json")],

@@ -24,12 +24,7 @@ NAMES = {"localhost", "127.0.0.1"}
         ({"Host": "10.0.0.7:8080"}, "/?token=abc", "abc", True),
         ({"Host": "10.0.0.7:8080", "Cookie": "a=b; planner-jax=abc"}, "/x.js", "abc", True),
         ({"Host": "10.0.0.7:8080", "Cookie": "planner-jax=é"}, "/x.js", "abc", False),
-        (
-            {"Host": "10.0.0.7:8080", "Origin": "http://other.example"},
-            "/?token=abc",
-            "abc",
-            False,
-        ),
+        ({"Host": "10.0.0.7:8080", "Origin": "http://other.example"}, "/?token=abc", "abc", False),
     ],
 )
 def test_pages_of_the_viewer_s_own_origin_and_with_its_token_are_allowed(
