@@ -45,10 +45,11 @@ def test_yaw_and_its_rate_are_those_of_the_nose_seen_from_above():
     differences = (yaw[2:] - yaw[:-2]) * 2000.0
     assert np.abs(rate[first]).max() > 0.1
     np.testing.assert_allclose(differences[:699], rate[first], atol=0.05)
+    turning = np.array([[0.3, 0.2, -0.7]])
+    assert frames.yaw_of(np.array([[1.0, 0.0, 0.0, 0.0]]), turning) == (0.0, -0.7)
     up = np.array([[np.sqrt(0.5), 0.0, -np.sqrt(0.5), 0.0]])
     assert frames.rotate(up, np.array([1.0, 0.0, 0.0]))[0, 2] == pytest.approx(1.0)
-    yaw, rate = frames.yaw_of(np.array([[1.0, 0.0, 0.0, 0.0]]), np.array([[0.3, 0.2, -0.7]]))
-    assert (yaw, rate) == (0.0, -0.7)
+    assert frames.yaw_of(up, turning) == (0.0, 0.0)
 
 
 def test_setpoints_of_px4_are_those_of_the_plan_in_north_east_down():

@@ -25,6 +25,9 @@ def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 
 
+_VERTICAL = 1e-6  # horizontal part of a unit vector below which it has no yaw
+
+
 def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the yaw of attitudes, the direction of the body's x axis from above, and its rate.
 
@@ -33,14 +36,14 @@ def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np
         body_rate: (K, 3) [rad/s], in the body frame.
 
     Returns:
-        yaw: (K,) [rad], counter-clockwise from east; 0 if the x axis is vertical.
-        rate: (K,) [rad/s], rate of the yaw; 0 if the x axis is vertical.
+        yaw: (K,) [rad], counter-clockwise from east; 0 if the x axis is vertical within 1e-6.
+        rate: (K,) [rad/s], rate of the yaw; 0 if the x axis is vertical within 1e-6.
     """
     forward, left, up = (rotate(quat_wxyz, axis) for axis in np.eye(3))
     moved = body_rate[:, 2:] * left - body_rate[:, 1:2] * up  # derivative of `forward`
     flat = forward[:, 0] ** 2 + forward[:, 1] ** 2
     turned = forward[:, 0] * moved[:, 1] - forward[:, 1] * moved[:, 0]
-    level = flat > 0.0
+    level = flat > _VERTICAL**2
     yaw = np.arctan2(forward[:, 1], forward[:, 0])
     return np.where(level, yaw, 0.0), np.where(level, turned / np.where(level, flat, 1.0), 0.0)
 
