@@ -100,8 +100,8 @@ def test_only_cases_and_plans_of_the_task_are_judged(task):
         task.judge(strangers, plans)
     with pytest.raises(TypeError, match=r"^plans must be a \w+Plan, got a list$"):
         task.judge(cases, [])
-    with pytest.raises(ValueError, match="samples must be >= 200, got 50"):
-        task.judge(cases, plans, samples=50)
+    with pytest.raises(TypeError, match="samples must be a setting of the referee, got 400"):
+        task.judge(cases, plans, samples=400)
 
 
 # Draws.

@@ -535,8 +535,6 @@ PLANNED = ("plan.motion.coeffs", "plan.motion.durations", "plan.contact_time")
 ABSURD, HARMLESS = ("ball.pos", "angles", "arm.origin", "scene.pole", *PLANNED), "scene.pole"
 READ = {name for name, leaf in good().items() if leaf.dtype == float} - UNREAD
 WRONG = [
-    ({}, {"step": 0.0}, "step must be > 0 and <= 0.002, got 0.0"),
-    ({}, {"step": 0.003}, "step must be > 0 and <= 0.002, got 0.003"),
     ({}, {"capsule_link": (6,) * 8}, "arm.capsule_link must be in -1, ..., 5"),
     ({PLANNED[0]: np.zeros((1, 2, 6, 5))}, {}, r"coeffs must be \(B, M, D \+ 1, 6\), got"),
     *(

@@ -442,7 +442,6 @@ FAILURES = {
 FAILED = ["", "speed", "", "head state", "net", "net"]
 ABSURD = ("coeffs", "durations", "times", "targets.drag", "net.height")
 WRONG = [
-    ({}, {"samples": 50}, "samples must be >= 200, got 50"),
     ({}, {"net_test": "hoop"}, r'net_test must be "plane" or "ball", got \'hoop\''),
     ({"net.radius": np.array(0.1)}, {}, r"net.radius must be \(1,\), got \(\)"),
     ({"present": np.ones(3, bool)}, {}, r"present must be \(1, N\), got \(3,\)"),

@@ -110,8 +110,6 @@ def referee_blocks(
     *,
     tolerance: float = 1e-3,
     contact_tolerance: float = 1e-3,
-    step: float = LONGEST_STEP,
-    chunk: int = 256,
 ) -> BlockVerdict:
     """Judge every plan of a batch.
 
@@ -119,9 +117,9 @@ def referee_blocks(
     their extrema inside. An extremum is a root of the next derivative. Roots are bracketed by the
     extrema of that derivative, recursively up to the constant derivative, and found by bisection.
 
-    Clearances are computed at the ends of the pieces and at samples between them, at most `step`
-    and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the distances between
-    capsules, the shield's plate and boxes (listed in `referee.arm_clearance`) are exact.
+    Clearances are computed at the ends of the pieces and at samples between them, at most
+    `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the distances
+    between capsules, the shield's plate and boxes (listed in `referee.arm_clearance`) are exact.
 
     The motion starts at the case's delay, and the arm then stays at the motion's end. It must be at
     standstill there if the case requires it, or if the contact is later.
@@ -135,22 +133,16 @@ def referee_blocks(
         contact_tolerance: [m], of the ball's distance from the plane and the square of the
             shield's face, of the arm's depth in an obstacle, and of the ball's distance from the
             boxes of the tunnel.
-        step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: see `referee_hits`.
 
     Returns:
         A `BlockVerdict`; see `referee_hits`. The offset and the tilt may be infinite too.
 
     Raises:
-        ValueError: a leaf has the wrong shape, `step` is not in (0, LONGEST_STEP] or `chunk` < 1.
+        ValueError: a leaf has the wrong shape.
     """
-    if not 0.0 < step <= LONGEST_STEP:
-        raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
     leaves, links = _read(cases, plans)
-    judge = functools.partial(
-        _judge, links=links, step=step, relative=tolerance, contact=contact_tolerance
-    )
-    return BlockVerdict(**judge_in_chunks(judge, leaves, chunk))
+    judge = functools.partial(_judge, links=links, relative=tolerance, contact=contact_tolerance)
+    return BlockVerdict(**judge_in_chunks(judge, leaves, chunk=256))
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
@@ -180,7 +172,7 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
     return leaves, links
 
 
-def _judge(case: dict, links: tuple, step: float, relative: float, contact: float) -> dict:
+def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
     """Return the fields of `BlockVerdict` for one chunk of plans."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
@@ -201,7 +193,7 @@ def _judge(case: dict, links: tuple, step: float, relative: float, contact: floa
     rest, parts["rest"] = _rest(case, motion, stays)
     tests["rest"] = rest
     turning = np.sqrt((np.abs(extremes[1][0]).max(axis=0) ** 2).sum(axis=0))
-    for kind, (least, time, part) in _clearances(case, links, motion, turning, step).items():
+    for kind, (least, time, part) in _clearances(case, links, motion, turning).items():
         measured[f"{kind}_clearance"] = least
         tests[kind], parts[kind] = (-least > contact, -least, time), part
     measured = {name: np.where(sound, value, np.nan) for name, value in measured.items()}
@@ -315,15 +307,13 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
 
-def _clearances(
-    case: dict, links: tuple, motion: _Motion, turning: np.ndarray, step: float
-) -> dict[str, tuple]:
+def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
     """Return least distances (B,) [m] by kind, their times (B,) [s], and the parts (B,) str.
 
     The norm of the joint rates in each piece is at most `turning` (B, M) [rad/s].
     """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
-    longest = np.minimum(step, LARGEST_TURN / turning)
+    longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
     most = count.sum(axis=1).astype(int) + 1
     # Lanes with similar numbers of samples are computed together.

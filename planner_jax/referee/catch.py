@@ -94,8 +94,6 @@ def referee_catches(
     tolerance: float = 1e-3,
     contact_tolerance: float = 5e-3,
     continuity_tolerance: float = 1e-4,
-    samples: int = 400,
-    chunk: int = 2048,
 ) -> CatchVerdict:
     """Judge every plan of a batch.
 
@@ -124,8 +122,6 @@ def referee_catches(
         tolerance: relative, of every limit of the case, including the net's radius and angle.
         contact_tolerance: [m], of the distance between target and hoop's plane at the catch.
         continuity_tolerance: see `referee_hits`.
-        samples: least number of samples between two catches, >= 200.
-        chunk: see `referee_hits`.
 
     Returns:
         A `CatchVerdict`; see `referee_hits`. The net's radius, its angle and a horizon may be
@@ -153,7 +149,7 @@ def referee_catches(
     judge = functools.partial(
         _judge,
         extras=cases.extras,
-        intervals=intervals_of(samples, leaves["durations"].shape[1] // shape[1]),
+        intervals=intervals_of(leaves["durations"].shape[1] // shape[1]),
         net_test=net_test,
         optional=bool(cases.optional),
         tolerances={
@@ -162,7 +158,7 @@ def referee_catches(
             "continuity": continuity_tolerance,
         },
     )
-    return CatchVerdict(**judge_in_chunks(judge, leaves, chunk))
+    return CatchVerdict(**judge_in_chunks(judge, leaves, chunk=2048))
 
 
 def _read(cases, plans) -> dict[str, np.ndarray]:

@@ -88,8 +88,6 @@ def referee_hits(
     landing_tolerance: float = 0.01,
     contact_tolerance: float = 5e-3,
     continuity_tolerance: float = 1e-4,
-    samples: int = 400,
-    chunk: int = 2048,
 ) -> HitVerdict:
     """Judge every plan of a batch.
 
@@ -108,15 +106,13 @@ def referee_hits(
             the case has `racket_radius`, the distance may also not exceed `RIM` times the radius.
         continuity_tolerance: of the displacement of head state and joints, relative to the largest
             coordinate at the ends of the pieces (at least 1 m).
-        samples: least number of samples of a trajectory, >= 200.
-        chunk: greatest number of plans that a thread judges at once; it bounds the memory.
 
     Returns:
         A `HitVerdict` of float64 arrays. A plan that is not finite fails as "not finite", without
         an effect on the others. Limits may be infinite.
 
     Raises:
-        ValueError: an array has the wrong shape, `samples` < 200 or `chunk` < 1.
+        ValueError: an array has the wrong shape.
     """
     leaves = read_flight(cases, plans)
     leaves |= read_leaves(cases, _CASE_SHAPES, len(leaves["lane"]))
@@ -130,11 +126,11 @@ def referee_hits(
     judge = functools.partial(
         _judge,
         extras=cases.extras,
-        intervals=intervals_of(samples, leaves["durations"].shape[1]),
+        intervals=intervals_of(leaves["durations"].shape[1]),
         drag_after_impact=drag_after_impact,
         tolerances=tolerances,
     )
-    return HitVerdict(**judge_in_chunks(judge, leaves, chunk))
+    return HitVerdict(**judge_in_chunks(judge, leaves, chunk=2048))
 
 
 def _judge(

@@ -92,8 +92,6 @@ def referee_intercepts(
     target_positions: Callable | None = None,
     tolerance: float = 1e-3,
     contact_tolerance: float = 1e-3,
-    step: float = LONGEST_STEP,
-    chunk: int = 128,
 ) -> InterceptVerdict:
     """Judge every plan of a batch.
 
@@ -102,8 +100,8 @@ def referee_intercepts(
     curvature, steering rate and lateral acceleration are compared with their limits at their
     extrema, not at samples.
 
-    Map, walls and movers are tested at the knots and at samples between them, at most `step`
-    apart: 3 cm at 1.5 m/s by default. At a sample the distance between rectangle and convex
+    Map, walls and movers are tested at the knots and at samples between them, at most
+    `LONGEST_STEP` apart: 3 cm at 1.5 m/s. At a sample the distance between rectangle and convex
     polygon is exact.
 
     Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
@@ -124,18 +122,13 @@ def referee_intercepts(
         tolerance: relative, of every limit of the car, of the case's tolerance and its heading
             tolerance; absolute, in their own units, of the plan's first pose, speed and curvature.
         contact_tolerance: [m], of the body's depth in an obstacle, and of its middle off the map.
-        step: [s], longest time between two samples, at most `LONGEST_STEP`.
-        chunk: see `referee_hits`.
 
     Returns:
         An `InterceptVerdict`; see `referee_hits`. Tolerances and the map's bounds may be infinite.
 
     Raises:
-        ValueError: a leaf has the wrong shape, the class of the target is not known, `step` is
-            not in (0, LONGEST_STEP] or `chunk` < 1.
+        ValueError: a leaf has the wrong shape, or the class of the target is not known.
     """
-    if not 0.0 < step <= LONGEST_STEP:
-        raise ValueError(f"step must be > 0 and <= {LONGEST_STEP}, got {step}")
     leaves = _leaves(cases, plans)
     times = leaves["plan.time"].astype(np.float64)
     target = cases.target if truth is None else truth
@@ -143,8 +136,8 @@ def referee_intercepts(
     with np.errstate(all="ignore"):
         where = (target_positions or target_positions_of)(target, times)
     leaves["target"] = check_leaf("target_positions", where, (*times.shape, 2))
-    judge = functools.partial(_judge, step=step, relative=tolerance, contact=contact_tolerance)
-    return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk))
+    judge = functools.partial(_judge, relative=tolerance, contact=contact_tolerance)
+    return InterceptVerdict(**judge_in_chunks(judge, leaves, chunk=128))
 
 
 _SHAPES: dict[str, tuple[int, ...]] = {
@@ -212,14 +205,14 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
     raise ValueError(f"a target of class {type(target).__name__} needs target_positions")
 
 
-def _judge(case: dict, step: float, relative: float, contact: float) -> dict:
+def _judge(case: dict, relative: float, contact: float) -> dict:
     """Return the fields of `InterceptVerdict` for one chunk of plans."""
     end = case["plan.time"]
     finite = finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
     span = np.where(driven, end, 0.0) / (case["plan.speed"].shape[1] - 1)
     measured, tests = _judge_limits(case, span, relative)
-    times, poses = _integrate_poses(case, span, step)
+    times, poses = _integrate_poses(case, span)
     found, more = _judge_clearance(case, times, poses, contact)
     measured, tests = measured | found, tests | more
     middle, heading = poses[:, -1, :2], poses[:, -1, 2]
@@ -260,7 +253,7 @@ def final_poses(plans, body) -> np.ndarray:
     end = np.where((end > 0.0) & (end <= LONGEST_PLAN), end, 0.0)
     span = end / (case["plan.speed"].shape[1] - 1)
     with np.errstate(all="ignore"):
-        pose = _integrate_poses(case, span, LONGEST_STEP)[1][:, -1]
+        pose = _integrate_poses(case, span)[1][:, -1]
     ahead = 0.5 * case["body.length"] - case["body.rear_overhang"]
     pose[:, 0] -= ahead * np.cos(pose[:, 2])
     pose[:, 1] -= ahead * np.sin(pose[:, 2])
@@ -334,7 +327,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
     return measured, tests
 
 
-def _integrate_poses(case: dict, span: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
+def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return times (B, S) [s] and poses (B, S, 3) of the body's middle, in pieces of (B,) [s].
 
     Lanes with fewer samples than others repeat the end of each piece.
@@ -348,7 +341,7 @@ def _integrate_poses(case: dict, span: np.ndarray, step: float) -> tuple[np.ndar
         """Integrate v k (B, K, ...) since the start of each piece."""
         return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
 
-    count = np.maximum(np.ceil(span / step - 1e-9), 1.0)
+    count = np.maximum(np.ceil(span / LONGEST_STEP - 1e-9), 1.0)
     most = int(count.max(initial=1.0))
     tau = span[:, None] * np.minimum(np.arange(most + 1) / count[:, None], 1.0)  # (B, most + 1)
     whole = heading_change(h)[..., 0]

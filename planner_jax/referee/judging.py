@@ -125,14 +125,10 @@ def judge_in_chunks(
 ) -> dict[str, np.ndarray]:
     """Judge arrays with leading axis B in chunks, and return the fields of the verdict.
 
-    Threads judge the chunks, one for each core, since NumPy releases the interpreter in its loops.
-    If there are many lanes and many cores, and `judge` can be pickled, processes judge instead.
-
-    Raises:
-        ValueError: `chunk` < 1.
+    At most `chunk` plans are judged together, which bounds the memory. Threads judge the chunks,
+    one for each core, since NumPy releases the interpreter in its loops. If there are many lanes
+    and many cores, and `judge` can be pickled, processes judge instead.
     """
-    if chunk < 1:
-        raise ValueError(f"chunk must be >= 1, got {chunk}")
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
     judge_part = functools.partial(_judge_in_float64, judge)

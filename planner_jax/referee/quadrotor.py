@@ -97,22 +97,17 @@ MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude,
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
 SHORTEST_PIECE = 0.1  # [s], least time over which an error of a derivative counts as displacement
-_FEWEST_INTERVALS = 16  # between samples of a piece
+_INTERVALS = 400  # least number between two contacts
+_FEWEST_INTERVALS = 16  # of a piece
 # Multiplications of one matrix product, and lanes whose peaks are searched at once: many to a call
 # of NumPy, but few enough for the cache. Up to 2^18 multiplications OpenBLAS starts no threads of
 # its own, which would compete with the referee's threads.
 _PRODUCT, _SEARCHED = 250_000, 1024
 
 
-def intervals_of(samples: int, num_pieces: int) -> int:
-    """Return the number of sample intervals of a piece, if all pieces together have `samples`.
-
-    Raises:
-        ValueError: the samples are fewer than 200.
-    """
-    if samples < 200:
-        raise ValueError(f"samples must be >= 200, got {samples}")
-    return max(math.ceil(samples / num_pieces), _FEWEST_INTERVALS)
+def intervals_of(num_pieces: int) -> int:
+    """Return the number of sample intervals of each piece between two contacts."""
+    return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
 def check_coeffs(value: ArrayLike) -> np.ndarray:
