@@ -15,6 +15,7 @@ from typing import Any
 import jax
 
 import planner_jax as pj
+from planner_jax.baselines.catch.published import RATES, PublishedRates
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
 from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.runs.summary import wilson_interval
@@ -82,7 +83,7 @@ def main() -> None:
             bench.say(
                 f"| {suite} | {name} | {100 * row['success']:.2f} % | "
                 f"{100 * low:.2f}..{100 * high:.2f} | {100 * row['success_protocol']:.2f} % | "
-                f"{SUITES[suite].success or '-'} | {ratio} | {last} s | "
+                f"{RATES.get(suite, PublishedRates()).success or '-'} | {ratio} | {last} s | "
                 f"{row['warm_seconds']:.2f} s |"
             )
             bench.row(**row)

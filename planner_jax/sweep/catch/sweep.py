@@ -4,10 +4,11 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
+from planner_jax.baselines.catch.published import SOURCE, make_table
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.table import RateTable, rate_cells
+from planner_jax.runs.table import RateTable
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
 from planner_jax.sweep.catch.figures import flight_figure, motion_figure
 from planner_jax.sweep.catch.settings import CatchSettings
@@ -16,7 +17,6 @@ from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
-from planner_jax.task.catch.spec import SUITES
 
 _SOLVED = ("CONVERGED", "FEASIBLE")
 _DECISIONS = {
@@ -99,21 +99,7 @@ class CatchSweep(Sweep[CatchSettings]):
 
     def table(self, manifest: Entries) -> RateTable:
         """Return success and optimal time ratio beside Tables I and III of [Yu2023catch]."""
-        summary, settings = manifest["summary"], manifest["parameters"]
-        planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
-        header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]
-        header += ["Catch Planner, paper %", "Catch Planner, paper OTR", "MPP, paper %"]
-        strong, fields = names.index(settings["suite"]), ("success", "time_ratio", "mpp_success")
-        rows = []
-        for index, name in enumerate(names):
-            own = ["", "", "", ""]
-            if index == strong:
-                ratio = _number(summary["optimal_time_ratio"], 3)
-                own = [*rate_cells(summary["successes"], summary["num"]), ratio]
-            suite = SUITES.get(name)
-            paper = [None if suite is None else vars(suite)[field] for field in fields]
-            rows.append([name, *own, *map(_number, paper, (1, 3, 1))])
-        return RateTable("Success beside the paper", header, rows, strong)
+        return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:
         """Return a sentence on targets caught, their times and the optimal time ratio."""
@@ -146,14 +132,9 @@ class CatchSweep(Sweep[CatchSettings]):
             "OTR is the optimal time ratio, the mean of |T_o - T_p| / T_o over the targets of "
             "solved cases, T_p decided and T_o optimised (eq. 29 of the paper); mpp has none, as "
             "it chooses its own times.",
-            "Paper: throws is its Table I (50 real throws, planned), the others its Table III "
-            "(1,000 simulated each). Their limits, weights and test are not published.",
+            SOURCE,
         ]
 
 
 def _mean(total: float, num: int) -> float | None:
     return total / num if num else None
-
-
-def _number(value: float | None, digits: int) -> str:
-    return "" if value is None else f"{value:.{digits}f}"

@@ -1,36 +1,17 @@
 """Columns of a hit run: serve, plan and verdict."""
 
-from typing import cast
-
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.baselines.hit.comparison import OUTCOMES
 from planner_jax.runs import columns as known
-from planner_jax.runs.columns import BOOL, COUNT, TEXT, VECTOR, Column, leaves_of, list_of
+from planner_jax.runs.columns import COUNT, TEXT, VECTOR, Column, leaves_of, list_of
 from planner_jax.sweep.quadrotor import MOTION, START, TRAJECTORY
 from planner_jax.task.hit import court
-from planner_jax.task.hit.suites import Serves
 
 FRAME = "world, z up, net at x = 0; times from the start of planning"
 _POINT = list_of(pa.float64(), 3)
 _names = lambda b: np.array(court.SCENARIOS)[b.chunk.origin.scenario]  # noqa: E731
-
-
-def name_outcome_column(planner: str) -> str:
-    """Return the name of the column with the published outcomes of a planner."""
-    return f"published_{planner.replace('-', '_')}"
-
-
-def _outcome_column(index: int, planner: str) -> Column:
-    def values(batch: known.RefereedBatch) -> pa.Array | None:
-        if (found := cast(Serves, batch.chunk.origin).published) is None:
-            return None
-        outcome = found[:, index]
-        return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
-
-    meaning = "published outcome; null if there is none"
-    return Column(name_outcome_column(planner), "", meaning, BOOL, values)
-
 
 COLUMNS = [
     known.INDEX,
@@ -68,12 +49,12 @@ COLUMNS = [
     ),
     *MOTION,
     *TRAJECTORY,
-    *(_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)),
+    *OUTCOMES,
 ]
 
 _ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")
 # Columns of a single case, which is not a serve of the court.
 SINGLE_COLUMNS = [
-    *(c for c in COLUMNS if c.name not in _ORIGIN and not c.name.startswith("published_")),
+    *(c for c in COLUMNS if c.name not in _ORIGIN and c not in OUTCOMES),
     *leaves_of("cases", ("target", "m", "desired landing point", VECTOR)),
 ]

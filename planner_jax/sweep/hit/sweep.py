@@ -2,30 +2,28 @@
 
 import dataclasses
 import hashlib
-from collections import Counter
 
 import jax
 import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
-from planner_jax.baselines.hit.published import read_published_rates
+from planner_jax.baselines.hit.comparison import ScenarioCounts, explain_table, make_table
 from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.source import Chunk, Source, fill_in
 from planner_jax.runs.summary import COUNTED, Tally
-from planner_jax.runs.table import RateTable, rate_cells
+from planner_jax.runs.table import RateTable
 from planner_jax.sweep.figures import CAPTION as MOTION
-from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS, name_outcome_column
+from planner_jax.sweep.hit.columns import COLUMNS, FRAME, SINGLE_COLUMNS
 from planner_jax.sweep.hit.figures import court_figure, motion_figure, path_figure
 from planner_jax.sweep.hit.settings import HitSettings
 from planner_jax.sweep.quadrotor import recovery_remark
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.rows import quadrotor_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
-from planner_jax.task.hit import court
 from planner_jax.task.hit.court import check_cases
 from planner_jax.task.hit.spec import REAL_SCENARIOS, TASK
 from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to_cases
@@ -75,38 +73,22 @@ class ServeSource(Source):
         return {"serves": known}
 
 
-def choose_reference(planner: str) -> str:
-    """Return the published planner for comparison: the planner itself, or else bat."""
-    return planner if planner in court.PLANNERS else "bat"
-
-
 class HitTally(Tally):
     """Counts by scenario; the example flies from the left to the far target.
 
     [Yu2023bat, Fig. 7] shows such a case.
     """
 
-    READS = (*COUNTED, "scenario", *map(name_outcome_column, court.PLANNERS))
+    READS = (*COUNTED, *ScenarioCounts.READS)
 
     def __init__(self) -> None:
         super().__init__()
-        self._num: Counter[str] = Counter()  # by scenario
-        self._successes: Counter[str] = Counter()
-        self._published: Counter[tuple[str, str]] = Counter()  # by planner and scenario
-        self._num_published: Counter[tuple[str, str]] = Counter()
+        self._scenarios = ScenarioCounts()
 
     def add(self, rows: pa.Table) -> None:
         """Count some rows of the run."""
         super().add(rows)
-        scenario = rows["scenario"].to_numpy()
-        self._num.update(scenario)
-        self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
-        for planner in court.PLANNERS:
-            outcome = rows[name_outcome_column(planner)]
-            known = outcome.is_valid().to_numpy().astype(bool)
-            solved = outcome.fill_null(False).to_numpy().astype(bool)
-            self._num_published.update((planner, name) for name in scenario[known])
-            self._published.update((planner, name) for name in scenario[solved])
+        self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
         """Return masks (B,) of possible examples, the preferred ones first."""
@@ -116,21 +98,7 @@ class HitTally(Tally):
 
     def summary(self) -> Entries:
         """Return success rates from 0 to 1, with published rates of the same serves."""
-        per_scenario = {
-            name: {
-                "num": self._num[name],
-                "successes": self._successes[name],
-                "success_rate": self._successes[name] / self._num[name],
-                "published_on_these_serves": {
-                    planner: self._published[planner, name] / self._num_published[planner, name]
-                    for planner in court.PLANNERS
-                    if self._num_published[planner, name]
-                },
-            }
-            for name in court.SCENARIOS
-            if self._num[name]
-        }
-        return {**super().summary(), "per_scenario": per_scenario}
+        return {**super().summary(), "per_scenario": self._scenarios.summary()}
 
 
 class HitSweep(Sweep[HitSettings]):
@@ -178,41 +146,16 @@ class HitSweep(Sweep[HitSettings]):
 
     def table(self, manifest: Entries) -> RateTable:
         """Return success per scenario in percent, beside the rates of a published planner."""
-        planner, summary = manifest["parameters"]["planner"], manifest["summary"]
-        other = choose_reference(planner)
-        published, column = read_published_rates(), court.PLANNERS.index(other)
-        beside = [rates[:, column] for rates in (published.paper, published.trials)]
-        header = ["scenario", "cases", f"{planner} %", "95 % interval"]
-        header += [f"{other}, paper %", f"{other}, trial files %"]
-        same = _knows_same_serves(summary, other)
-        header += [f"{other}, same serves %"] if same else []
-        rows, known, solved = [], 0, 0.0
-        for index, name in enumerate(court.SCENARIOS):
-            counts = summary["per_scenario"].get(name)
-            own = rate_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
-            row = [name, *own, *(f"{rates[index]:.1f}" for rates in beside)]
-            if same:
-                rate = counts["published_on_these_serves"].get(other) if counts else None
-                row.append("" if rate is None else f"{100.0 * rate:.1f}")
-                if rate is not None:
-                    known, solved = known + counts["num"], solved + counts["num"] * rate
-            rows.append(row)
-        total = ["all", *rate_cells(summary["successes"], summary["num"])]
-        total += [f"{rates.mean():.2f}" for rates in beside]
-        total += [f"{100.0 * solved / known:.2f}"] if same else []
-        return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
+        return make_table(manifest)
 
     def remarks(self, manifest: Entries) -> list[str]:
         """Return where the numbers come from, a sentence each."""
         summary, settings = manifest["summary"], manifest["parameters"]
-        other, start = choose_reference(settings["planner"]), settings["start"]
         law = f"drawn from the published law, suite {settings['suite']}, seed {settings['seed']}"
         origin = "cases of published trial files" if settings["serves"] else law
+        start = settings["start"]
         start = "uniform over the half court" if start == "uniform" else f"{tuple(start)} m"
         truth = "with" if settings["drag_after_impact"] else "without"
-        same = ""
-        if _knows_same_serves(summary, other):
-            same = '"Same serves" are the published outcomes of this run\'s cases, if known. '
         return [
             *robot_remark(settings),
             *recovery_remark(settings),
@@ -222,13 +165,5 @@ class HitSweep(Sweep[HitSettings]):
             f"acceleration and body-rate limits x {settings['limit_scale']:g}; returned ball "
             f"{truth} drag.",
             "The referee accepts a success: every limit within 1e-3 relative, landing within 1 cm.",
-            f'"{other}, paper" is Table I of the paper, "{other}, trial files" what its published '
-            "trial files count over 1,000 rows a scenario. The two differ by up to 20 points; "
-            f"their totals are means over the scenarios. {same}"
-            "All of these hold for the paper's own setting: full limits, planning from the serve.",
+            explain_table(manifest),
         ]
-
-
-def _knows_same_serves(summary: Entries, other: str) -> bool:
-    """Return whether published outcomes of the run's own cases are known."""
-    return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())

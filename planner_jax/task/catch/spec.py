@@ -12,26 +12,19 @@ class Suite:
     num_targets: int
     horizon: float  # [s], latest time at which a target of the suite may be caught
     description: str
-    # Results of [Yu2023catch, Tables I and III], for `throws` with 50 real throws, otherwise with
-    # 1,000 simulated cases. The paper gives no ranges, so its cases are similar, not the same.
-    success: float | None = None  # [%], of the planner
-    time_ratio: float | None = None  # optimal time ratio
-    mpp_success: float | None = None  # [%], of the motion primitives of the paper
     optional: bool = False  # whether targets may be left out
 
 
 SUITES = {
-    "throws": Suite(
-        1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m.", 96.0, 0.092, 14.0
-    ),
+    "throws": Suite(1, 1.42, "The paper's throws: with drag, to within 2 m x 0.8 m."),
     "hard": Suite(1, 1.22, "Throws to within 4 m x 3 m, planned for 0.2 s later."),
     "parabola1": Suite(
-        1, 1.66, "A throw without drag, to a height that follows from its flight time.", 99.3, 0.052
+        1, 1.66, "A throw without drag, to a height that follows from its flight time."
     ),
-    "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together.", 98.2, 0.119),
-    "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across.", 84.7, 0.234),
-    "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle.", 99.7, 0.126),
-    "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon.", 76.3, 0.458),
+    "parabola2": Suite(2, 1.96, "Two throws without drag, in the air together."),
+    "harmonic2": Suite(2, 7.0, "Two targets that swing in height and drift across."),
+    "triangle3": Suite(3, 6.0, "Three targets along the sides of a triangle."),
+    "hexagon6": Suite(6, 10.0, "Six targets in parallel, on a hexagon."),
     "square4": Suite(4, 10.0, "Four targets in parallel, on a square."),
     "pentagon5": Suite(5, 10.0, "Five targets in parallel, on a pentagon."),
     "heptagon7": Suite(7, 10.0, "Seven targets in parallel, on a heptagon."),

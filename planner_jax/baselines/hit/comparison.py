@@ -1,0 +1,121 @@
+"""Comparison of runs of hits with the outcomes and rates published with [Yu2023bat]."""
+
+from collections import Counter
+from typing import cast
+
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.baselines.hit.published import read_published_rates
+from planner_jax.runs.columns import BOOL, Column, RefereedBatch
+from planner_jax.runs.manifest import Entries
+from planner_jax.runs.table import RateTable, rate_cells
+from planner_jax.task.hit import court
+from planner_jax.task.hit.suites import Serves
+
+
+def choose_reference(planner: str) -> str:
+    """Return the published planner for comparison: the planner itself, or else bat."""
+    return planner if planner in court.PLANNERS else "bat"
+
+
+def _outcome_column(index: int, planner: str) -> Column:
+    """Return the column with the published outcomes of a planner of `court.PLANNERS`."""
+
+    def values(batch: RefereedBatch) -> pa.Array | None:
+        if (found := cast(Serves, batch.chunk.origin).published) is None:
+            return None
+        outcome = found[:, index]
+        return pa.array(outcome == 1.0, pa.bool_(), mask=np.isnan(outcome))
+
+    name = f"published_{planner.replace('-', '_')}"
+    return Column(name, "", "published outcome; null if there is none", BOOL, values)
+
+
+OUTCOMES = [_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)]
+
+
+class ScenarioCounts:
+    """Successes by scenario of the court: the run's own, and the published on the same serves."""
+
+    READS = ("scenario", *(column.name for column in OUTCOMES))
+
+    def __init__(self) -> None:
+        self._num: Counter[str] = Counter()  # by scenario
+        self._successes: Counter[str] = Counter()
+        self._published: Counter[tuple[str, str]] = Counter()  # by planner and scenario
+        self._num_published: Counter[tuple[str, str]] = Counter()
+
+    def add(self, rows: pa.Table) -> None:
+        """Count some rows of the run."""
+        scenario = rows["scenario"].to_numpy()
+        self._num.update(scenario)
+        self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
+        for planner, column in zip(court.PLANNERS, OUTCOMES, strict=True):
+            outcome = rows[column.name]
+            known = outcome.is_valid().to_numpy().astype(bool)
+            solved = outcome.fill_null(False).to_numpy().astype(bool)
+            self._num_published.update((planner, name) for name in scenario[known])
+            self._published.update((planner, name) for name in scenario[solved])
+
+    def summary(self) -> Entries:
+        """Return success rates from 0 to 1, with published rates of the same serves."""
+        return {
+            name: {
+                "num": self._num[name],
+                "successes": self._successes[name],
+                "success_rate": self._successes[name] / self._num[name],
+                "published_on_these_serves": {
+                    planner: self._published[planner, name] / self._num_published[planner, name]
+                    for planner in court.PLANNERS
+                    if self._num_published[planner, name]
+                },
+            }
+            for name in court.SCENARIOS
+            if self._num[name]
+        }
+
+
+def make_table(manifest: Entries) -> RateTable:
+    """Return success per scenario in percent, beside the rates of a published planner."""
+    planner, summary = manifest["parameters"]["planner"], manifest["summary"]
+    other = choose_reference(planner)
+    published, column = read_published_rates(), court.PLANNERS.index(other)
+    beside = [rates[:, column] for rates in (published.paper, published.trials)]
+    header = ["scenario", "cases", f"{planner} %", "95 % interval"]
+    header += [f"{other}, paper %", f"{other}, trial files %"]
+    same = _knows_same_serves(summary, other)
+    header += [f"{other}, same serves %"] if same else []
+    rows, known, solved = [], 0, 0.0
+    for index, name in enumerate(court.SCENARIOS):
+        counts = summary["per_scenario"].get(name)
+        own = rate_cells(counts["successes"], counts["num"]) if counts else ["0", "", ""]
+        row = [name, *own, *(f"{rates[index]:.1f}" for rates in beside)]
+        if same:
+            rate = counts["published_on_these_serves"].get(other) if counts else None
+            row.append("" if rate is None else f"{100.0 * rate:.1f}")
+            if rate is not None:
+                known, solved = known + counts["num"], solved + counts["num"] * rate
+        rows.append(row)
+    total = ["all", *rate_cells(summary["successes"], summary["num"])]
+    total += [f"{rates.mean():.2f}" for rates in beside]
+    total += [f"{100.0 * solved / known:.2f}"] if same else []
+    return RateTable("Success per scenario", header, [*rows, total], strong=len(rows))
+
+
+def explain_table(manifest: Entries) -> str:
+    """Return sentences on the published columns of the table."""
+    other, same = choose_reference(manifest["parameters"]["planner"]), ""
+    if _knows_same_serves(manifest["summary"], other):
+        same = '"Same serves" are the published outcomes of this run\'s cases, if known. '
+    return (
+        f'"{other}, paper" is Table I of the paper, "{other}, trial files" what its published '
+        "trial files count over 1,000 rows a scenario. The two differ by up to 20 points; "
+        f"their totals are means over the scenarios. {same}"
+        "All of these hold for the paper's own setting: full limits, planning from the serve."
+    )
+
+
+def _knows_same_serves(summary: Entries, other: str) -> bool:
+    """Return whether published outcomes of the run's own cases are known."""
+    return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())
