@@ -170,44 +170,8 @@ def write_verdicts(
 
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the success rate, failures if there are any, and a histogram of iterations."""
-    failed = run.manifest["summary"]["failed_limits"]
-    widths = [1.0, 1.2, 1.8] if failed else [1.0, 3.0]
-    panels = figure.subplots(1, len(widths), width_ratios=widths)
-    _draw_rate(panels[0], run.manifest)
-    if failed:
-        _draw_failures(panels[1], failed)
-    iterations = np.asarray(run.columns("iterations")["iterations"])
-    last = panels[-1]
-    style.label(last, "iterations of the attempt that gave the plan", "plans", "Effort")
-    last.hist(iterations, bins=np.arange(iterations.min(), iterations.max() + 2) - 0.5)
-    last.xaxis.set_major_locator(MaxNLocator(integer=True))
-
-
-def _draw_rate(axes: Axes, manifest: Entries) -> None:
-    """Draw the success rate with its interval."""
-    summary, settings = manifest["summary"], manifest["parameters"]
-    rate, name = 100.0 * summary["success_rate"], settings["planner"]
-    axes.bar(0, rate, 0.7, color=style.PLANNER_COLOURS.get(name, style.INK))
-    colour, level = ("white", 2.0) if rate >= 10.0 else (style.INK, rate + 2.0)
-    axes.annotate(f"{rate:.1f}", (0, level), ha="center", weight="bold", color=colour)
-    ends = 100.0 * np.array(summary["wilson_95"])
-    axes.errorbar(0, rate, np.abs(ends[:, None] - rate), color=style.INK, capsize=3)
-    axes.set_xticks([0], [name])
-    axes.set(xlim=(-0.6, 0.6), ylim=(0.0, 104.0))
-    axes.grid(axis="x", visible=False)
-    style.label(axes, "", "success [%]", f"Suite {settings['suite']}")
-
-
-def _draw_failures(axes: Axes, failed: dict[str, int]) -> None:
-    """Draw the number of failures by the first limit that fails."""
-    style.label(axes, "plans", "", f"First failed limit of {sum(failed.values()):,}")
+    """Draw a histogram of iterations; success and failures are text of the page."""
+    iterations, axes = np.asarray(run.columns("iterations")["iterations"]), figure.subplots()
+    style.label(axes, "iterations of the attempt that gave the plan", "plans", "Effort")
+    axes.hist(iterations, bins=np.arange(iterations.min(), iterations.max() + 2) - 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
-    positions = range(len(failed))
-    axes.barh(positions, list(failed.values()), 0.7, color=style.RED)
-    for index, count in zip(positions, failed.values(), strict=True):
-        axes.annotate(f" {count:,}", (count, index), va="center")
-    axes.set_yticks(positions, list(failed))
-    axes.set_ylim(max(len(failed), 4) - 0.5, -0.5)
-    axes.margins(x=0.15)
-    axes.grid(axis="y", visible=False)

@@ -48,8 +48,8 @@ class Sweep(Generic[AnySettings]):
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure(
             "outcomes.png",
-            "Success with its 95 % Wilson interval, failures by name, and iterations.",
-            (13.0, 4.4),
+            "Number of plans by iterations.",
+            (9.0, 4.4),
             outcomes_figure,
         ),
     )

@@ -117,11 +117,10 @@ def path_figure(figure: Figure, run: RunRows) -> None:
     (_, row), setting = run.same_case()[0], run.manifest["setting"]
     drag_after = run.manifest["parameters"].get("drag_after_impact", False)
     above, side = figure.subplots(2, 1, sharex=True)
-    target: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "markersize": 11}
     for axes, second in ((above, 1), (side, 2)):
         draw_case(axes, row, second, setting, drag_after)
         axes.plot(row["start"][0], row["start"][second], "s", color=style.BLUE, markersize=5)
-        axes.plot(row["target"][0], row["target"][second], zorder=6, **target)
+        axes.plot(row["target"][0], row["target"][second], zorder=6, markersize=11, **_TARGET)
         low, high = axes.get_ylim()
         wide = np.ptp(axes.get_xlim())
         # Keep panels high enough to be read.

@@ -7,11 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, Normalize, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -111,7 +112,7 @@ _SAMPLES = 241
 _PANELS, _COLUMNS, _FAILURES = 6, 3, 2
 _MOST_BODIES, _MOST_MOVERS = 6, 16  # greatest numbers of times and of polygons of movers
 # Viridis without its light end, which is invisible on paper.
-_STOPS = ("#440154", "#443983", "#31688E", "#21918C", "#35B779", "#90D743")
+_COLOURS_OF_TIME = ListedColormap(colormaps["viridis"](np.linspace(0.0, 5.0 / 6.0, 256)))
 
 
 def plane_figure(figure: Figure, run: RunRows) -> None:
@@ -119,7 +120,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
     setting = run.manifest["setting"]
     drives = [sample_drive(row, setting, _SAMPLES) for row in chosen(run)]
     latest = max(drive.row["due_time"] for drive in drives)
-    colours = ScalarMappable(Normalize(0.0, latest), colours_of_time())
+    colours = ScalarMappable(Normalize(0.0, latest), _COLOURS_OF_TIME)
     num_rows = -(-len(drives) // _COLUMNS)
     figure.set_size_inches(13.0, 0.7 + 4.0 * num_rows)
     panels = figure.subplots(num_rows, _COLUMNS, sharex=True, sharey=True, squeeze=False)
@@ -197,14 +198,6 @@ def entries(colours: ScalarMappable) -> list[Artist]:
     ]
 
 
-def colours_of_time(num: int = 256) -> ListedColormap:
-    """Return the colours of times; early times are dark."""
-    stops = np.array([[int(stop[k : k + 2], 16) for k in (1, 3, 5)] for stop in _STOPS]) / 255.0
-    at = np.linspace(0.0, len(stops) - 1.0, num)
-    each = [np.interp(at, np.arange(len(stops)), stops[:, k]) for k in range(3)]
-    return ListedColormap(np.stack(each, axis=1))
-
-
 def instants(end: float, most: int) -> np.ndarray:
     """Return at most `most` round times [s] from 0 to `end`."""
     steps = [mantissa * 10.0**power for power in range(-3, 9) for mantissa in (1.0, 2.0, 2.5, 5.0)]
@@ -231,10 +224,8 @@ def draw_polygons(
     zorder: float = 2,
 ) -> None:
     """Draw polygons (V, 2) [m] with a pale filling."""
-    look: Look = {"facecolor": colour, "alpha": alpha, "linewidth": 0.0, "zorder": zorder}
-    axes.add_collection(PolyCollection(polygons, **look))
-    edge: Look = {"facecolor": "none", "edgecolor": colour, "linewidth": 1.0, "zorder": zorder}
-    axes.add_collection(PolyCollection(polygons, **edge))
+    look: Look = {"facecolor": to_rgba(colour, alpha), "edgecolor": colour, "zorder": zorder}
+    axes.add_collection(PolyCollection(polygons, linewidth=1.0, **look))
 
 
 _CURVE_SAMPLES = 801
