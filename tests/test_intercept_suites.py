@@ -15,7 +15,13 @@ from planner_jax.task.intercept.api import draw, observe
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.searches import earliest_arrival
 from planner_jax.task.intercept.spec import SUITES
-from planner_jax.task.intercept.suites import BODY_MIDDLE, CAUSES, SIZE, drawn, first_cause
+from planner_jax.task.intercept.suites import (
+    BODY_MIDDLE,
+    CAUSES,
+    SIZE,
+    draw_with_counts,
+    first_cause,
+)
 
 NUM, SEED = 24, 3
 PLAIN = [name for name, suite in SUITES.items() if not suite.is_maze]
@@ -31,7 +37,7 @@ def numpy(tree):
 def batches():
     """Draw a batch of every suite, in double precision."""
     with jax.enable_x64(True):
-        batches = {name: drawn(name, NUM, SEED, dtype=jnp.float64) for name in SUITES}
+        batches = {name: draw_with_counts(name, NUM, SEED, dtype=jnp.float64) for name in SUITES}
         return {name: replace(each, cases=numpy(each.cases)) for name, each in batches.items()}
 
 

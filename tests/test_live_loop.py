@@ -74,7 +74,7 @@ class Throw:
         answer = self.planner.answer(data, "sender", self.now)
         found = None if answer is None else read_answer(answer)
         if found is not None:
-            self.planner.sent(data, time.perf_counter())
+            self.planner.record_sent(data, time.perf_counter())
             self.answers.append(found)
         return found
 

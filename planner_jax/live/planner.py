@@ -161,7 +161,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         with report.stages["setpoints"].measure():
             return self._pack(packet, fault, due)
 
-    def sent(self, data: bytes, received: float) -> None:
+    def record_sent(self, data: bytes, received: float) -> None:
         """Count an answer that was sent, and then plan the recovery if it is missing."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1

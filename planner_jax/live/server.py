@@ -80,7 +80,7 @@ class Server:
         except OSError:
             self.planner.report.counts["unsent"] += 1
             return
-        self.planner.sent(data, received)
+        self.planner.record_sent(data, received)
 
     def _warn(self, data: bytes, sender: tuple[str, int]) -> None:
         """Print the fault of a packet without an answer, once for each fault."""

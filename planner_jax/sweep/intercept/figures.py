@@ -118,7 +118,7 @@ _COLOURS_OF_TIME = ListedColormap(colormaps["viridis"](np.linspace(0.0, 5.0 / 6.
 def plane_figure(figure: Figure, run: RunRows) -> None:
     """Draw the run's example and other cases."""
     setting = run.manifest["setting"]
-    drives = [sample_drive(row, setting, _SAMPLES) for row in chosen(run)]
+    drives = [sample_drive(row, setting, _SAMPLES) for row in choose_rows(run)]
     latest = max(drive.row["due_time"] for drive in drives)
     colours = ScalarMappable(Normalize(0.0, latest), _COLOURS_OF_TIME)
     num_rows = -(-len(drives) // _COLUMNS)
@@ -138,7 +138,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
     figure.legend(handles=entries(colours), loc="outside upper center", ncols=6)
 
 
-def chosen(run: RunRows) -> list[Row]:
+def choose_rows(run: RunRows) -> list[Row]:
     """Return the example, evenly spaced other rows, and a few failures."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]

@@ -6,4 +6,4 @@ from .case import InterceptCase as InterceptCase
 from .case import case as case
 from .default_planner import SpacetimeIntercept as SpacetimeIntercept
 from .plan import InterceptPlan as InterceptPlan
-from .suites import drawn as drawn
+from .suites import draw_with_counts as draw_with_counts

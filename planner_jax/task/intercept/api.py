@@ -20,7 +20,7 @@ from planner_jax.task.arguments import judge_by
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES, TASK
-from planner_jax.task.intercept.suites import drawn
+from planner_jax.task.intercept.suites import draw_with_counts
 
 
 def draw(
@@ -34,12 +34,12 @@ def draw(
     """Draw a batch of interceptions of a suite, with the arguments and errors of `pj.hit.draw`.
 
     The suite is "easy" by default, "medium", "hard", "storm", "gale", "maze", "rush", or a suite of
-    another package. `drawn` also returns the number of rejected draws.
+    another package. `draw_with_counts` also returns the number of rejected draws.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:
         return TASK.other_suite(suite)(num, seed, first)
-    return drawn(suite, num, seed, first, dtype=dtype).cases
+    return draw_with_counts(suite, num, seed, first, dtype=dtype).cases
 
 
 def observe(

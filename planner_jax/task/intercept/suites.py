@@ -80,7 +80,7 @@ class Drawn:
     rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws that it rejected first
 
 
-def drawn(
+def draw_with_counts(
     suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
 ) -> Drawn:
     """Draw a batch of cases of a suite in float64, cast it, and count the rejected draws.

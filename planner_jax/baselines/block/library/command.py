@@ -95,7 +95,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Referee stored motions for random balls, `num` for each home."""
+    """Judge stored motions for random balls, `num` for each home."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
