@@ -82,9 +82,8 @@ SLOW = (
 )
 # Modules beside `test_sims_*` that convert types implicitly, mostly in MJX, Brax or optax.
 MIXED = (
-    *("policy", "training", "stack", "speed", "bench", "live_loop", "perception", "robot_files"),
-    *("sweep", "sweep_catch", "sweep_intercept", "cli", "snippets", "notebooks", "export_command"),
-    *("plane_prediction", "intercept_gradient", "referee_block", "referee_intercept"),
+    *("policy", "training", "stack", "speed", "bench", "live_loop", "perception"),
+    *("plane_prediction", "cli", "snippets", "notebooks"),
 )
 # Modules that take longest, or compile programs that others find in the cache: test_exact the hit
 # planner's, test_decide the catch planner's. Workers get whole modules in this order, so that none

@@ -55,7 +55,8 @@ class SampledTarget:
         share = jnp.clip(time / self.end * num, 0.0, num)
         k = jnp.clip(share.astype(jnp.int32), 0, num - 1)
         step = self.places[k + 1] - self.places[k]
-        return PointState(pos=self.places[k] + (share - k) * step, vel=step * (num / self.end))
+        share = share - k.astype(share.dtype)
+        return PointState(pos=self.places[k] + share * step, vel=step * (num / self.end))
 
 
 def case_of(row: Row, setting: Entries) -> InterceptCase:
