@@ -171,13 +171,13 @@ def modelled(bench: Bench, num: int, seed: int) -> None:
 
 def rendered(bench: Bench, num: int, seed: int) -> None:
     """The same of images, beside the model on the same throws; and times of frames and fits."""
-    from planner_jax.sims.board import calibrated
+    from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
     seer, look = eye(rate=RENDERED_RATE), ball_look()
     assert isinstance(seer.noise, StereoNoise)
     cases = pj.block.draw(num, "short", seed)
-    camera, found = calibrated(irb1600(), seer.camera, seer.noise, seed=seed)
+    camera, found = calibrate_camera(irb1600(), seer.camera, seer.noise, seed=seed)
     off = 1e3 * np.linalg.norm(camera.position - np.asarray(seer.camera.position))
     bench.say("", f"Calibration from 20 views: {off:.2g} mm off, residual {found.residual:.2f}")
     times = frame_times(seer, max(MOMENTS))

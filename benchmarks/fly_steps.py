@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from planner_jax.planning.plan import plan
-from planner_jax.sims.launch import launched, ready
+from planner_jax.sims.launch import launch_ball, ready
 from planner_jax.sims.loop import fly_leg
 from planner_jax.sims.loop_state import Loop
 from planner_jax.sims.model import World, at_rest, step
 from planner_jax.sims.noise import NOISES
 from planner_jax.sims.tasks.catch import CATCH_WORLD, SEEN, throws
-from planner_jax.sims.tasks.catch_ahead import believed, with_catch
+from planner_jax.sims.tasks.catch_ahead import predict_case, with_catch
 from planner_jax.sims.tasks.catch_pilot import CatchPilot
 from planner_jax.task import catch
 from planner_jax.task.catch.case import START
@@ -77,8 +77,8 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     starts = jnp.tile(jnp.array(START), (few, 1))
     flight = ready(loop, starts, jax.random.split(jax.random.key(0), few))
     balls = jax.tree.map(jnp.asarray, cases.balls)
-    flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
-    known = believed(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
+    flight = launch_ball(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
+    known = predict_case(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
     plans = plan(catch.planner(), jax.tree.map(np.asarray, known))
     begun = jax.tree.map(jnp.asarray, plans)
     flight = with_catch(flight, begun, jnp.ones((few, 1), bool)).replace(key=None)

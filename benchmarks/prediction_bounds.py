@@ -7,7 +7,7 @@ from jax.typing import ArrayLike
 
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
-from planner_jax.sims.prediction.turn_fit import given_rate, tangent
+from planner_jax.sims.prediction.turn_fit import fit_rate, tangent
 
 
 def cramer_rao(
@@ -31,7 +31,7 @@ def cramer_rao(
     times = jnp.asarray(times)
     seen = centre(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
     velocity = path.at(seen.middle).vel
-    fit = given_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
+    fit = fit_rate(seen, path.turn_rate)._replace(velocity=(velocity[0], velocity[1]))
     variance = jnp.square(jnp.asarray(noise, seen.after.dtype))
     after = jnp.asarray(time) - seen.middle
     moves = zip(arc(path.turn_rate, after), fit.lever, strict=True)

@@ -72,7 +72,7 @@ def show_board(
     return BoardViews(flange[chosen], points, seen, std)
 
 
-def calibrated(
+def calibrate_camera(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
 ) -> tuple[Camera, Calibration]:
     """The camera where `num` views of the board say that it stands, and the calibration itself."""

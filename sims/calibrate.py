@@ -118,18 +118,18 @@ def calibrate(
     turn = Rotation.from_matrix(boards[:, :3, :3]).mean().as_matrix()
     board = pose(turn, boards[:, :3, 3].mean(axis=0))
 
-    def moved(change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def apply_change(change: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         turns = Rotation.from_rotvec(change[:6].reshape(2, 3)).as_matrix()
         there = pose(turns, change[6:].reshape(2, 3))
         return camera @ there[0], board @ there[1]
 
     def errors(change: np.ndarray) -> np.ndarray:
-        at, held = moved(change)
+        at, held = apply_change(change)
         to_camera = np.linalg.inv(at) @ flange @ held
         expected = points @ np.swapaxes(to_camera[:, :3, :3], 1, 2) + to_camera[:, None, :3, 3]
         return ((expected - seen) / std).reshape(-1)
 
     refined = least_squares(errors, np.zeros(12), method="lm", x_scale="jac")
-    camera, board = moved(refined.x)
+    camera, board = apply_change(refined.x)
     free = max(seen.size - 12, 1)
     return Calibration(camera, board, float(np.sqrt(2.0 * refined.cost / free)))

@@ -89,7 +89,7 @@ def _car(world: World) -> Car:
     return world.robot
 
 
-def reckoned(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
+def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
     """The pose (3,) a short span [s] later, at a speed () on a way of a curvature ()."""
     turned = speed * curvature * span
     middle = pose[2] + 0.5 * turned
@@ -97,7 +97,7 @@ def reckoned(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
     return pose + jnp.stack([way * jnp.cos(middle), way * jnp.sin(middle), turned])
 
 
-def started(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
+def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
     """Drives at the begin of their plans.
 
     Args:
@@ -126,7 +126,7 @@ def started(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
     return jax.vmap(one)(plans, keys)
 
 
-def believed_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
+def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
     """What is believed of pose (3,), speed () [m/s] and curvature () [1/m]."""
     state = loop.car.state(drive.physics)
     curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
@@ -154,9 +154,9 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
         # What is shown now is a latency old, as is what had been reckoned for then.
-        seen = car.sensed(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
+        seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
-        next_pose = _reckoned_on(car, believed[-1], true, after, span) + correction
+        next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
         shown = jnp.concatenate([shown[1:], after.pose[None]])
         believed = jnp.concatenate([believed[1:] + correction, next_pose[None]])
         worst = jnp.where(counts, jnp.maximum(worst, off), worst)
@@ -188,11 +188,13 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
     return drive, Frame(time=time, pose=physics.qpos[:3], wanted=wanted)
 
 
-def _reckoned_on(car: Car, pose: Array, before: CarState, after: CarState, span: float) -> Array:
+def _advance_estimate(
+    car: Car, pose: Array, before: CarState, after: CarState, span: float
+) -> Array:
     """A believed pose one step on, from the speed and steering angle that the car knows."""
     steering = 0.5 * (before.steering + after.steering)
     curvature = jnp.tan(steering) / car.vehicle.wheelbase
-    return reckoned(pose, after.speed, curvature, span)
+    return dead_reckon(pose, after.speed, curvature, span)
 
 
 @functools.partial(jax.jit, static_argnames=("world", "num_frames"))

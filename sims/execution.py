@@ -98,7 +98,7 @@ def _one_frame(
         reference, noise, time = now
         true = robot.state(state.physics)
         asked = robot.command(
-            robot.sensed(true, noise, setting.stds), reference, world, setting.mass_error
+            robot.sense(true, noise, setting.stds), reference, world, setting.mass_error
         )
         limited = jnp.clip(asked, -setting.torques, setting.torques)
         torques = state.torques + follows * (limited - state.torques)
@@ -127,7 +127,7 @@ def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState,
     return lax.scan(lambda state, _: _one_frame(world, setting, state), state, None, length=_FRAMES)
 
 
-def _begun(world: World, setting: _Setting, key: Array) -> ArmState:
+def _start(world: World, setting: _Setting, key: Array) -> ArmState:
     """An arm at time 0 of its course, with the torques that it needs there."""
     robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
     reference = jax.tree.map(
@@ -140,17 +140,17 @@ def _begun(world: World, setting: _Setting, key: Array) -> ArmState:
 
 
 @functools.cache
-def _compiled(world: World) -> tuple[Callable, Callable, Callable]:
+def _compile(world: World) -> tuple[Callable, Callable, Callable]:
     """What begins a batch, what carries it on for some frames, and where its courses are."""
     options = compiler_options()
-    begun = jax.jit(jax.vmap(functools.partial(_begun, world)))
-    on = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
+    start = jax.jit(jax.vmap(functools.partial(_start, world)))
+    advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
 
     def angles(course: Course, times: Array) -> Array:
         return _arm(world).references(course, times, world).angles
 
     wanted = jax.jit(jax.vmap(angles, (0, None)))
-    return begun, on, wanted
+    return start, advance, wanted
 
 
 @functools.cache
@@ -201,11 +201,11 @@ def execute(
         raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     if not np.isclose(world.timestep, TIMESTEP):
         raise ArgumentError("timestep", f"{TIMESTEP:g}", world.timestep)
-    begin, on, wanted = _compiled(world)
+    start, advance, wanted = _compile(world)
     dtype = jnp.asarray(courses.begin).dtype
     num = len(courses.begin)
 
-    def shared(value: Any) -> Array:
+    def broadcast(value: Any) -> Array:
         return jnp.broadcast_to(jnp.asarray(value, dtype), (num, *np.shape(value)))
 
     planned: Course = jax.tree.map(jnp.asarray, courses)
@@ -214,16 +214,16 @@ def execute(
         course=dataclasses.replace(planned, begin=begins),
         since=jnp.asarray(since, dtype),
         until=jnp.asarray(until, dtype),
-        torques=shared(drives.torques),
-        lag=shared(drives.lag),
-        stds=shared((drives.angle_std, drives.rate_std)),
-        mass_error=shared(drives.mass_error),
+        torques=broadcast(drives.torques),
+        lag=broadcast(drives.lag),
+        stds=broadcast((drives.angle_std, drives.rate_std)),
+        mass_error=broadcast(drives.mass_error),
     )
-    state = begin(setting, keys)
+    state = start(setting, keys)
     first = state.physics.qpos[:, None]
     parts, rates = [], state.physics.qvel
     for _ in range(max(int(np.ceil(end / (_FRAMES * FRAME) - 1e-6)), 1)):
-        state, (angles, each) = on(setting, state)
+        state, (angles, each) = advance(setting, state)
         parts.append(angles)
         rates = each[:, -1]
     times = FRAME * np.arange(1 + _FRAMES * len(parts))

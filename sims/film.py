@@ -64,7 +64,7 @@ class Scene:
         self.balls = np.where(after[..., None], np.nan, balls)
         self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # of a returned ball
         self.axes: Any = figure.add_subplot(projection="3d")
-        wanted = self.wanted()
+        wanted = self.plan_path()
         plan = self.axes.plot(*wanted.T, color=INK, lw=1.0, ls="--", label="plan")
         self.moving = plan[:0]
         number, thing = balls.shape[1], task.THING
@@ -145,7 +145,7 @@ class Scene:
         look |= {"alpha": opacity, "shade": shade}
         return self.axes.add_collection3d(Poly3DCollection(faces, **look))
 
-    def wanted(self) -> np.ndarray:
+    def plan_path(self) -> np.ndarray:
         """The path of the plans that are flown (M, 3) [m], from the first to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.last_met() + 1]
         return wanted[np.isfinite(wanted).all(axis=1)]

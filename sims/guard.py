@@ -43,7 +43,7 @@ def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> b
 
 
 @contextlib.contextmanager
-def guarded(names: set[str], token: str | None) -> Iterator[Callable[[], bool]]:
+def guard_server(names: set[str], token: str | None) -> Iterator[Callable[[], bool]]:
     """A block in which what begins to serve answers allowed requests only.
 
     Yields a function that says whether something has begun to.

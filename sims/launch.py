@@ -18,7 +18,7 @@ from planner_jax.ball.flight import BallState, fly
 from planner_jax.core.errors import ArgumentError
 from planner_jax.sims import sensing as sight
 from planner_jax.sims.loop_state import FlightState, Loop
-from planner_jax.sims.model import at_rest, placed
+from planner_jax.sims.model import at_rest, place_balls
 from planner_jax.sims.scoring import no_contact
 from planner_jax.sims.sensing import Estimate
 
@@ -63,7 +63,7 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
     return jax.vmap(one)(starts, keys)
 
 
-def launched(
+def launch_ball(
     loop: Loop,
     flights: FlightState,
     balls: BallState,
@@ -85,12 +85,12 @@ def launched(
         seen: [s] that it has been in flight already (static).
     """
     without = dataclasses.replace(flights, plan=None)  # of which nothing is changed
-    after = _launched(loop, without, balls, drag, believed, ball, seen)
+    after = _launch_ball(loop, without, balls, drag, believed, ball, seen)
     return dataclasses.replace(after, plan=flights.plan)
 
 
 @functools.partial(jax.jit, static_argnames=("loop", "seen"))
-def _launched(
+def _launch_ball(
     loop: Loop,
     flights: FlightState,
     balls: BallState,
@@ -99,17 +99,17 @@ def _launched(
     ball: Array,
     seen: float,
 ) -> FlightState:
-    """As `launched`, of flights without plans."""
+    """As `launch_ball`, of flights without plans."""
 
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
         own = jax.tree.map(lambda leaf: leaf[ball], balls)
-        shown, earlier, now = watched(loop, own, drag[ball], believed[ball], look_key, seen)
+        shown, earlier, now = watch_ball(loop, own, drag[ball], believed[ball], look_key, seen)
         which = jnp.arange(drag.size) == ball
         put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
         return dataclasses.replace(
             flight,
-            physics=placed(loop.world, flight.physics, balls, drag, which),
+            physics=place_balls(loop.world, flight.physics, balls, drag, which),
             shown=flight.shown.at[:, ball].set(shown),
             estimates=jax.tree.map(put, flight.estimates, now),
             earlier=jax.tree.map(put, flight.earlier, earlier),
@@ -121,7 +121,7 @@ def _launched(
 
 
 @functools.partial(jax.jit, static_argnames=("loop", "ahead"))
-def awaited(
+def await_ball(
     loop: Loop, flights: FlightState, coming: BallState, believed: Array, *, ball: int, ahead: float
 ) -> FlightState:
     """The flights with a guess of one more ball, of which nothing is seen yet.
@@ -143,7 +143,7 @@ def awaited(
         there = fly(coming, ago, drag, gravity, num_steps=16)[0]
         estimate = sight.first_estimate(there.pos, drag)
         belief = dataclasses.replace(estimate.belief, mean=jnp.concatenate([there.pos, there.vel]))
-        return sight.anchored(dataclasses.replace(estimate, belief=belief), gravity)
+        return sight.anchor_energy(dataclasses.replace(estimate, belief=belief), gravity)
 
     def one(flight: FlightState, believed: Array) -> FlightState:
         put = lambda all_balls, one_ball: all_balls.at[ball].set(one_ball)  # noqa: E731
@@ -157,7 +157,7 @@ def awaited(
     return jax.vmap(one)(flights, believed)
 
 
-def watched(
+def watch_ball(
     loop: Loop, ball: BallState, drag: Array, believed: Array, key: Array, duration: float
 ) -> tuple[Array, Estimate, Estimate]:
     """What was seen of one ball before it is planned for.
@@ -182,7 +182,7 @@ def watched(
     path = jax.vmap(place)(jnp.asarray(ages, dtype))
     looks, shown = path[: num - loop.late_looks], path[num - loop.late_looks :]
     keys = jax.random.split(key, looks.shape[0])
-    seen = jax.vmap(lambda k, at: sight.observed(k, at[None], sensing)[0])(keys, looks)
+    seen = jax.vmap(lambda k, at: sight.observe(k, at[None], sensing)[0])(keys, looks)
 
     look = sight.look if loop.kalman else sight.look_unfiltered
 
@@ -193,7 +193,7 @@ def watched(
     first = sight.first_estimate(looks[0], believed)
     now, history = lax.scan(advance, first, seen)
     earlier = jax.tree.map(lambda leaf: leaf[-1 - loop.looks_per_plan], history)
-    return shown, earlier, sight.anchored(now, gravity)
+    return shown, earlier, sight.anchor_energy(now, gravity)
 
 
 def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None:

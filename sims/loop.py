@@ -48,7 +48,7 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Fli
         reference, time = now
         state = robot.state(physics)
         if any(loop.sensing.robot_stds):
-            state = robot.sensed(state, noise, loop.sensing.robot_stds)
+            state = robot.sense(state, noise, loop.sensing.robot_stds)
         command = robot.command(state, reference, world)
         physics = step(world, physics, command, drag)
         after = moment(world, physics)
@@ -68,13 +68,13 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Fli
     )
     physics, _, contact, worst, squared, tracked = carry
     shown = jnp.concatenate([flight.shown, ball_states(world, physics)[0][None]])
-    seen = sight.observed(look_key, shown[0], loop.sensing)
+    seen = sight.observe(look_key, shown[0], loop.sensing)
     seen = jnp.where(flight.launched[:, None], seen, jnp.nan)
     return dataclasses.replace(
         flight,
         physics=physics,
         shown=shown[1:],
-        estimates=_looked(loop, flight.estimates, seen),
+        estimates=_update_estimates(loop, flight.estimates, seen),
         contact=contact,
         worst_tracking=jnp.sqrt(worst),
         squared_tracking=squared,
@@ -84,7 +84,7 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Fli
     )
 
 
-def _looked(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
+def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
     """The estimates (N, ...) after one look (N, 3)."""
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
@@ -96,16 +96,18 @@ def _looked(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
     return jax.vmap(one)(estimates, seen)
 
 
-def expected(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
+def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
     """The balls `ahead` [s] from now, as they are believed, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
     span = jnp.asarray(ahead + loop.sensing.latency, dtype)
-    return jax.vmap(lambda estimate: sight.predicted(estimate, span, gravity))(estimates)
+    return jax.vmap(lambda estimate: sight.predict(estimate, span, gravity))(estimates)
 
 
 @functools.partial(jax.jit, static_argnames=("loop", "pilot"))
-def _asked(loop: Loop, pilot: Pilot, flights: FlightState, cases: Any) -> tuple[Outlook, Any]:
+def _pose_problems(
+    loop: Loop, pilot: Pilot, flights: FlightState, cases: Any
+) -> tuple[Outlook, Any]:
     """What is to be planned for the end of this period (B, ...), and what is then expected."""
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
@@ -114,18 +116,18 @@ def _asked(loop: Loop, pilot: Pilot, flights: FlightState, cases: Any) -> tuple[
         outlook = Outlook(
             time=when,
             elapsed=elapsed,
-            balls=expected(loop, flight.estimates, loop.period),
+            balls=predict_balls(loop, flight.estimates, loop.period),
             drag=flight.estimates.drag,
             present=flight.present & (pilot.times(flight.plan) > elapsed),
             head_state=loop.world.carrier.head_state(flight.plan, elapsed),
         )
-        return outlook, pilot.asked(case, flight.plan, outlook)
+        return outlook, pilot.pose_problem(case, flight.plan, outlook)
 
     return jax.vmap(one)(flights, cases)
 
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
-def _found(pilot: Pilot, number: int, asked: Any) -> Any:
+def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
     """The plans (B, ...) of one of the pilot's searches."""
     return jax.vmap(pilot.searches[number])(asked)
 
@@ -139,7 +141,7 @@ def _fly(
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
         def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
             flight = _fly_look(loop, pilot, flight, drag)
-            return flight, _recorded(loop, pilot, flight, drag) if loop.record else None
+            return flight, _record(loop, pilot, flight, drag) if loop.record else None
 
         def next_period(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
             flight = dataclasses.replace(flight, earlier=flight.estimates)
@@ -161,7 +163,7 @@ def _with_plans(
     """Flights (B, ...) at the end of a period, with what was found for it where that is good."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
-        plan, good = pilot.chosen(asked, outlook, found)
+        plan, good = pilot.choose(asked, outlook, found)
         pick = lambda new, old: jnp.where(good, new, old)  # noqa: E731
         return dataclasses.replace(
             flight,
@@ -172,7 +174,7 @@ def _with_plans(
     return jax.vmap(one)(flights, outlook, asked, found)
 
 
-def _recorded(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
+def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
     """Where everything is, and how wrong the balls' predictions are."""
     world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
@@ -214,8 +216,8 @@ def _next_period(
         drag: (B, N) K_D [1/m].
         begin: begins a part of the period with what it is given, and returns what waits for it.
     """
-    outlook, asked = _asked(loop, pilot, flights, cases)
-    found = [begin(_found, pilot, number, asked) for number in range(len(pilot.searches))]
+    outlook, asked = _pose_problems(loop, pilot, flights, cases)
+    found = [begin(_search_plans, pilot, number, asked) for number in range(len(pilot.searches))]
     flown_on = begin(_fly, loop, pilot, flights, drag, 1)
     flights, record = flown_on()
     return _with_plans(pilot, flights, outlook, asked, tuple(each() for each in found)), record

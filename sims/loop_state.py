@@ -33,7 +33,7 @@ class Outlook:
 class Pilot(Protocol):
     """A task's part of the loop: a frozen dataclass, static under jit."""
 
-    def asked(self, case: Any, plan: Any, outlook: Outlook) -> Any:
+    def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
         """What is to be planned anew, while a plan is flown."""
         ...
 
@@ -42,7 +42,7 @@ class Pilot(Protocol):
         """Each makes a plan of what is asked; none waits for another."""
         ...
 
-    def chosen(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
+    def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
         """One of the plans that the searches found; and () bool, whether to fly it."""
         ...
 
@@ -150,7 +150,7 @@ class Flown:
     record: Record | None  # leaves (B, K, ...)
 
 
-def flown(flights: FlightState, records: list[Record]) -> Flown:
+def collect_flights(flights: FlightState, records: list[Record]) -> Flown:
     """Of flights (B, ...) at their end, and what was recorded of them, in order."""
     there, records = jax.device_get((dataclasses.replace(flights, key=None), records))
     joined = functools.partial(jax.tree.map, lambda *leaves: np.concatenate(leaves, axis=1))

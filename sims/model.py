@@ -12,7 +12,7 @@ crossed the hoop's disc (`scoring`), so the model has no contacts. Scenery and p
 there to be looked at: they touch nothing and cost no step anything.
 
 MuJoCo's Euler is semi-implicit: the velocity it keeps lies half a step before the position. For
-a ball that is taken care of at both ends, by `placed` and `ball_velocity`, which makes its
+a ball that is taken care of at both ends, by `place_balls` and `ball_velocity`, which makes its
 flight second order.
 """
 
@@ -172,7 +172,9 @@ def at_rest(world: World, place: Array) -> Physics:
     )
 
 
-def placed(world: World, physics: Physics, balls: BallState, drag: Array, which: Array) -> Physics:
+def place_balls(
+    world: World, physics: Physics, balls: BallState, drag: Array, which: Array
+) -> Physics:
     """The same with some balls in flight.
 
     Args:

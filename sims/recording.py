@@ -111,13 +111,13 @@ def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
     at = min(look, int(np.flatnonzero(flown)[-1]))
     pose = recording.robot[flight, at]
     balls, time = recording.balls[flight, look].copy(), recording.time[flight, look]
-    held = robot.held_ball(pose)
+    held = robot.find_held_ball(pose)
     if np.isfinite(held).all():
         balls[time > _or_never(recording.met[flight])] = held
     return Frame(float(time), pose, recording.wanted[flight, at], balls)
 
 
-def recorded(
+def make_recording(
     world: World, flown: Flown, launches: Launches, *, index: np.ndarray, success: np.ndarray
 ) -> Recording:
     """The recording of some flights: what was simulated, the balls before, and what came back.
@@ -144,7 +144,7 @@ def recorded(
     grid = steps[0, 0] + apart * np.arange(-before, looks + after)
     time = np.broadcast_to(grid, (number, grid.size))
 
-    def stretched(leaf: np.ndarray) -> np.ndarray:
+    def extend(leaf: np.ndarray) -> np.ndarray:
         """The first value before the record, and NaN after it."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
         whole[:, before : before + looks], whole[:, :before] = leaf, leaf[:, :1]
@@ -158,7 +158,7 @@ def recorded(
     robot, simulated = np.split(
         np.asarray(record.physics.qpos, float), [world.robot.num_pos], axis=2
     )
-    paths = stretched(simulated.reshape(number, looks, -1, 3))
+    paths = extend(simulated.reshape(number, looks, -1, 3))
     own = time[:, :, None] - begins  # (F, K, N) [s], since each ball was planned for
     early = flight_of(balls, np.clip(own, -seen, 0.0), drag)
     paths = np.where((own < 0.5 * apart)[..., None], early, paths)
@@ -176,8 +176,8 @@ def recorded(
         index=np.asarray(index),
         success=np.asarray(success),
         time=time,
-        robot=stretched(robot),
-        wanted=stretched(np.asarray(record.wanted, float)),
+        robot=extend(robot),
+        wanted=extend(np.asarray(record.wanted, float)),
         balls=paths,
         met=met,
         contact=contact,

@@ -64,7 +64,7 @@ class Robot(Protocol):
     WORDS: ClassVar[str]  # how it is simulated and controlled, for the page of a run
     num_pos: ClassVar[int]  # R, of its joint positions in `qpos`
     num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
-    noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sensed` takes
+    noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sense` takes
 
     def mjcf(self) -> tuple[str, str]:
         """Its body and its actuators as MJCF text."""
@@ -85,7 +85,7 @@ class Robot(Protocol):
         """Its state, a pytree."""
         ...
 
-    def sensed(self, state: Any, noise: Array, stds: Any) -> Any:
+    def sense(self, state: Any, noise: Array, stds: Any) -> Any:
         """Its state as it is estimated, with errors of some standard deviations."""
         ...
 
@@ -109,7 +109,7 @@ class Robot(Protocol):
         """The point (..., 3) [m] that stands for the robot at joint positions (..., R)."""
         ...
 
-    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+    def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
         """Centre (3,) [m] of a ball that lies in the tool; NaN if the tool holds none."""
         ...
 

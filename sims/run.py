@@ -95,16 +95,20 @@ def start_flights(
         "loop": flight.parameters(),
         "video": video,
     }
-    rest: dict[str, Any] = {"remainder": lambda: _dropped(folder), "patient": False, "bar": False}
+    rest: dict[str, Any] = {
+        "remainder": lambda: _discard_unfinished(folder),
+        "patient": False,
+        "bar": False,
+    }
     with folder.create(manifest), stopping.under_way(**rest):
         try:
             return _fly_into(folder, manifest, flight, cases, min(record, settings.num))
         except (KeyboardInterrupt, OSError):
-            _dropped(folder)
+            _discard_unfinished(folder)
             raise
 
 
-def _dropped(folder: RunFolder) -> str:
+def _discard_unfinished(folder: RunFolder) -> str:
     """Remove what was written of flights that are not finished, and say so."""
     try:
         if folder.read_manifest()["state"] == "complete":

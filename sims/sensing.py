@@ -74,7 +74,7 @@ class Estimate:
     drag: Array  # () K_D [1/m]
 
 
-def observed(key: Array, pos: Array, sensing: Sensing) -> Array:
+def observe(key: Array, pos: Array, sensing: Sensing) -> Array:
     """What a look shows of balls at (N, 3) [m]; a row of NaN where it shows nothing."""
     noise_key, drop_key = jax.random.split(key)
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
@@ -124,7 +124,7 @@ def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: 
     return dataclasses.replace(estimate, belief=dataclasses.replace(estimate.belief, mean=mean))
 
 
-def anchored(estimate: Estimate, gravity: Array) -> Estimate:
+def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
     """The estimate with its energy as it is now, from which losses count."""
     energy, variance = _energy(estimate.belief, gravity)
     return dataclasses.replace(
@@ -151,6 +151,6 @@ def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
     return dataclasses.replace(estimate, drag=found.estimate)
 
 
-def predicted(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:
+def predict(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:
     """The ball `ahead` [s] after the time of the belief."""
     return fly(estimate.belief.ball, ahead, estimate.drag, gravity, num_steps=_FLIGHT_STEPS)[0]

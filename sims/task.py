@@ -14,7 +14,7 @@ from planner_jax.runs.table import RateTable
 from planner_jax.sims.loop_state import Flown, Loop
 from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.noise import NOISES
-from planner_jax.sims.recording import Launches, Recording, recorded
+from planner_jax.sims.recording import Launches, Recording, make_recording
 from planner_jax.sims.scenery import Prism
 from planner_jax.sims.settings import BallFly
 
@@ -207,7 +207,7 @@ class BallFlightTask(FlightTask):
             record=jax.tree.map(pick, flights.flown.record),
         )
         some = cases[lanes]
-        return recorded(
+        return make_recording(
             self.world(),
             flown,
             self.launches(some, flown),

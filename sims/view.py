@@ -20,7 +20,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.runs.style import BLUE, GREEN, GREY, INK, RED, SKY
 from planner_jax.sims.film import BALL_COLOURS
-from planner_jax.sims.guard import guarded
+from planner_jax.sims.guard import guard_server
 from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
@@ -109,7 +109,7 @@ class Viewer:
         self._titles = [task.title(recording, row) for row in range(len(recording))]
         is_own = ipaddress.ip_address(address.partition("%")[0]).is_loopback
         token = None if is_own else secrets.token_urlsafe(16)
-        with guarded({host, address}, token) as is_guarded:
+        with guard_server({host, address}, token) as is_guarded:
             self._server = viser.ViserServer(address, port, label="planner-jax", verbose=False)
         if not is_guarded():
             self._server.stop()

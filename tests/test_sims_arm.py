@@ -34,7 +34,7 @@ from planner_jax.sims.tasks.block_flights import (
     courses_of,
     fly_blocks,
     require_arm,
-    scored,
+    score,
     throws,
 )
 from planner_jax.sims.tasks.intercept import CAR_WORLD
@@ -182,7 +182,7 @@ def as_planned(cases, angles, end=0.8):
     nothing, none = np.zeros((num, 6)), np.zeros(num)
     flown = Executed(times, held, held, np.zeros((num, 2)), *[nothing] * 6)
     cases = jax.tree.map(np.asarray, cases)
-    return scored(cases, plans(*[STILL] * num, contact=0.5), flown, Budget(*[none] * 6))
+    return score(cases, plans(*[STILL] * num, contact=0.5), flown, Budget(*[none] * 6))
 
 
 def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
@@ -227,7 +227,7 @@ def test_clearances_of_an_exact_execution_are_those_of_the_referee():
     angles = np.asarray(at(course, times.astype(np.float32)), float)
     nothing = np.zeros((LANES, 6))
     flown = Executed(times, angles, angles, np.zeros((LANES, 2)), *[nothing] * 6)
-    found = scored(cases, plan, flown, Budget(*[np.zeros(LANES)] * 6))
+    found = score(cases, plan, flown, Budget(*[np.zeros(LANES)] * 6))
     np.testing.assert_allclose(found.clearance, least, atol=1e-3)
     assert found.clearance.min() < found.clearance.max()
 

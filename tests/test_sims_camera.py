@@ -12,7 +12,7 @@ import planner_jax as pj
 from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sims import camera as scene_camera
-from planner_jax.sims.board import calibrated, show_board
+from planner_jax.sims.board import calibrate_camera, show_board
 from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
 from planner_jax.sims.segment import ball_look, sighting
 from planner_jax.studies.block.camera import project
@@ -97,7 +97,7 @@ def test_no_opengl_is_one_line(monkeypatch):
 
 def test_the_arm_shows_a_board_from_which_the_camera_is_found():
     arm, noise = irb1600(), stereo_noise()
-    found, calibration = calibrated(arm, CAMERA, noise, 12)
+    found, calibration = calibrate_camera(arm, CAMERA, noise, 12)
     np.testing.assert_allclose(found.position, CAMERA.position, atol=0.002)
     np.testing.assert_allclose(found.rotation, CAMERA.rotation, atol=0.002)
     assert calibration.residual == pytest.approx(1.0, abs=0.1)

@@ -14,7 +14,7 @@ import planner_jax as pj
 from planner_jax.cli.main import main
 from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.target import TurningPath
-from planner_jax.sims.drive import DriveLoop, drive_on, started
+from planner_jax.sims.drive import DriveLoop, drive_on, start_drives
 from planner_jax.sims.film import draw_flight
 from planner_jax.sims.model import step
 from planner_jax.sims.noise import PlaneSensing
@@ -28,11 +28,11 @@ from planner_jax.sims.tasks.intercept import (
     CAR_WORLD,
     Driven,
     Meetings,
-    expected,
     fly_intercepts,
     meetings,
+    predict_scene,
     require_car,
-    scored,
+    score,
 )
 from planner_jax.task import intercept
 from planner_jax.task.intercept.plan import InterceptPlan
@@ -71,7 +71,7 @@ def driven(sensing):
     """The ways of WAYS, driven: the drives at their end and all frames."""
     loop = DriveLoop(CAR_WORLD, sensing)
     keys = jax.random.split(jax.random.key(3), len(WAYS))
-    drives = started(loop, plans(*zip(*WAYS.values(), strict=True)), keys)
+    drives = start_drives(loop, plans(*zip(*WAYS.values(), strict=True)), keys)
     until = np.full(len(WAYS), END, np.float32)  # one program with that of flights
     for _ in range(2):
         drives, frames = drive_on(CAR_WORLD, drives, until, num_frames=100)
@@ -203,7 +203,7 @@ def test_contacts_of_planned_poses_are_those_that_the_referee_finds():
         plans=np.ones(6, int),
         ways=np.zeros((6, len(setpoints.time), 0, 2)),
     )
-    found, verdict = scored(cases, plan, flown), intercept.judge(cases, plan)
+    found, verdict = score(cases, plan, flown), intercept.judge(cases, plan)
     for name in ("wall_clearance", "mover_clearance", "miss"):
         np.testing.assert_allclose(getattr(found, name), getattr(verdict, name), atol=2e-4)
     assert found.touched.any() and not found.touched.all()
@@ -213,7 +213,7 @@ def test_contacts_of_planned_poses_are_those_that_the_referee_finds():
 def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
     loop = DriveLoop(CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
     seen = meetings("easy", 2, seed=4, observation_rate=1.0)
-    of = jax.jit(functools.partial(expected, loop, known_target=False, predict_movers=True))
+    of = jax.jit(functools.partial(predict_scene, loop, known_target=False, predict_movers=True))
     path, movers = jax.device_get(of(seen, np.float32(3.04)))
     later = dataclasses.replace(seen, target=seen.target + 9.0 * (seen.times > 2.5)[..., None])
     np.testing.assert_array_equal(path.pos, of(later, np.float32(3.04))[0].pos)

@@ -25,7 +25,7 @@ from planner_jax.sims.tasks.catch_ahead import (
     LIMITS,
     bounds,
     compile_attempts,
-    planned_ahead,
+    plan_ahead,
     within,
 )
 from planner_jax.sims.tasks.catch_pilot import is_worth_flying
@@ -143,14 +143,14 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
     # The second lane's next ball is to be caught at once.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
-    known, plans = planned_ahead(catch.planner(decide="greedy"), both, 0, WIDER)
+    known, plans = plan_ahead(catch.planner(decide="greedy"), both, 0, WIDER)
     assert not known.present[1, 1] and known.present[1, 0]
     assert not is_unsolved(plans.status).any()
 
 
 @struct.dataclass
 class Outcome:
-    """What `planned_ahead` looks at in a plan."""
+    """What `plan_ahead` looks at in a plan."""
 
     status: np.ndarray
     violation: np.ndarray
@@ -180,7 +180,7 @@ def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
 
     monkeypatch.setattr(catch_ahead, "plan_all", planned)
     both = jax.tree.map(np.asarray, catch.draw(1, "parabola2", seed=4))
-    known, plans = planned_ahead(catch.planner(), within(both, WIDER[0]), 0, WIDER)
+    known, plans = plan_ahead(catch.planner(), within(both, WIDER[0]), 0, WIDER)
     assert (known.present.all(), known.limits.body_rate[0]) == chosen
     assert plans.violation[0] == (pair if chosen[0] else alone)[chosen[1]]
 

@@ -13,10 +13,17 @@ import pytest
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.robot.quadrotor_model import FlightLimits
-from planner_jax.sims.launch import awaited, ready, require_plan, require_world
-from planner_jax.sims.loop import expected
+from planner_jax.sims.launch import await_ball, ready, require_plan, require_world
+from planner_jax.sims.loop import predict_balls
 from planner_jax.sims.loop_state import Loop
-from planner_jax.sims.model import BALL_MASS, at_rest, ball_states, mujoco_model, placed, step
+from planner_jax.sims.model import (
+    BALL_MASS,
+    at_rest,
+    ball_states,
+    mujoco_model,
+    place_balls,
+    step,
+)
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
@@ -24,7 +31,14 @@ from planner_jax.sims.robots.quadrotor.reference import with_rest
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.scenery import machine_parts, outlines
 from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
-from planner_jax.sims.sensing import anchored, first_estimate, look, observed, predicted, with_drag
+from planner_jax.sims.sensing import (
+    anchor_energy,
+    first_estimate,
+    look,
+    observe,
+    predict,
+    with_drag,
+)
 from planner_jax.sims.tasks.catch import CATCH_WORLD
 from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds
 from planner_jax.sims.tasks.hit import HIT_WORLD, court_parts
@@ -189,7 +203,7 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
     world = CATCH_WORLD
     balls = BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
     drag = jnp.array([0.06])
-    start = placed(
+    start = place_balls(
         world, at_rest(world, jnp.array([0.0, 0.0, 1.0])), balls, drag, jnp.array([True])
     )
     late = np.arange(400)[:, None] > 200
@@ -269,12 +283,12 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
     ball = BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
     flown = jax.jit(functools.partial(fly, num_steps=130))(ball, 1.3, true, GRAVITY)
     path, ahead = flown[1].pos[:120], flown[0].pos
-    seen = jax.jit(lambda path: observed(jax.random.key(0), path, sensing))(path)
+    seen = jax.jit(lambda path: observe(jax.random.key(0), path, sensing))(path)
 
     def advance(estimate, now):
         number, at = now
         estimate = look(estimate, at, sensing, GRAVITY)
-        fresh = anchored(estimate, GRAVITY)
+        fresh = anchor_energy(estimate, GRAVITY)
         later = with_drag(estimate, GRAVITY)
         return jax.tree.map(lambda a, b: jnp.where(number < 30, a, b), fresh, later), None
 
@@ -283,7 +297,7 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
     @jax.jit
     def followed(first):
         last = jax.lax.scan(advance, first, (jnp.arange(120), seen))[0]
-        return last.drag, predicted(last, 0.1, GRAVITY).pos
+        return last.drag, predict(last, 0.1, GRAVITY).pos
 
     drag, later = followed(first)
     assert abs(drag / true - 1.0) < 0.06
@@ -299,10 +313,13 @@ def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
         """The balls then, of both estimates, and the drag."""
         flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
         drag = jnp.full((3, 2), 0.06)
-        flights = awaited(loop, flights, coming, drag, ball=1, ahead=0.8)
+        flights = await_ball(loop, flights, coming, drag, ball=1, ahead=0.8)
         then = [
-            jax.vmap(lambda known, ahead=ahead: expected(loop, known, ahead))(estimates)
-            for estimates, ahead in ((flights.estimates, 0.8), (flights.earlier, 0.8 + loop.period))
+            jax.vmap(lambda known, ahead=ahead: predict_balls(loop, known, ahead))(estimates)
+            for estimates, ahead in (
+                (flights.estimates, 0.8),
+                (flights.earlier, 0.8 + loop.period),
+            )
         ]
         return then, flights.estimates.drag
 
@@ -315,7 +332,7 @@ def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
 
 def test_a_lost_look_shows_nothing():
     sensing = Sensing(dropout=0.25)
-    seen = jax.jit(lambda key: observed(key, jnp.zeros((2000, 3)), sensing))(jax.random.key(1))
+    seen = jax.jit(lambda key: observe(key, jnp.zeros((2000, 3)), sensing))(jax.random.key(1))
     assert abs(np.isnan(seen[:, 0]).mean() - 0.25) < 0.04
 
 

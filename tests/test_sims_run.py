@@ -19,9 +19,9 @@ from planner_jax.core.registry import Task, all_tasks
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sims import loop as sims_loop
 from planner_jax.sims.film import draw_flight, film_flights, require_film
-from planner_jax.sims.launch import flight_keys, launched, ready
+from planner_jax.sims.launch import flight_keys, launch_ball, ready
 from planner_jax.sims.loop import begin_compiling, fly_leg
-from planner_jax.sims.loop_state import flown
+from planner_jax.sims.loop_state import collect_flights
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.run import start_flights
 from planner_jax.sims.scoring import passage
@@ -219,7 +219,7 @@ class RisingPilot(DropPilot):
         codes = jax.ShapeDtypeStruct((self.num,), jnp.int32)
         return HoverPlan(PiecewisePolynomial(path, one), codes, codes)
 
-    def asked(self, case, plan, outlook):
+    def pose_problem(self, case, plan, outlook):
         return plan
 
     @property
@@ -228,7 +228,7 @@ class RisingPilot(DropPilot):
         raised = lambda plan: jax.tree.map(lambda x: higher(x) if x.ndim == 3 else x, plan)  # noqa: E731
         return (lambda plan: plan, raised)
 
-    def chosen(self, asked, outlook, found):
+    def choose(self, asked, outlook, found):
         return found[1], outlook.time < 0.09
 
 
@@ -250,7 +250,7 @@ class DropFlight(BallFlightTask):
 
     def fly(self, cases, record):
         state, looks, plan = self.leg(self.loop(record), cases, DropPilot(), 60)
-        return DropFlights(plan, flown(state, looks), 0.0)
+        return DropFlights(plan, collect_flights(state, looks), 0.0)
 
     def leg(self, loop, cases, pilot, periods):
         num = len(cases)
@@ -260,7 +260,7 @@ class DropFlight(BallFlightTask):
         plan = HoverPlan(PiecewisePolynomial(path, jnp.ones((num, 1))), codes, codes)
         state = ready(loop, place, flight_keys(self.settings.seed, cases.index))
         balls = self.launches(cases, None).balls
-        state = launched(loop, state, balls, drag, drag, ball=0, seen=0.1)
+        state = launch_ball(loop, state, balls, drag, drag, ball=0, seen=0.1)
         state = state.replace(plan=plan, began=state.time, present=state.launched)
         return *fly_leg(loop, pilot, state, None, drag, num_periods=periods), plan
 
@@ -285,7 +285,7 @@ def test_the_parts_of_a_period_fly_as_one_program_does(monkeypatch):
     for in_parts in (False, True):
         monkeypatch.setattr(sims_loop, "in_parts", lambda _, parts=in_parts: parts)
         state, looks, _ = flight.leg(loop, flight.cases(), RisingPilot(), 8)
-        flights.append(dataclasses.asdict(flown(state, looks)))
+        flights.append(dataclasses.asdict(collect_flights(state, looks)))
     whole, parts = flights
     assert whole["plan"]["trajectory"]["coeffs"][0, 0, 0, 2] == pytest.approx(1.004, abs=1e-6)
     assert whole["record"]["time"].shape == (2, 8 * loop.looks_per_plan)
@@ -307,7 +307,7 @@ def test_a_leg_compiled_ahead_is_not_compiled_again(monkeypatch, caplog):
         fly_leg(loop, pilot, start.replace(plan=plan), None, drag, num_periods=3)
     finally:
         jax.config.update("jax_log_compiles", False)
-    assert ahead == ["_asked", "_fly", "_found", "_found", "_with_plans"]
+    assert ahead == ["_pose_problems", "_fly", "_search_plans", "_search_plans", "_with_plans"]
     assert compiled_parts(caplog) == ahead
 
 

@@ -26,8 +26,8 @@ from planner_jax.sims.recording import (
     Launches,
     Recording,
     frame,
+    make_recording,
     read_recording,
-    recorded,
     to_rows,
 )
 from planner_jax.sims.robot import Physics
@@ -75,7 +75,7 @@ def kept(flown, balls, begins, **more):
     drag = np.zeros((1, len(begins)))
     launches = Launches(balls, drag, np.array(begins), seen=0.3, **more)
     one = {"index": np.array([0]), "success": np.array([True])}
-    return recorded(CATCH_WORLD, flown, launches, **one)
+    return make_recording(CATCH_WORLD, flown, launches, **one)
 
 
 def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():

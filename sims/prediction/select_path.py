@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
-from planner_jax.sims.prediction.turn_fit import best_turn, given_rate, path_of, tangent
+from planner_jax.sims.prediction.turn_fit import best_turn, fit_rate, path_of, tangent
 
 _REACH = 5.0  # standard deviations of the turn rate that are looked at, to either side
 _OFFSETS = np.linspace(-1.0, 1.0, 49)  # where, in reaches
@@ -158,7 +158,7 @@ def select(
     reach = _REACH / jnp.sqrt(precision)
     step = reach * (_OFFSETS[1] - _OFFSETS[0])
     rates = best.rate * information / precision + reach * jnp.asarray(_OFFSETS, dtype)
-    fits = jax.vmap(given_rate, in_axes=(None, 0))(seen, jnp.append(jnp.zeros((), dtype), rates))
+    fits = jax.vmap(fit_rate, in_axes=(None, 0))(seen, jnp.append(jnp.zeros((), dtype), rates))
     chance = jnp.asarray(prior.chance, dtype)
     of_turns = prior.log_density(rates) + jnp.log(step) + jnp.log(chance)
     log_prior = jnp.append(jnp.log1p(-chance), of_turns)
@@ -168,7 +168,7 @@ def select(
         rate = _median(rates, step, likely[1:], likely[0])
     else:
         rate = jnp.where(gains[0] > threshold, best.rate, 0.0)
-    chosen = given_rate(seen, jnp.where(enough, rate, 0.0))
+    chosen = fit_rate(seen, jnp.where(enough, rate, 0.0))
     return Prediction(
         path=path_of(seen, chosen),
         is_turning=chosen.rate != 0.0,

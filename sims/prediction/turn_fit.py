@@ -59,7 +59,7 @@ def fit_turn(
     return path_of(seen, best_turn(seen, fastest))
 
 
-def given_rate(seen: Centred, rate: Array) -> TurnFit:
+def fit_rate(seen: Centred, rate: Array) -> TurnFit:
     """Fit position and velocity for a turn rate () [rad/s] by least squares."""
     arcs = arc(rate, seen.after)
     lever = _mean(seen, arcs)
@@ -78,21 +78,21 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
         information: () [m^2 s^2/rad^2], weighted sum of their squares over the observations.
     """
 
-    def bent(after: Array) -> tuple[Pair, Pair]:
+    def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
         """Return arcs, and how the paths along them move with the rate alone."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
 
-    arcs, moved = bent(seen.after)
+    arcs, moved = differentiate_arcs(seen.after)
     mean = _mean(seen, moved)
     follows = _share(seen, _minus(arcs, fit.lever), fit.power, moved)
 
-    def left(arcs: Pair, moved: Pair) -> Pair:
+    def subtract_fit(arcs: Pair, moved: Pair) -> Pair:
         return _minus(_minus(moved, mean), _times(follows, _minus(arcs, fit.lever)))
 
-    of_seen = left(arcs, moved)
-    return lambda after: left(*bent(after)), _sum(seen, of_seen, of_seen)
+    of_seen = subtract_fit(arcs, moved)
+    return lambda after: subtract_fit(*differentiate_arcs(after)), _sum(seen, of_seen, of_seen)
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
@@ -100,31 +100,31 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
 
     def downhill(rate: Array) -> Array:
         """Return half the negative slope of the sum of squares by the rate, () [m^2 s/rad]."""
-        fit = given_rate(seen, rate)
+        fit = fit_rate(seen, rate)
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)
 
     spacing = jnp.asarray(fastest, seen.after.dtype) * (2.0 / (_RATES - 1))
-    rate = lax.stop_gradient(_searched(lax.stop_gradient(seen), spacing))
+    rate = lax.stop_gradient(_search_rate(lax.stop_gradient(seen), spacing))
     # By the implicit function theorem a step of Newton from where the slope vanishes has the
     # derivatives of the optimum, the curvature taken as constant.
     slope, curvature = jax.jvp(downhill, (rate,), (jnp.ones_like(rate),))
     curved = (curvature < 0.0) & (seen.num >= 3)
     step = slope / lax.stop_gradient(jnp.where(curved, curvature, -1.0))
-    return given_rate(seen, rate - jnp.where(curved, jnp.clip(step, -spacing, spacing), 0.0))
+    return fit_rate(seen, rate - jnp.where(curved, jnp.clip(step, -spacing, spacing), 0.0))
 
 
-def _searched(seen: Centred, spacing: Array) -> Array:
+def _search_rate(seen: Centred, spacing: Array) -> Array:
     """Search the best turn rate by Gauss-Newton (Kaufman's variable projection).
 
     It begins from the best of rates that are equally spaced around zero, and goes no further than
     the next ones.
     """
     rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
-    squares = jax.vmap(lambda rate: given_rate(seen, rate).squares)(rates)
+    squares = jax.vmap(lambda rate: fit_rate(seen, rate).squares)(rates)
 
     def refine(k: Array, rate: Array) -> Array:
-        fit = given_rate(seen, rate)
+        fit = fit_rate(seen, rate)
         slope, information = tangent(seen, fit)
         step = _sum(seen, slope(seen.after), fit.residual)
         step = step / jnp.where(information > 0.0, information, 1.0)

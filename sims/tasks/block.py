@@ -136,7 +136,7 @@ class BlockFlight(FlightTask):
                 frame_rate=settings.frame_rate,
                 seed=settings.seed,
             )
-            decided, seconds, _ = measure(lambda: arms.decided(cases.cases))
+            decided, seconds, _ = measure(lambda: arms.decide_batch(cases.cases))
         flights = fly_blocks(
             BLOCK_WORLD,
             cases,

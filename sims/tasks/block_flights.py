@@ -201,7 +201,7 @@ def fly_blocks(
         stand=contact - (delay - budget) - np.maximum(budget, seconds) - move,
         rest=entry - contact,
     )
-    flights = scored(case, plan, flown, budget)
+    flights = score(case, plan, flown, budget)
     if decided is None:
         return flights
     first, last = (np.asarray(decided.fit_errors(place)[0], float) for place in (0, -1))
@@ -242,7 +242,7 @@ def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
     return pos + vel * times - 0.5 * fall * times**2
 
 
-def scored(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
+def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
     """Compare flown motions with the balls and all obstacles, in float64.
 
     A ball is blocked when it comes down on the face of the shield, from in front and with its

@@ -23,7 +23,7 @@ BUDGET = {
 }
 
 
-def _boxed(box: Box, colour: str, opacity: float) -> Part:
+def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
     """Return a box of the scene as it is drawn, in the world."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
@@ -39,9 +39,11 @@ def _around(ends: np.ndarray, radius: float) -> np.ndarray:
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
     """Return both boxes, the beams, what the arm stands on and the pole, as they are drawn."""
     scene, (lower, upper) = paper_scene(), arm.base_box
-    parts = [_boxed(scene.inner, GREEN, 0.1), _boxed(scene.outer, SKY, 0.07)]
+    parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
-        parts.append(_boxed(Box(*_around(np.asarray(ends, float), float(radius))), GREY, 1.0))
+        parts.append(
+            _make_box_part(Box(*_around(np.asarray(ends, float), float(radius))), GREY, 1.0)
+        )
     x, y, _ = 0.5 * (lower + upper)
     length, width, _ = upper - lower
     parts.append(Part("box", (length, width, -FLOOR), (x, y, -0.5 * FLOOR), GREY))

@@ -21,15 +21,15 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.robot.quadrotor_model import PAPER_CATCHER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, Column, list_of
 from planner_jax.sims.launch import (
-    awaited,
+    await_ball,
     flight_keys,
-    launched,
+    launch_ball,
     ready,
     require_plan,
     require_world,
 )
 from planner_jax.sims.loop import begin_compiling, fly_leg, in_parts
-from planner_jax.sims.loop_state import Flown, Loop, flown
+from planner_jax.sims.loop_state import Flown, Loop, collect_flights
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -37,10 +37,10 @@ from planner_jax.sims.settings import INTERVAL, CatchFly, require_interval
 from planner_jax.sims.task import BallFlightTask, FlightCases, Flights
 from planner_jax.sims.tasks.catch_ahead import (
     LIMITS,
-    believed,
     bounds,
     compile_attempts,
-    planned_ahead,
+    plan_ahead,
+    predict_case,
     with_catch,
 )
 from planner_jax.sims.tasks.catch_pilot import LIFT, CatchPilot
@@ -145,7 +145,7 @@ def fly_catches(
     """Plan and fly a batch of throws.
 
     Whenever a ball comes into sight, its catch and that of the one awaited next are planned from
-    scratch (`planned_ahead`), from where the last of those seen before will have been made; all
+    scratch (`plan_ahead`), from where the last of those seen before will have been made; all
     that are left are then re-planned inside the loop.
 
     Args:
@@ -172,22 +172,22 @@ def fly_catches(
     flight = ready(loop, jnp.tile(jnp.array(START), (len(cases), 1)), keys)
     nothing = np.zeros(num_balls, bool), np.zeros(cases.horizon.shape, np.float32)
     compiled = begin_compiling(
-        loop, pilot, flight, believed.eval_shape(loop, flight, *nothing), drag
+        loop, pilot, flight, predict_case.eval_shape(loop, flight, *nothing), drag
     )
     first: Any = plan
     records, planning = [], 0.0
     shortest, window = earliest_throw("throws")
     for ball in range(num_balls):
-        flight = launched(loop, flight, balls, drag, guess, ball=ball, seen=SEEN)
+        flight = launch_ball(loop, flight, balls, drag, guess, ball=ball, seen=SEEN)
         until = cases.horizon + INTERVAL * (np.arange(num_balls) - ball)
         given, last = plan is not None and ball == 0, ball == num_balls - 1
         if not last:
             coming = jax.tree.map(jnp.asarray, shortest)
-            flight = awaited(loop, flight, coming, guess, ball=ball + 1, ahead=INTERVAL)
+            flight = await_ball(loop, flight, coming, guess, ball=ball + 1, ahead=INTERVAL)
             until[:, ball + 1] = INTERVAL + window
         horizon = jnp.asarray(until, jnp.float32)
         new = np.isin(np.arange(num_balls), [ball] if given else [ball, ball + 1])
-        known = believed(loop, flight, jnp.asarray(new), horizon)
+        known = predict_case(loop, flight, jnp.asarray(new), horizon)
         if given:
             found: Any = plan
             require_plan(found, CatchPlan, known.head_state)
@@ -199,7 +199,7 @@ def fly_catches(
             limits = [bounds(loop, each) for each in LIMITS]
             if ball == 0 and not last and in_parts(flight):  # some lanes will need all attempts
                 compile_attempts(planner, known)
-            known, found = planned_ahead(planner, known, ball, limits)
+            known, found = plan_ahead(planner, known, ball, limits)
             planning += time.perf_counter() - began
         first = found if first is None else first
         begun = jax.tree.map(jnp.asarray, found)
@@ -214,7 +214,7 @@ def fly_catches(
             num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
         )
         records += looks
-    return CatchFlights(first, flown(flight, records), planning)
+    return CatchFlights(first, collect_flights(flight, records), planning)
 
 
 class CatchFlight(BallFlightTask):

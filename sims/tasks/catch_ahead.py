@@ -19,7 +19,7 @@ from planner_jax.host.machine import as_here
 from planner_jax.planning.batch import Watch
 from planner_jax.planning.drive import Driver
 from planner_jax.planning.plan import plan as plan_all
-from planner_jax.sims.loop import expected
+from planner_jax.sims.loop import predict_balls
 from planner_jax.sims.loop_state import FlightState, Loop
 from planner_jax.sims.tasks.catch_pilot import BORNE, CatchPilot, tables
 from planner_jax.task.catch.case import CatchCase
@@ -35,7 +35,7 @@ LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
+def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
     """What is believed of a ball that has come into sight and of the next one, to be planned.
 
     The plans begin where and when the last catch of a ball seen before will have been made, or
@@ -67,7 +67,7 @@ def believed(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> Ca
         else:
             after = until_last_catch(flight, new)
             head = robot.head_state(flight.plan, flight.time - flight.began + after)
-        balls = expected(loop, flight.earlier, loop.period + after)
+        balls = predict_balls(loop, flight.earlier, loop.period + after)
         horizon = horizon - after
         return dataclasses.replace(
             case,
@@ -94,7 +94,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
     flown, after its last such catch. Elsewhere the new plan is flown alone, from now on.
 
     Args:
-        flights: the ones for which `believed` was called.
+        flights: the ones for which `predict_case` was called.
         found: plans (B, ...) of the cases that it returned.
         new: (B, N) bool, the balls that `found` catches.
     """
@@ -170,7 +170,7 @@ def compile_attempts(planner: Planner, cases: Any) -> None:
     _EveryAttempt()(planner, cases)
 
 
-def planned_ahead(
+def plan_ahead(
     planner: Planner[CatchCase, CatchPlan],
     known: CatchCase,
     ball: int,
@@ -215,12 +215,12 @@ def planned_ahead(
         better = is_solved(np.asarray(found.status)) | (found.violation < before)
         to, chosen = lanes[better], np.flatnonzero(better)
 
-        def merged(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:
+        def merge(old: Any, new: Any, to: np.ndarray = to, chosen: np.ndarray = chosen) -> Any:
             old = np.array(old)
             old[to] = np.asarray(new)[chosen]
             return old
 
-        cases, plans = jax.tree.map(merged, (cases, plans), (part, found))
+        cases, plans = jax.tree.map(merge, (cases, plans), (part, found))
     return cases, plans
 
 

@@ -59,7 +59,7 @@ class CatchPilot:
         """Those of the planner behind the re-planner."""
         return self.planner.planner.plan_shapes(cases)
 
-    def asked(
+    def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
         """What is still to be caught, while a plan is flown."""
@@ -85,9 +85,9 @@ class CatchPilot:
         The first is a short round of the re-planner.
         """
         from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
-        return (from_last, self._decided_anew) if self.redecide > 0.0 else (from_last,)
+        return (from_last, self._decide_again) if self.redecide > 0.0 else (from_last,)
 
-    def chosen(
+    def choose(
         self,
         asked: Replanning[CatchCase, CatchPlan],
         outlook: Outlook,
@@ -109,7 +109,7 @@ class CatchPilot:
         excess = jnp.where(jnp.sum(left.present) > 1, self.excess[1], self.excess[0])
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
-    def _decided_anew(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
+    def _decide_again(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
         """A plan from scratch of what is left, with the decision's first choice."""
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)

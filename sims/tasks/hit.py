@@ -20,9 +20,9 @@ from planner_jax.planning.replan import Replanning
 from planner_jax.robot.quadrotor_model import PAPER_HITTER, QuadrotorModel
 from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
-from planner_jax.sims.launch import flight_keys, launched, ready, require_plan, require_world
-from planner_jax.sims.loop import begin_compiling, expected, fly_leg
-from planner_jax.sims.loop_state import FlightState, Flown, Loop, Outlook, flown
+from planner_jax.sims.launch import flight_keys, launch_ball, ready, require_plan, require_world
+from planner_jax.sims.loop import begin_compiling, fly_leg, predict_balls
+from planner_jax.sims.loop_state import FlightState, Flown, Loop, Outlook, collect_flights
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -111,10 +111,12 @@ class HitPilot:
         """Those of the planner behind the re-planner."""
         return self.planner.planner.plan_shapes(cases)
 
-    def asked(self, case: HitCase, plan: HitPlan, outlook: Outlook) -> Replanning[HitCase, HitPlan]:
+    def pose_problem(
+        self, case: HitCase, plan: HitPlan, outlook: Outlook
+    ) -> Replanning[HitCase, HitPlan]:
         """What is to be planned anew, while a plan is flown."""
         return Replanning(
-            case=believed(case, outlook.balls, outlook.drag, outlook.head_state),
+            case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
             elapsed=outlook.elapsed,
         )
@@ -124,7 +126,7 @@ class HitPilot:
         """One short round of the re-planner."""
         return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
 
-    def chosen(
+    def choose(
         self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]
     ) -> tuple[HitPlan, Array]:
         """The plan that was found, and whether it is good enough."""
@@ -134,7 +136,7 @@ class HitPilot:
         return plan, good & (plan.violation <= self.excess)
 
 
-def believed(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
+def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
     """One case for what its ball (leaves (1, 3)) seems to do, drag (1,)."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
@@ -187,27 +189,27 @@ class HitFlights(Flights):
         return self.miss <= _NEAR
 
 
-def returned(contact: Contact, restitution: Array) -> BallState:
+def reflect_ball(contact: Contact, restitution: Array) -> BallState:
     """One ball just after the racket's impact, by the library's map [Yu2023bat, eq. 3]."""
     vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
     return BallState(pos=contact.ball_pos, vel=vel)
 
 
 @functools.partial(jax.jit, static_argnames="loop")
-def _believed(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
+def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
     """What is to be hit, as it is believed."""
 
     def one(flight: FlightState, case: HitCase) -> HitCase:
-        balls = expected(loop, flight.earlier, loop.period)
-        return believed(case, balls, flight.earlier.drag, case.head_state)
+        balls = predict_balls(loop, flight.earlier, loop.period)
+        return replace_ball(case, balls, flight.earlier.drag, case.head_state)
 
     return jax.vmap(one)(flights, truth)
 
 
-def _returned(contact: Contact, truth: HitCase) -> BallState:
+def _reflect_balls(contact: Contact, truth: HitCase) -> BallState:
     """Balls just after their impacts, leaves (B, 3) in NumPy, NaN where they were missed."""
     one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
-    balls = jax.device_get(jax.vmap(returned)(one, truth.restitution))
+    balls = jax.device_get(jax.vmap(reflect_ball)(one, truth.restitution))
     return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
 
 
@@ -245,8 +247,8 @@ def fly_hits(
     compiled = begin_compiling(loop, pilot, flight, truth, drag)
     balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
     guess = jnp.asarray(cases.believed)[:, None]
-    flight = launched(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
-    known = jax.block_until_ready(_believed(loop, flight, truth))
+    flight = launch_ball(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
+    known = jax.block_until_ready(_predict_cases(loop, flight, truth))
     clock = time.perf_counter()
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
@@ -258,10 +260,10 @@ def fly_hits(
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
     compiled()
     flight, records = fly_leg(loop, pilot, flight, known, drag, num_periods=periods)
-    back, truth = _returned(flight.contact, truth), cases.cases
+    back, truth = _reflect_balls(flight.contact, truth), cases.cases
     point = landing(back.pos, back.vel, truth.drag, truth.gravity)[1]
     miss = np.nan_to_num(np.linalg.norm(point - truth.target, axis=1), nan=np.inf)
-    return HitFlights(first, flown(flight, records), planning, point, miss)
+    return HitFlights(first, collect_flights(flight, records), planning, point, miss)
 
 
 class HitFlight(BallFlightTask):
@@ -309,7 +311,7 @@ class HitFlight(BallFlightTask):
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
         """The serves, and the balls that come back from the racket."""
         truth = cases.cases
-        back = _returned(flown.contact, truth)
+        back = _reflect_balls(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
         drag = truth.drag[:, None]
         return Launches(balls, drag, np.zeros(1), SEEN, returned=back, target=truth.target)

@@ -27,9 +27,9 @@ from planner_jax.sims.drive import (
     DriveLoop,
     DriveState,
     Frame,
-    believed_state,
     drive_on,
-    started,
+    estimate_state,
+    start_drives,
 )
 from planner_jax.sims.launch import flight_keys
 from planner_jax.sims.model import World
@@ -109,7 +109,7 @@ def meetings(
 
 
 @functools.partial(jax.jit, static_argnames=("loop", "known_target", "predict_movers"))
-def expected(
+def predict_scene(
     loop: DriveLoop, meetings: Meetings, now: Array, *, known_target: bool, predict_movers: bool
 ) -> tuple[TurningPath, Obstacles]:
     """Where targets and movers are believed to go; both count from now.
@@ -259,7 +259,7 @@ def fly_intercepts(
     frames = loop.sensing.frames_per_plan(replan)
     planner = planner or intercept_planner()
     ways = functools.partial(
-        expected, loop, cases, known_target=known_target, predict_movers=predict_movers
+        predict_scene, loop, cases, known_target=known_target, predict_movers=predict_movers
     )
     truth = jax.tree.map(jnp.asarray, cases.cases)
     until, zero = truth.time, jnp.zeros((), truth.time.dtype)
@@ -270,23 +270,23 @@ def fly_intercepts(
     clock = time.perf_counter()
     first = jax.block_until_ready(plan_all(planner, begun)) if plan is None else plan
     planning = time.perf_counter() - clock
-    drive = started(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
+    drive = start_drives(loop, jax.tree.map(jnp.asarray, first), flight_keys(seed, cases.index))
     number = np.ones(len(cases), int)
     parts, seen = [], []
     periods = int(np.ceil(float(jnp.max(until)) * FRAME_RATE / frames - 1e-6))
     for period in range(periods):
-        seen.append((_sampled(target, until - drive.time), frames))
+        seen.append((_sample_paths(target, until - drive.time), frames))
         drive, part = drive_on(loop.world, drive, until, num_frames=frames)
         parts.append(part)
         if replan > 0.0 and period + 1 < periods:
             target, movers = ways(drive.time[0])
-            drive, begun, good = planned_anew(loop, planner, drive, begun, target, movers)
+            drive, begun, good = plan_again(loop, planner, drive, begun, target, movers)
             number += np.asarray(good)
-    flown = _driven(truth, drive, parts, seen, number)
-    return scored(cases.cases, first, flown, planning)
+    flown = _collect_drives(truth, drive, parts, seen, number)
+    return score(cases.cases, first, flown, planning)
 
 
-def planned_anew(
+def plan_again(
     loop: DriveLoop,
     planner: Any,
     drive: DriveState,
@@ -307,7 +307,7 @@ def planned_anew(
     Returns:
         The drives, the cases that their plans are of, and (B,) bool, which plans are new.
     """
-    pose, speed, curvature = jax.vmap(functools.partial(believed_state, loop))(drive)
+    pose, speed, curvature = jax.vmap(functools.partial(estimate_state, loop))(drive)
     elapsed = drive.time - drive.began
     if isinstance(planner, SpacetimeIntercept):
         again = planner.replanner()
@@ -321,11 +321,11 @@ def planned_anew(
         found = plan_all(planner, left)
     left, found = jax.tree.map(jnp.asarray, (left, found))
     good = is_solved(found.status) & (left.time >= _SHORTEST)
-    return *_changed(good, (drive.plan, drive.began, begun), found, left, drive), good
+    return *_replace_plans(good, (drive.plan, drive.began, begun), found, left, drive), good
 
 
 @jax.jit
-def _changed(
+def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
     """Drives, and what their plans are of, with new plans where those are good (B,)."""
@@ -338,14 +338,14 @@ def _changed(
 
 
 @jax.jit
-def _sampled(path: TurningPath, span: Array) -> Array:
+def _sample_paths(path: TurningPath, span: Array) -> Array:
     """Points (B, M, 2) [m] on paths up to spans (B,) [s]."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
 
 
-def _driven(
+def _collect_drives(
     truth: InterceptCase,
     drive: DriveState,
     parts: list[Frame],
@@ -370,7 +370,7 @@ def _driven(
     )
 
 
-def scored(
+def score(
     cases: InterceptCase, first: InterceptPlan, flown: Driven, planning_seconds: float = 0.0
 ) -> InterceptFlights:
     """Drives held against what truly was: miss and contacts, in float64.

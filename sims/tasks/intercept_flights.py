@@ -59,10 +59,14 @@ class InterceptFlight(FlightTask):
             ("wall_clearance", "m", "least; negative inside"),
             ("mover_clearance", "m", "least; negative inside"),
         ),
-        Column("meeting_time", "s", "end of the last plan", NUMBER, lambda b: _flown(b).meeting),
-        Column("drive_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 0]),
-        Column("steering_saturated", "1", "share", NUMBER, lambda b: _flown(b).saturation[:, 1]),
-        Column("num_plans", "", "that were driven", NUMBER, lambda b: _flown(b).plans),
+        Column(
+            "meeting_time", "s", "end of the last plan", NUMBER, lambda b: _get_drives(b).meeting
+        ),
+        Column("drive_saturated", "1", "share", NUMBER, lambda b: _get_drives(b).saturation[:, 0]),
+        Column(
+            "steering_saturated", "1", "share", NUMBER, lambda b: _get_drives(b).saturation[:, 1]
+        ),
+        Column("num_plans", "", "that were driven", NUMBER, lambda b: _get_drives(b).plans),
     )
 
     def world(self) -> World:
@@ -118,12 +122,12 @@ class InterceptFlight(FlightTask):
             success=flights.success[lanes],
             time=times,
             robot=flown.poses[lanes][:, kept],
-            wanted=_raised(flown.wanted[lanes][:, kept], 0.0),
-            balls=_raised(np.stack(seen, axis=1), _TARGET_HEIGHT)[:, :, None],
+            wanted=_add_height(flown.wanted[lanes][:, kept], 0.0),
+            balls=_add_height(np.stack(seen, axis=1), _TARGET_HEIGHT)[:, :, None],
             met=met[:, None],
-            contact=_raised(where, _TARGET_HEIGHT)[:, None],
+            contact=_add_height(where, _TARGET_HEIGHT)[:, None],
             target=np.full((len(some), 3), np.nan),
-            expected=_raised(flown.ways[lanes][:, kept], _TARGET_HEIGHT),
+            expected=_add_height(flown.ways[lanes][:, kept], _TARGET_HEIGHT),
         )
 
     @property
@@ -207,11 +211,11 @@ class InterceptFlight(FlightTask):
         ]
 
 
-def _flown(batch: Any) -> Driven:
+def _get_drives(batch: Any) -> Driven:
     return batch.verdict.flown
 
 
-def _raised(points: np.ndarray, height: float) -> np.ndarray:
+def _add_height(points: np.ndarray, height: float) -> np.ndarray:
     """Points of the plane (..., 2) at a height, (..., 3) [m]."""
     high = np.where(np.isfinite(points[..., :1]), height, np.nan)
     return np.concatenate([points, high], axis=-1)

@@ -28,16 +28,16 @@ def inverse_dynamics(
     spin = jnp.cumsum(added, axis=0)
     spin_rate = jnp.cumsum(axes * acceleration[:, None] + jnp.cross(spin - added, added), axis=0)
 
-    def carried(arm_to: Array, spin: Array, spin_rate: Array) -> Array:
+    def accelerate_points(arm_to: Array, spin: Array, spin_rate: Array) -> Array:
         """Return the acceleration of points at `arm_to` relative to a point of the same body."""
         return jnp.cross(spin_rate, arm_to) + jnp.cross(spin, jnp.cross(spin, arm_to))
 
     between = positions[1:] - positions[:-1]
     # A base that accelerates upwards stands for gravity; joint 1 turns in place.
     first = jnp.zeros((1, 3), positions.dtype).at[0, 2].set(gravity)
-    of_joints = jnp.concatenate([first, carried(between, spin[:-1], spin_rate[:-1])])
+    of_joints = jnp.concatenate([first, accelerate_points(between, spin[:-1], spin_rate[:-1])])
     lever = product(rotations, jnp.asarray(arm.centre)[:, :, None])[:, :, 0]
-    of_centres = jnp.cumsum(of_joints, axis=0) + carried(lever, spin, spin_rate)
+    of_centres = jnp.cumsum(of_joints, axis=0) + accelerate_points(lever, spin, spin_rate)
 
     force = jnp.asarray(arm.mass)[:, None] * of_centres
     inertia = product(product(rotations, jnp.asarray(arm.inertia)), jnp.swapaxes(rotations, 1, 2))

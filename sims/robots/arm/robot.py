@@ -124,7 +124,7 @@ class ShieldArm:
         """Return the arm's part of the simulated state."""
         return JointState(angles=physics.qpos[:6], rates=physics.qvel[:6])
 
-    def sensed(self, state: JointState, noise: Array, stds: Any) -> JointState:
+    def sense(self, state: JointState, noise: Array, stds: Any) -> JointState:
         """Return the measurements of the encoders.
 
         Args:
@@ -197,7 +197,7 @@ class ShieldArm:
         middle = shield_middle(case, *links_of(case, angles))[:, 0].T
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 
-    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+    def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
         """Return naN (3,): it holds none."""
         return np.full(3, np.nan)
 

@@ -131,7 +131,7 @@ class Car:
             steering=physics.act[1],
         )
 
-    def sensed(self, state: CarState, noise: Array, stds: Any) -> CarState:
+    def sense(self, state: CarState, noise: Array, stds: Any) -> CarState:
         """The car's state as it is estimated.
 
         Args:
@@ -177,6 +177,6 @@ class Car:
         """The rear axle's middle on the ground, (..., 3) [m]."""
         return np.concatenate([poses[..., :2], 0.0 * poses[..., :1]], axis=-1)
 
-    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+    def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
         """NaN (3,): it holds none."""
         return np.full(3, np.nan)

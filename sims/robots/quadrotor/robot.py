@@ -100,7 +100,7 @@ class Quadrotor:
         qpos, qvel = physics.qpos, physics.qvel
         return RobotState(pos=qpos[:3], vel=qvel[:3], quat_wxyz=qpos[3:7], rate=qvel[3:6])
 
-    def sensed(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
+    def sense(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
         """The quadrotor's state as it is estimated.
 
         Args:
@@ -158,7 +158,7 @@ class Quadrotor:
         """Centre of the propeller plane (..., 3) [m]."""
         return poses[..., :3]
 
-    def held_ball(self, pose: np.ndarray) -> np.ndarray:
+    def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
         """Centre (3,) [m] of a ball that lies in the net; NaN with a racket."""
         up = self.tool.height - BALL_RADIUS if self.tool.kind == NET else np.nan
         return pose[:3] + up * rotation(pose[3:7], np)[:, 2]
