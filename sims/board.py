@@ -1,7 +1,7 @@
-"""A board that the arm shows to a camera, from which it is calibrated, without images.
+"""Calibration of a camera from a board that the arm holds up, without rendered images.
 
-The board is as large as the shield and lies on its face. Its corners are seen with the noise of a
-stereo camera, each for itself. Whether the arm can get to where it shows the board is not asked.
+The board covers the face of the shield and is as large as the shield. Each corner is measured with
+the independent noise of a stereo camera. Poses of the arm are not checked for collisions.
 """
 
 from typing import NamedTuple
@@ -15,34 +15,34 @@ from planner_jax.sims.calibrate import Calibration, calibrate, pose
 from planner_jax.studies.block.camera import Camera, in_view, move_camera, to_camera
 from planner_jax.studies.block.noise import StereoNoise, depth_std
 
-_CORNERS = 6  # each way
-_FACING = 0.5  # least cosine between the board's normal and the way to the camera
+_CORNERS = 6  # corners of the board along each edge
+_FACING = 0.5  # least cosine between the board's normal and the direction to the camera
 
 
 class BoardViews(NamedTuple):
-    """What `calibrate` takes, of K views."""
+    """K views of the board: the arguments of `calibrate`."""
 
     flange: np.ndarray  # (K, 4, 4), poses of the flange in the base frame
     points: np.ndarray  # (M, 3) [m], corners in the flange's frame
-    seen: np.ndarray  # (K, M, 3) [m], along the camera's axes
-    std: np.ndarray  # (K, M, 3) [m], of that
+    seen: np.ndarray  # (K, M, 3) [m], measured corners in the camera's frame
+    std: np.ndarray  # (K, M, 3) [m], standard deviations of the measured corners
 
 
 def show_board(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int, *, seed: int = 0, draws: int = 20000
 ) -> BoardViews:
-    """Views of the board from `num` poses of the arm, drawn from all that its joints allow.
+    """Return views of the board from `num` poses, drawn uniformly within the joint limits.
 
     Args:
         arm: NumPy leaves.
-        camera: where it really stands.
-        noise: of what it sees.
-        num: how many views, >= 1.
+        camera: at its true pose.
+        noise: of the stereo camera's measurements.
+        num: number of views, >= 1.
         seed: of poses and noise.
-        draws: poses of the arm that are looked at.
+        draws: number of drawn poses; poses from which the camera cannot see the board are dropped.
 
     Raises:
-        ValueError: the camera does not see the board in as many of them; one line.
+        ValueError: the camera sees the board in fewer than `num` of the drawn poses; one line.
     """
     rng = np.random.default_rng(seed)
     angles = rng.uniform(arm.lower, arm.upper, (draws, 6)).astype(np.float32)
@@ -62,7 +62,8 @@ def show_board(
     depth = own[..., 2]
     across = depth * float(noise.pixel_std) / float(camera.focal)
     along = np.asarray(depth_std(camera, noise, jnp.asarray(depth, jnp.float32)))
-    # The error of the depth lies along the ray, whose other components are small beside it.
+    # The depth error acts along the ray. The pixel errors act across the ray; their components
+    # along it are neglected.
     ray = own / depth[..., None]
     none = np.zeros_like(depth)
     errors = rng.normal(size=own.shape)
@@ -75,6 +76,9 @@ def show_board(
 def calibrate_camera(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
 ) -> tuple[Camera, Calibration]:
-    """The camera where `num` views of the board say that it stands, and the calibration itself."""
+    """Return the camera at its calibrated pose, and the calibration itself.
+
+    The calibration uses `num` views of the board.
+    """
     found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
     return move_camera(camera, found.camera), found

@@ -1,10 +1,11 @@
-"""Where a camera stands beside a robot: hand-eye calibration, on the host, in float64.
+"""Hand-eye calibration of a fixed camera beside a robot, on the host, in float64.
 
-The robot holds a board of known points before the camera, which does not move. With A_k the pose of
-the flange in the robot's base frame, Z that of the board on the flange, X that of the camera in the
-base frame and B_k that of the board as the camera sees it,  A_k Z = X B_k.  Z falls out between two
-views:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. It is solved in
-closed form and then refined on the seen points themselves. Poses are (4, 4) matrices, lengths [m].
+The robot holds a board of known points before the camera, which does not move. Four poses are
+involved: A_k of the flange in the robot's base frame, Z of the board on the flange, X of the camera
+in the base frame, and B_k of the board in the camera's frame. They satisfy  A_k Z = X B_k.  Two
+views eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. It
+is solved in closed form, and the solution is refined on the measured points. Poses are (4, 4)
+matrices, lengths [m].
 """
 
 import dataclasses
@@ -13,12 +14,12 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-_LEAST_TURN = 0.05  # [rad], of a motion between two views that counts
+_LEAST_TURN = 0.05  # [rad], least rotation between two views that are used as a pair
 
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """Where the camera and the board are, and how well the views agree."""
+    """The poses of the camera and the board, and the residual of the views."""
 
     camera: np.ndarray  # (4, 4), pose of the camera in the robot's base frame
     board: np.ndarray  # (4, 4), pose of the board on the flange
@@ -26,25 +27,25 @@ class Calibration:
 
 
 def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Poses (..., 4, 4) of rotations (..., 3, 3) and places (..., 3) [m]."""
+    """Return poses (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3) [m]."""
     found = np.zeros((*np.shape(rotation)[:-2], 4, 4))
     found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = rotation, place, 1.0
     return found
 
 
 def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """The pose (4, 4) that takes points (M, 3) [m] nearest to others (M, 3) [m].
+    """Return the pose (4, 4) that maps points (M, 3) [m] onto measured points (M, 3) [m].
 
-    In closed form by a singular value decomposition [Kabsch1976], never a mirror image.
+    It minimises the sum of squared distances in closed form, by a singular value decomposition
+    [Kabsch1976]. The result is never a reflection.
 
     Raises:
-        ValueError: fewer than three points, or all on one line; one line.
+        ValueError: there are fewer than three points, or all lie on one line; one line.
     """
     points, seen = np.asarray(points, float), np.asarray(seen, float)
     if points.shape != seen.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
         raise ValueError(
-            f"points must be (M, 3) with M >= 3, and as many seen, got {points.shape} and "
-            f"{seen.shape}"
+            f"points and seen must both be (M, 3) with M >= 3, got {points.shape} and {seen.shape}"
         )
     middles = points.mean(axis=0), seen.mean(axis=0)
     U, singular, V = np.linalg.svd((seen - middles[1]).T @ (points - middles[0]))
@@ -56,19 +57,19 @@ def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """The pose X (4, 4) of the camera that solves A X = X B over every pair of views.
+    """Return the pose X (4, 4) of the camera that solves A X = X B over every pair of views.
 
-    The rotation is that which best takes the rotation vectors of the camera's motions to those of
-    the robot's, by a singular value decomposition as in [Park1994]; the place then follows from
-    linear least squares.
+    The rotation is the one that best maps the rotation vectors of the camera's motions onto the
+    rotation vectors of the robot's motions, by a singular value decomposition as in [Park1994]. The
+    position then follows from linear least squares.
 
     Args:
         flange: (K, 4, 4) A_k, poses of the flange in the base frame, K >= 3.
-        views: (K, 4, 4) B_k, poses of the board as the camera sees it.
+        views: (K, 4, 4) B_k, poses of the board in the camera's frame.
 
     Raises:
-        ValueError: too few views, or they turn about one axis only, which leaves the camera's
-            place along it open; one line.
+        ValueError: there are too few views, or all rotate about one axis, so that the camera's
+            position along that axis is undetermined; one line.
     """
     flange, views = np.asarray(flange, float), np.asarray(views, float)
     if flange.shape != views.shape or flange.shape[1:] != (4, 4):
@@ -95,25 +96,26 @@ def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
 def calibrate(
     flange: np.ndarray, points: np.ndarray, seen: np.ndarray, std: np.ndarray | float = 1.0
 ) -> Calibration:
-    """Where the camera is, from a board that the robot shows to it.
+    """Return the camera's pose from views of a board that the robot holds.
 
-    Every view gives the board's pose by `rigid_motion`, all of them the camera's by `hand_eye`.
-    Both poses are then moved together until the points that were seen are nearest to where they
-    should have been, each error in its own standard deviation (Levenberg-Marquardt).
+    `rigid_motion` gives the board's pose in each view, and `hand_eye` the camera's pose from all
+    views. Levenberg-Marquardt then refines both poses together: it minimises the distances between
+    measured and expected points, each in units of its standard deviation.
 
     Args:
         flange: (K, 4, 4), poses of the flange in the base frame, K >= 3.
         points: (M, 3) [m], of the board in its own frame, M >= 3.
-        seen: (K, M, 3) [m], the same as the camera sees them, along its own axes.
-        std: [m], of what is seen: a number, or (K, M, 3) along the camera's axes.
+        seen: (K, M, 3) [m], the measured points in the camera's frame.
+        std: [m], of the measured points: a number, or (K, M, 3) along the camera's axes.
 
     Raises:
-        ValueError: what `rigid_motion` and `hand_eye` say.
+        ValueError: the points or the views do not determine the poses; see `rigid_motion` and
+            `hand_eye`.
     """
     flange, points, seen = (np.asarray(each, float) for each in (flange, points, seen))
     views = np.stack([rigid_motion(points, each) for each in seen])
     camera = hand_eye(flange, views)
-    # One board for all views: the mean of where each of them has it.
+    # The board does not move on the flange: its pose is the mean over all views.
     boards = np.linalg.inv(flange) @ camera @ views
     turn = Rotation.from_matrix(boards[:, :3, :3]).mean().as_matrix()
     board = pose(turn, boards[:, :3, 3].mean(axis=0))

@@ -1,13 +1,13 @@
-# MuJoCo's names come from a compiled module.
+# Pyright cannot see the names of MuJoCo's compiled module.
 # pyright: reportAttributeAccessIssue=false
-"""What a camera sees of the arm's scene: colour and depth images, rendered off-screen by MuJoCo.
+"""A simulated camera beside the arm: colour and depth images, rendered off-screen by MuJoCo.
 
 Robot base frame, z up, SI units. The scene has the arm, the pole, the rig's beams, a floor, walls
-and a ball. The boxes that are protected and met in are nothing to be seen. Light is even, shutters
-take no time: there is no blur.
+and a ball. The protected boxes of the task are invisible. The light is even. Exposure takes no
+time, so that there is no motion blur.
 
-An OpenGL without a display is needed, by default that of EGL; `MUJOCO_GL` may name another one, as
-MuJoCo has it.
+Rendering needs OpenGL without a display. The default is EGL; MuJoCo's environment variable
+`MUJOCO_GL` selects another one.
 """
 
 import importlib.resources
@@ -30,31 +30,34 @@ from planner_jax.task.block.scene import Scene
 
 _ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
 _POLE_TOP = 2.52  # [m]: 3 m from the floor, as in the authors' model
-_WALLS, _HIGH = 13.0, 6.0  # [m], from the arm to the walls, and their height
-_NEAR, _FAR = 0.1, 40.0  # [m], what is rendered
+_WALLS, _HIGH = 13.0, 6.0  # [m], distance of the walls from the arm, and their height
+_NEAR, _FAR = 0.1, 40.0  # [m], clipping planes of the renderer
 _BALL, _POLE, _STEEL, _ARM_COLOUR, _WALL = "#FF7A0A", "#E59BC0", "#A7AFB5", "#D9D9D4", "#9AA7B4"
 
 
 class RenderError(PlannerJaxError, RuntimeError):
-    """Images that cannot be rendered here, in one line."""
+    """Rendering is impossible on this machine; the message is one line."""
 
 
 class SceneCamera:
-    """A camera that takes images of the arm's scene. Close it, or use it in a `with`."""
+    """A camera that renders images of the arm's scene.
+
+    Close it after use, or use it in a `with` statement.
+    """
 
     def __init__(
         self, camera: Camera, scene: Scene, *, ball_radius: float = 0.05, arm_xml: str | None = None
     ):
-        """Set up scene and OpenGL.
+        """Create the scene and the OpenGL context.
 
         Args:
             camera: NumPy leaves.
             scene: of one case.
             ball_radius: [m].
-            arm_xml: MJCF text of the arm; that of the paper if not given.
+            arm_xml: MJCF text of the arm; by default the arm of the paper.
 
         Raises:
-            RenderError: there is no OpenGL here; one line.
+            RenderError: OpenGL is not available; one line.
         """
         text = _ARM.read_text("utf-8") if arm_xml is None else arm_xml
         self.camera = camera
@@ -66,11 +69,11 @@ class SceneCamera:
             self._context: Any = _context_class()(width, height)
             self._context.make_current()
             self._to: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        # The bindings of OpenGL raise whatever the library that is missing leads to.
+        # The type of the exception depends on which library is missing.
         except Exception as error:
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise RenderError(
-                f"images need an OpenGL without a display, EGL or what MUJOCO_GL names: {reason}"
+                f"images need OpenGL without a display, EGL or what MUJOCO_GL names: {reason}"
             ) from None
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._to)
         self._to.readDepthMap = mujoco.mjtDepthMap.mjDEPTH_ZEROFAR
@@ -88,19 +91,19 @@ class SceneCamera:
         self.close()
 
     def close(self) -> None:
-        """Give OpenGL's context back."""
+        """Free the OpenGL context."""
         self._to.free()
         self._context.free()
 
     def take(
         self, ball: np.ndarray | None, angles: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """One frame, without noise.
+        """Return one frame, without noise.
 
         Args:
-            ball: (3,) [m], its middle; None for a scene without a ball.
-            angles: (6,) [rad], of the arm's joints; those of the frame before if not given, home
-                at first.
+            ball: (3,) [m], centre of the ball; None for a scene without a ball.
+            angles: (6,) [rad], of the arm's joints; by default the angles of the previous frame, at
+                first the home position.
 
         Returns:
             image: (rows, columns, 3) bytes, red, green and blue.
@@ -124,7 +127,7 @@ class SceneCamera:
         self._context.make_current()
         mujoco.mjr_render(whole, self._shown, self._to)
         mujoco.mjr_readPixels(image, far_to_near, whole, self._to)
-        # The buffer is linear in one over the depth, 0 at the far plane and 1 at the near one.
+        # The depth buffer is linear in 1 / depth: 0 at the far plane, 1 at the near plane.
         extent = self._model.stat.extent
         near, far = self._model.vis.map.znear * extent, self._model.vis.map.zfar * extent
         closeness = 1.0 / far + far_to_near[::-1].astype(float) * (1.0 / near - 1.0 / far)
@@ -135,15 +138,15 @@ class SceneCamera:
 def look(
     key: Array, image: Array, depth: Array, camera: Camera, noise: StereoNoise, ball: BallLook
 ) -> Sighting:
-    """The ball in one frame of a stereo camera, from an image and its true depth.
+    """Return where the ball is in one frame of a stereo camera, from an image and its true depth.
 
     Args:
         key: of the noise.
         image: (rows, columns, 3) bytes.
         depth: (rows, columns) [m], without noise.
-        camera: as calibrated: where it is believed to stand.
+        camera: at its calibrated pose.
         noise: of depths.
-        ball: what it looks like.
+        ball: thresholds that separate the ball from the background.
     """
     seen, confidence = noisy_depth(key, camera, noise, depth)
     return sighting(image, seen, confidence, camera, ball)
@@ -158,15 +161,15 @@ def sightings_of(
     seed: int = 0,
     believed: Camera | None = None,
 ) -> np.ndarray:
-    """Where a ball at places (N, 3) [m] is seen in N rendered frames, (N, 3) [m] or NaN.
+    """Return measured positions (N, 3) [m] of a ball in N rendered frames; NaN if invisible.
 
     Args:
-        eye: that takes the frames; the arm stands still.
-        places: (N, 3) [m], of the ball's middle.
+        eye: the camera that renders the frames; the arm stands still.
+        places: (N, 3) [m], true positions of the ball's centre.
         noise: of depths.
-        ball: what it looks like.
+        ball: thresholds that separate the ball from the background.
         seed: of the noise.
-        believed: where the camera is thought to stand, by calibration; where it is if not given.
+        believed: the camera at its calibrated pose; by default at its true pose.
     """
     camera = eye.camera if believed is None else believed
     keys = jax.random.split(jax.random.key(seed), len(places))
@@ -178,7 +181,7 @@ def sightings_of(
 
 
 def _context_class() -> Any:
-    """MuJoCo's class of an OpenGL context: EGL's where nothing else is asked for."""
+    """Return MuJoCo's class of OpenGL contexts: EGL unless `MUJOCO_GL` selects another one."""
     if os.environ.get("MUJOCO_GL", "").lower().strip() in ("", "egl") and os.name == "posix":
         from mujoco.egl import GLContext
 
@@ -187,16 +190,16 @@ def _context_class() -> Any:
 
 
 def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float) -> mujoco.MjModel:
-    """The arm's model with all that stands around it, a ball and the camera."""
+    """Return the model of the arm, its surroundings, a ball and the camera."""
     root = ET.fromstring(arm_xml)
     for geom in root.iter("geom"):
         geom.set("rgba", xml_colour(_ARM_COLOUR))
     width, height = camera.size
-    root.append(_element("statistic", extent=1.0))  # so that near and far are lengths
+    root.append(_element("statistic", extent=1.0))  # near and far are then in metres
     visual = _element("visual")
     visual.append(_element("map", znear=_NEAR, zfar=_FAR))
     visual.append(_element("global", offwidth=width, offheight=height))
-    # Smoothed edges would shift small things by up to half a pixel, by which samples are blended.
+    # Antialiasing blends samples and would shift small objects by up to half a pixel.
     visual.append(_element("quality", offsamples=0, numslices=48, numstacks=48))
     visual.append(_element("headlight", ambient=[0.45] * 3, diffuse=[0.25] * 3))
     root.append(visual)
@@ -224,7 +227,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
     ball = _element("body", name="ball", mocap="true")
     ball.append(_element("geom", type="sphere", size=[ball_radius], rgba=xml_colour(_BALL)))
     world.append(ball)
-    # MuJoCo's cameras have y up, and look against z.
+    # MuJoCo's cameras have y up and look along -z.
     axes = np.asarray(camera.rotation, float)
     angle = np.rad2deg(2.0 * np.arctan(0.5 * height / float(camera.focal)))
     eye = {"pos": camera.position, "xyaxes": [*axes[:, 0], *-axes[:, 1]], "fovy": angle}
@@ -233,7 +236,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
 
 
 def _element(tag: str, **attributes: Any) -> ET.Element:
-    """An element of MJCF; lists and arrays of numbers are written with blanks."""
+    """Return an element of MJCF; numbers of lists and arrays are separated by blanks."""
     written = {
         name: value if isinstance(value, str) else xml_numbers(*np.atleast_1d(value))
         for name, value in attributes.items()

@@ -1,10 +1,11 @@
-"""Drives in closed loop: estimate, track, and a plan that is changed from outside between frames.
+"""Drives of a car in closed loop: state estimation, tracking, and replanning between frames.
 
-A physics step is a control step; a number of steps makes a frame, at whose end the pose is kept.
-Between frames a new plan may be put in (`sims.tasks.intercept` does). The car is shown its pose a
-latency late, with noise; in between it reckons from its own speed and steering angle, and what it
-is shown corrects what it had reckoned for then. Written for one drive; `drive_on` makes a batch of
-it. Times count from the first plan.
+A physics step is also a control step. A frame is a fixed number of steps; the pose at its end is
+stored. The caller may replace the plan between frames (`sims.tasks.intercept` does). Measured poses
+of the car are noisy and one latency old. Between measurements the car integrates its own speed and
+steering angle (dead reckoning). A measurement corrects the estimate of the time at which it was
+taken. The code is written for one drive; `drive_on` batches it. Times count from the start of the
+first plan.
 """
 
 import dataclasses
@@ -25,18 +26,20 @@ from planner_jax.sims.robot import Physics
 from planner_jax.sims.robots.car.control import CarState
 from planner_jax.sims.robots.car.robot import Car
 
-_TRUST = 0.1  # share of what a shown pose differs that is believed, at every step
+_TRUST = 0.1  # gain of the pose estimator: share of the innovation that is added at every step
 
 
 @dataclasses.dataclass(frozen=True)
 class DriveLoop:
-    """World and sensing of a drive; static under jit. Noise alone compiles nothing anew.
+    """World and sensing of a drive; static under jit.
+
+    A change of the noise alone recompiles nothing.
 
     Raises:
-        ValueError: the world has no car, or steps of another length than that of control.
+        ValueError: the world has no car, or its time step is not the control step.
     """
 
-    world: World  # with a car
+    world: World  # must hold a car
     sensing: PlaneSensing = PlaneSensing()
 
     def __post_init__(self) -> None:
@@ -49,12 +52,12 @@ class DriveLoop:
 
     @property
     def car(self) -> Car:
-        """The robot."""
+        """The simulated car."""
         return _car(self.world)
 
     @property
     def late_steps(self) -> int:
-        """How many steps old is the pose that is shown."""
+        """The age of a measured pose, in control steps."""
         return round(self.sensing.latency * CONTROL_RATE)
 
 
@@ -64,33 +67,34 @@ class DriveState:
 
     physics: Physics
     shown: Array  # (L + 1, 3), true poses of the last steps, the newest last
-    believed: Array  # (L + 1, 3), poses that were reckoned then
+    believed: Array  # (L + 1, 3), estimated poses of the same steps
     plan: CarPlan
-    began: Array  # () [s], when the plan began
-    worst_tracking: Array  # () [m], of the rear axle from its plan
-    squared_tracking: Array  # () [m^2 s]
-    saturated: Array  # (2,) [s], how long more was asked than drive and steering can do
+    began: Array  # () [s], start time of the plan
+    worst_tracking: Array  # () [m], greatest distance of the rear axle from its plan
+    squared_tracking: Array  # () [m^2 s], integral of the squared distance
+    # (2,) [s], time during which drive and steering commands exceeded their limits
+    saturated: Array
     time: Array  # () [s]
-    pose_stds: Array  # (2,), errors of a shown coordinate [m] and heading [rad]
+    pose_stds: Array  # (2,), standard deviations of a measured coordinate [m] and heading [rad]
     key: Array
 
 
 @struct.dataclass
 class Frame:
-    """The end of a frame."""
+    """The state at the end of a frame."""
 
     time: Array  # () [s]
-    pose: Array  # (3,) x, y [m] of the rear axle's middle and heading [rad]
-    wanted: Array  # (2,) [m], where the plan has it
+    pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
+    wanted: Array  # (2,) [m], planned position
 
 
 def _car(world: World) -> Car:
-    assert isinstance(world.robot, Car)  # a `DriveLoop` has seen to it
+    assert isinstance(world.robot, Car)  # `DriveLoop` has checked this
     return world.robot
 
 
 def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
-    """The pose (3,) a short span [s] later, at a speed () on a way of a curvature ()."""
+    """Return the pose (3,) after a short time [s] at a speed () along a path of a curvature ()."""
     turned = speed * curvature * span
     middle = pose[2] + 0.5 * turned
     way = speed * span
@@ -98,7 +102,7 @@ def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array
 
 
 def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
-    """Drives at the begin of their plans.
+    """Return drives at the start of their plans.
 
     Args:
         loop: with the world.
@@ -127,14 +131,14 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
 
 
 def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
-    """What is believed of pose (3,), speed () [m/s] and curvature () [1/m]."""
+    """Return the estimated pose (3,), the speed () [m/s] and the path curvature () [1/m]."""
     state = loop.car.state(drive.physics)
     curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
     return drive.believed[-1], state.speed, curvature
 
 
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
-    """The drive one frame later; tracking and saturation count up to a time () [s]."""
+    """Return the drive one frame later; tracking and saturation are summed up to a time () [s]."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
     steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)
@@ -153,7 +157,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         over = car.saturation(physics, command)
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
-        # What is shown now is a latency old, as is what had been reckoned for then.
+        # The measurement is one latency old; compare it with the estimate of that time.
         seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
@@ -191,7 +195,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
 def _advance_estimate(
     car: Car, pose: Array, before: CarState, after: CarState, span: float
 ) -> Array:
-    """A believed pose one step on, from the speed and steering angle that the car knows."""
+    """Return an estimated pose one step later, from the car's own speed and steering angle."""
     steering = 0.5 * (before.steering + after.steering)
     curvature = jnp.tan(steering) / car.vehicle.wheelbase
     return dead_reckon(pose, after.speed, curvature, span)
@@ -201,13 +205,13 @@ def _advance_estimate(
 def drive_on(
     world: World, drives: DriveState, until: Array, *, num_frames: int
 ) -> tuple[DriveState, Frame]:
-    """A batch of drives for some frames.
+    """Simulate a batch of drives for some frames.
 
     Args:
         world: with a car.
         drives: leaves (B, ...).
-        until: (B,) [s], up to when tracking and saturation count.
-        num_frames: how many (static).
+        until: (B,) [s], up to when tracking and saturation are summed.
+        num_frames: number of frames (static).
 
     Returns:
         The drives at the end, and the frames, leaves (B, num_frames, ...).

@@ -1,8 +1,9 @@
-"""Plans of an arm carried out in closed loop: read the joints, ask for torques, step the world.
+"""Execution of an arm's plans in closed loop: measure the joints, command torques, step the world.
 
-A physics step is a control step; two of them make a frame, at whose end the joints are kept. The
-arm waits until its course begins, follows it, and brakes where it ends. Written for one arm;
-`execute` makes a batch of it. Times count from the moment at which the ball is first seen.
+A physics step is also a control step. Two steps make a frame, at whose end the joint angles are
+stored. The arm waits until its motion starts, follows it, and brakes where it ends. The code is
+written for one arm; `execute` batches it. Times count from the moment at which the ball is first
+seen.
 """
 
 import dataclasses
@@ -24,7 +25,7 @@ from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 
 TIMESTEP = 1e-3  # [s], of physics and control
-_STEPS, _FRAMES = 2, 50  # steps a frame, frames of one compiled call
+_STEPS, _FRAMES = 2, 50  # steps per frame, frames per compiled call
 FRAME = _STEPS * TIMESTEP  # [s]
 
 
@@ -33,62 +34,62 @@ class ArmState:
     """Everything that changes while an arm follows a course."""
 
     physics: Physics
-    torques: Array  # (6,) [N m], that act
-    squared_error: Array  # (6,) [rad^2 s], of the angles from the course
-    worst_error: Array  # (6,) [rad]
-    squared_torque: Array  # (6,) [N^2 m^2 s]
-    worst_torque: Array  # (6,) [N m]
-    saturated: Array  # (6,) [s], how long more was asked than a drive can do
+    torques: Array  # (6,) [N m], acting torques
+    squared_error: Array  # (6,) [rad^2 s], integral of the squared angle error
+    worst_error: Array  # (6,) [rad], greatest angle error
+    squared_torque: Array  # (6,) [N^2 m^2 s], integral of the squared torque
+    worst_torque: Array  # (6,) [N m], greatest torque
+    saturated: Array  # (6,) [s], time during which the command exceeded the torque limit
     time: Array  # () [s]
     key: Array
 
 
 @struct.dataclass
 class _Setting:
-    """What an arm does and with which drives, the same at all times."""
+    """The motion and the drives of an arm, constant during its execution."""
 
     course: Course
-    since: Array  # () [s], from when on errors and torques count
-    until: Array  # () [s]
-    torques: Array  # (6,) [N m]
-    lag: Array  # () [s]
-    stds: Array  # (2,) [rad], [rad/s]
-    mass_error: Array  # ()
+    since: Array  # () [s], start of the interval in which errors and torques are summed
+    until: Array  # () [s], end of that interval
+    torques: Array  # (6,) [N m], torque limits
+    lag: Array  # () [s], of the torques, first order
+    stds: Array  # (2,), of measured angles [rad] and rates [rad/s]
+    mass_error: Array  # () relative error of the masses that control believes
 
 
 @dataclasses.dataclass(frozen=True)
 class Executed:
-    """What came of a batch of courses, on the host in float64; leaves with a leading axis B.
+    """The result of executing B courses, on the host in float64; leaves (B, ...).
 
-    Errors and torques count from the time at which the arm may start to that of its contact.
+    Errors and torques are evaluated from the time at which the arm may start until its contact.
     """
 
     times: np.ndarray  # (S,) [s], of the frames, the first 0
     angles: np.ndarray  # (B, S, 6) [rad]
-    wanted: np.ndarray  # (B, S, 6) [rad], by the course as it was planned
-    tracking: np.ndarray  # (B, 2) [m], of the shield's middle from its plan: rms and worst
-    error_rms: np.ndarray  # (B, 6) [rad], of angles from what the joints were told, maybe late
+    wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without delays
+    tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
+    error_rms: np.ndarray  # (B, 6) [rad], of angles from the commanded course, which may start late
     error_worst: np.ndarray  # (B, 6) [rad]
     torque_rms: np.ndarray  # (B, 6) [N m]
     torque_worst: np.ndarray  # (B, 6) [N m]
-    saturation: np.ndarray  # (B, 6), share of the time that a drive was at its limit
-    last_rates: np.ndarray  # (B, 6) [rad/s], at the last frame, where another plan may begin
+    saturation: np.ndarray  # (B, 6), share of the time in which a drive was at its limit
+    last_rates: np.ndarray  # (B, 6) [rad/s], at the last frame, where another plan may start
 
 
 def _arm(world: World) -> ShieldArm:
-    assert isinstance(world.robot, ShieldArm)  # `execute` has seen to it
+    assert isinstance(world.robot, ShieldArm)  # `execute` has checked this
     return world.robot
 
 
 def _one_frame(
     world: World, setting: _Setting, state: ArmState
 ) -> tuple[ArmState, tuple[Array, Array]]:
-    """The arm one frame later, and its angles (6,) and rates (6,) there."""
+    """Return the arm one frame later, and its angles (6,) and rates (6,) then."""
     robot, dtype, span = _arm(world), state.time.dtype, world.timestep
     key, noise_key = jax.random.split(state.key)
     noise = jax.random.normal(noise_key, (_STEPS, *robot.noise_shape), dtype)
     times = state.time + span * jnp.arange(_STEPS, dtype=dtype)
-    # What the drives lag behind is asked for earlier.
+    # The feedforward acceleration leads by the drives' lag, to compensate it.
     references = robot.references(setting.course, times, world)
     ahead = robot.references(setting.course, times + setting.lag, world)
     references = dataclasses.replace(references, accelerations=ahead.accelerations)
@@ -128,7 +129,7 @@ def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState,
 
 
 def _start(world: World, setting: _Setting, key: Array) -> ArmState:
-    """An arm at time 0 of its course, with the torques that it needs there."""
+    """Return an arm at time 0 of its course, with the torques that hold it on the course."""
     robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
     reference = jax.tree.map(
         lambda leaf: leaf[0], robot.references(setting.course, zero[None], world)
@@ -141,7 +142,7 @@ def _start(world: World, setting: _Setting, key: Array) -> ArmState:
 
 @functools.cache
 def _compile(world: World) -> tuple[Callable, Callable, Callable]:
-    """What begins a batch, what carries it on for some frames, and where its courses are."""
+    """Return compiled functions that start a batch, advance it, and evaluate its courses."""
     options = compiler_options()
     start = jax.jit(jax.vmap(functools.partial(_start, world)))
     advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
@@ -155,10 +156,11 @@ def _compile(world: World) -> tuple[Callable, Callable, Callable]:
 
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
-    """Options with which XLA compiles steps of an arm.
+    """Return the XLA options for compiling steps of an arm; None for the defaults.
 
-    On a CPU the newer way of fusing operations works out a link's place anew in all that rest on
-    it, a chain of six links hundreds of times over: without it a step is 200 times as fast.
+    On a CPU, XLA's fusion emitters recompute a link's position in every expression that uses it. In
+    a chain of six links that means hundreds of evaluations. A step is 200 times as fast without
+    them.
     """
     if jax.default_backend() != "cpu":
         return None
@@ -166,7 +168,7 @@ def compiler_options() -> dict[str, Any] | None:
     try:
         jax.jit(jnp.negative, compiler_options=options).lower(0.0).compile()
     except jax.errors.JaxRuntimeError:
-        return None  # of another version, in which there is no such option
+        return None  # this version of XLA has no such option
     return options
 
 
@@ -181,21 +183,20 @@ def execute(
     late: np.ndarray | float = 0.0,
     drives: Drives = IDEAL,
 ) -> Executed:
-    """Carry out a batch of courses.
+    """Execute a batch of courses.
 
     Args:
         world: with an arm, and steps of `TIMESTEP`.
         courses: leaves (B, ...), as planned.
         keys: (B,) of the noise.
-        since: (B,) [s], from when on errors and torques count.
-        until: (B,) [s], up to when.
-        end: [s], up to when at least the arms are simulated.
-        late: (B,) or () [s], by how much later than planned a course begins; the drives' latency
-            comes on top.
+        since: (B,) [s], start of the interval in which errors and torques are evaluated.
+        until: (B,) [s], end of that interval.
+        end: [s], least duration of the simulation.
+        late: (B,) or () [s], delay of the start of a course, in addition to the drives' latency.
         drives: of all arms.
 
     Raises:
-        ValueError: the world has no arm, or steps of another length.
+        ValueError: the world has no arm, or its time step is not `TIMESTEP`.
     """
     if not isinstance(world.robot, ShieldArm):
         raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")

@@ -1,4 +1,4 @@
-"""Pictures of a flight: what is to be met, robot, plan and ghost images, without a display."""
+"""Pictures and films of a flight, drawn without a display: target, robot, plan and ghost images."""
 
 import shutil
 from pathlib import Path
@@ -21,12 +21,12 @@ from planner_jax.sims.task import FlightTask
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
-_FRAME = 2  # looks a frame
-_GHOSTS, _APART = 7, 0.45  # at most; [m] of way from one to the next
+_FRAME = 2  # recorded samples per film frame
+_GHOSTS, _APART = 7, 0.45  # greatest number of ghost images, and their spacing on the path [m]
 
 
 def require_film(path: Path) -> None:
-    """Raise `ArgumentError` unless a film can be written here."""
+    """Raise `ArgumentError` unless this machine can write a film of that file format."""
     if path.suffix not in FORMATS:
         raise ArgumentError("video", " or ".join(FORMATS), path.name, verb="end in")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
@@ -34,7 +34,7 @@ def require_film(path: Path) -> None:
 
 
 class Scene:
-    """One flight in a 3-D axes."""
+    """One flight, drawn in 3-D axes."""
 
     def __init__(
         self,
@@ -45,7 +45,7 @@ class Scene:
         title: str | None = None,
         view: tuple[float, float] | None = None,
     ):
-        """Draw what does not move.
+        """Draw everything that does not move.
 
         Args:
             figure: an empty one.
@@ -62,7 +62,7 @@ class Scene:
         balls, met = recording.balls[flight], np.nan_to_num(self.met, nan=np.inf)
         after = self.times[:, None] > met
         self.balls = np.where(after[..., None], np.nan, balls)
-        self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # of a returned ball
+        self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # path of the returned ball
         self.axes: Any = figure.add_subplot(projection="3d")
         wanted = self.plan_path()
         plan = self.axes.plot(*wanted.T, color=INK, lw=1.0, ls="--", label="plan")
@@ -95,7 +95,7 @@ class Scene:
         if task.BOUNDS is None:
             points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
             low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-            thin = np.maximum(1.6 - (high - low), 0.0)  # [m], so that flat flights keep depth
+            thin = np.maximum(1.6 - (high - low), 0.0)  # [m], padding of thin axes
             low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
             low[2] = 0.0
         else:
@@ -125,7 +125,10 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """The balls (K, N, 3), NaN outside of what is shown, before and after a contact alike."""
+        """Return the balls (K, N, 3), with NaN outside the bounds of the axes.
+
+        Balls in flight and returned balls are clipped to the same bounds.
+        """
         balls = self.recording.balls[self.flight]
         inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)
         self.balls = np.where(inside, self.balls, np.nan)
@@ -133,36 +136,36 @@ class Scene:
         return np.where(inside, balls, np.nan)
 
     def _fill(self, prism: Prism, time: float) -> list[Any]:
-        """A prism's top at a time [s], filled; what it was drawn with."""
+        """Draw a prism's top as a filled polygon at a time [s]; return what was drawn."""
         top = prism.outlines(time)[1]
         look = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
         return [self.axes.add_collection3d(Poly3DCollection([top], **look))]
 
     def _add_solid(self, solid: Solid, colour: str, opacity: float, shade: bool = False) -> Any:
-        """The faces of a solid in the world; what they are drawn with."""
+        """Draw the faces of a solid in the world frame; return what was drawn."""
         faces = solid.corners[solid.triangles]
         look = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
         look |= {"alpha": opacity, "shade": shade}
         return self.axes.add_collection3d(Poly3DCollection(faces, **look))
 
     def plan_path(self) -> np.ndarray:
-        """The path of the plans that are flown (M, 3) [m], from the first to the last contact."""
+        """Return the path of the executed plans (M, 3) [m], up to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.last_met() + 1]
         return wanted[np.isfinite(wanted).all(axis=1)]
 
     def last_met(self) -> int:
-        """The look at the last contact; the last one where there is none."""
+        """Return the index of the sample at the last contact; by default the last sample."""
         end = np.nanmax(np.append(self.met, -np.inf))
         at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_looks
         return min(at, self.num_looks - 1)
 
     def _machine(self) -> list[Part]:
-        """The pitching machine, where the first ball comes from."""
+        """Return the parts of the pitching machine at the launch position, if there is one."""
         launch = self.recording.launch(self.flight)
         return machine_parts(*launch) if launch and self.world.mouth else []
 
     def robot(self, at: int, alpha: float = 1.0) -> list[Any]:
-        """The robot at a look, and what it was drawn with; its tool is filled."""
+        """Draw the robot at a sample, with its tool filled; return what was drawn."""
         robot = self.world.robot
         pose = frame(self.recording, robot, self.flight, at).robot
         drawn: list[Any] = []
@@ -180,7 +183,10 @@ class Scene:
         return drawn
 
     def ghosts(self, last: int) -> None:
-        """Images of the robot and the balls at equal intervals up to a look, ever firmer."""
+        """Draw the robot and the balls at equal distances along the path up to a sample.
+
+        Later images are more opaque.
+        """
         path = self.world.robot.place(self.recording.robot[self.flight, : last + 1])
         path = path[np.isfinite(path).all(axis=1)]
         way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
@@ -192,7 +198,7 @@ class Scene:
                 self.axes.plot(*ball[:, None], ".", ms=7, color=trail.get_color())
 
     def contacts(self, label: str) -> None:
-        """A star where each ball was met, and a cross at the target."""
+        """Draw a star at each contact, and a cross at the target."""
         target = self.recording.target[self.flight]
         if np.isfinite(target).all():
             self.axes.plot(*target[:, None], "X", ms=10, color=INK, label="target")
@@ -204,7 +210,10 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def show(self, at: int, back: int | None = None) -> None:
-        """The moving parts at a look; the returned ball's path up to another one, if given."""
+        """Draw the moving parts at a sample.
+
+        The returned ball's path ends at the sample `back`, if given.
+        """
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
         for k, dot in enumerate(self.dots):
@@ -252,16 +261,18 @@ def draw_flight(
 
 
 def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -> None:
-    """Write a film of the first flights, one after the other; whole or not at all.
+    """Write a film of the first flights, one after the other.
+
+    An interrupted film leaves no file.
 
     Args:
         path: ends in .gif, or in .mp4 where ffmpeg is installed.
         task: that was flown.
         recording: of the run.
-        num: how many flights are filmed.
+        num: number of flights in the film.
 
     Raises:
-        ArgumentError: the file cannot be of that kind.
+        ArgumentError: this machine cannot write a film of that file format.
     """
     require_film(path)
     fps = 20
@@ -283,7 +294,7 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
 
 
 def _write(path: Path, write: Any) -> None:
-    """Let `write` fill a scratch file, and put it in place only once it is whole."""
+    """Let `write` fill a temporary file, and move it to `path` once it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with replacing(path) as scratch:
         write(scratch)

@@ -1,10 +1,12 @@
-"""Who may look at the viewer: pages of its own origin, and beyond this machine who has the token.
+"""Access control of the viewer's web server.
 
-Viser has no setting for either, so that the function with which it begins to serve is wrapped while
-it does: a page of another site in the same browser cannot reach the web socket, and neither can one
-that calls this machine by another name. Beyond the loopback address every request has to carry the
-token, in its address or, after the first page, in a cookie. What is sent is not encrypted, and who
-reads the traffic of a network reads the token: across networks use a tunnel such as `ssh -L`.
+Pages of other sites in the same browser are rejected: the origin of a request must be the server
+itself, under one of its own host names. Beyond the loopback address every request also needs the
+token, in its address or, after the first page, in a cookie. Traffic is not encrypted: whoever can
+read the network traffic can read the token. Across networks use a tunnel such as `ssh -L`.
+
+Viser has no setting for this. Therefore the function that starts its web server is replaced while
+the server is created.
 """
 
 import contextlib
@@ -19,13 +21,13 @@ _OWN = {"localhost", "127.0.0.1", "::1"}
 
 
 def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> bool:
-    """Whether a request may be answered.
+    """Return whether a request may be answered.
 
     Args:
         headers: of the request.
         path: of the request, with its query.
-        names: under which the machine is called.
-        token: that is asked for, or None.
+        names: host names of this machine.
+        token: required of the request, or None.
     """
     here = headers.get("Host", "")
     if token is None and urlsplit(f"//{here}").hostname not in names | _OWN:
@@ -44,9 +46,10 @@ def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> b
 
 @contextlib.contextmanager
 def guard_server(names: set[str], token: str | None) -> Iterator[Callable[[], bool]]:
-    """A block in which what begins to serve answers allowed requests only.
+    """Make servers that are started inside this context reject requests that are not allowed.
 
-    Yields a function that says whether something has begun to.
+    Yields:
+        A function that returns whether a server has been started.
     """
     from websockets.asyncio import server
 

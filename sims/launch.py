@@ -1,8 +1,8 @@
-"""The start of a flight: a robot at rest, balls that are launched, and what is seen of them.
+"""The start of a flight: a robot at rest, launched balls, and the first observations of them.
 
-A ball is in flight for a while before it is planned for: the papers use what they see of it
-only after 2 m (000, Section VII-A). That part is flown by the library, backwards from the
-ball's state at the planning.
+A ball has been in flight for a while when the first plan starts: the papers observe it for the
+first 2 m of its path [Yu2023catch, Section VII-A]. This first part is not simulated in MuJoCo. It
+is integrated backwards from the ball's state at the start of the plan.
 """
 
 import dataclasses
@@ -24,17 +24,20 @@ from planner_jax.sims.sensing import Estimate
 
 
 def flight_keys(seed: int, index: np.ndarray) -> Array:
-    """Keys (B,) of the flights at some places of the whole, whichever batch they are flown in."""
+    """Return random keys (B,) of the flights at these indices of the run.
+
+    A flight's key does not depend on its batch.
+    """
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.asarray(index))
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
-    """Flights with the robots at rest and no ball launched.
+    """Return flights with the robots at rest and no ball launched.
 
     Args:
         loop: with the world.
-        starts: (B, 3) [m].
+        starts: (B, 3) [m], positions of the robots.
         keys: (B,) of the noise.
     """
     number = loop.world.num_balls
@@ -73,18 +76,18 @@ def launch_ball(
     ball: int,
     seen: float,
 ) -> FlightState:
-    """The flights with one more ball in the air.
+    """Return the flights with one more ball in the air.
 
     Args:
         loop: of the flights.
         flights: leaves (B, ...).
-        balls: leaves (B, N, 3), each when it is planned for.
+        balls: leaves (B, N, 3), each at the start of the plan for it.
         drag: (B, N) K_D [1/m], the true one.
-        believed: (B, N) K_D [1/m].
-        ball: which of the N.
-        seen: [s] that it has been in flight already (static).
+        believed: (B, N) K_D [1/m], initial estimate.
+        ball: index of the launched ball among the N.
+        seen: [s], how long the ball has been in flight (static).
     """
-    without = dataclasses.replace(flights, plan=None)  # of which nothing is changed
+    without = dataclasses.replace(flights, plan=None)  # plans stay as they are
     after = _launch_ball(loop, without, balls, drag, believed, ball, seen)
     return dataclasses.replace(after, plan=flights.plan)
 
@@ -99,7 +102,7 @@ def _launch_ball(
     ball: Array,
     seen: float,
 ) -> FlightState:
-    """As `launch_ball`, of flights without plans."""
+    """Launch a ball as `launch_ball` does, in flights without plans."""
 
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
@@ -124,17 +127,18 @@ def _launch_ball(
 def await_ball(
     loop: Loop, flights: FlightState, coming: BallState, believed: Array, *, ball: int, ahead: float
 ) -> FlightState:
-    """The flights with a guess of one more ball, of which nothing is seen yet.
+    """Return the flights with a guess of one more ball that has not been observed yet.
 
-    What is believed of it is the guessed flight, backwards from when it will be planned for.
+    The estimate of the ball is the guessed flight, integrated backwards from the start of the plan
+    for it.
 
     Args:
         loop: of the flights.
         flights: leaves (B, ...).
-        coming: leaves (3,), as it is guessed to be when it is planned for.
-        believed: (B, N) K_D [1/m].
-        ball: which of the N.
-        ahead: [s] until it is planned for (static).
+        coming: leaves (3,), guessed state of the ball at the start of the plan for it.
+        believed: (B, N) K_D [1/m], initial estimate.
+        ball: index of the awaited ball among the N.
+        ahead: [s] until the plan for it starts (static).
     """
     gravity = jnp.asarray(loop.world.gravity, believed.dtype)
 
@@ -160,19 +164,19 @@ def await_ball(
 def watch_ball(
     loop: Loop, ball: BallState, drag: Array, believed: Array, key: Array, duration: float
 ) -> tuple[Array, Estimate, Estimate]:
-    """What was seen of one ball before it is planned for.
+    """Return the observations of one ball before the start of the plan for it.
 
     Args:
         loop: with sensing and planning period.
-        ball: true state when the plan begins.
+        ball: true state at the start of the plan.
         drag: () K_D [1/m], the true one.
-        believed: () K_D [1/m].
-        key: of the looks.
-        duration: [s] that the ball has been in flight by then (static).
+        believed: () K_D [1/m], initial estimate.
+        key: of the observation noise.
+        duration: [s], how long the ball has been in flight by then (static).
 
     Returns:
-        Positions (L, 3) [m] that looks are still to show, and the estimates of one planning
-        period ago and of now.
+        Positions (L, 3) [m] that are still to be observed because of the latency, and the estimates
+            of one planning period ago and of now.
     """
     sensing, dtype = loop.sensing, drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
@@ -197,15 +201,14 @@ def watch_ball(
 
 
 def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None:
-    """Raise `ValueError` unless the flown world is the one that is planned for.
+    """Raise `ValueError` unless the simulated world is the one for which plans are made.
 
     Args:
         loop: with the world.
         kind: of the tool.
         num_balls: of a flight.
-        planned: (B,) each, what the plans' cases say of `gravity`, `net_height`,
-            `net_radius`, `racket_height` or `racket_radius`; only those that are given are
-            compared.
+        planned: (B,) each, the values of `gravity`, `net_height`, `net_radius`, `racket_height` or
+            `racket_radius` in the plans' cases; only the passed ones are compared.
     """
     world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:
@@ -226,7 +229,7 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
 
 
 def require_plan(plan: Any, kind: type, head_state: Any) -> None:
-    """Raise `ValueError` unless a plan is one of the task and begins where the robot rests.
+    """Raise `ValueError` unless a plan is one of the task and starts at the position of the robot.
 
     Args:
         plan: with a trajectory, leaves (B, ...).

@@ -1,14 +1,14 @@
-"""A batch of flights, period by period: observe, estimate, plan anew, track, meet.
+"""The closed loop of a batch of flights, period by period: observe, estimate, replan, track, hit.
 
-Three periods are nested. A physics step is a control step; every look at the balls ends a row
-of these; a plan is made at the start of a row of looks, for the moment at which that row ends
-and from what was known at its start, and takes effect there. So a plan may take as long as one
-period to compute. The known latency is made up for by flying the estimate on.
+Three periods are nested. A physics step is also a control step. An observation of the balls follows
+after a fixed number of steps. A plan is made for a fixed number of observations: it uses what is
+known at the start of a planning period and takes effect at its end. So a plan may take one period
+to compute. The known latency of observations is compensated by extrapolating the estimates.
 
-The robot (`sims.robot.Robot`, in the world) says how it is tracked and commanded, the task's
-pilot what is planned and what counts as meeting a ball. Both are written for one flight; `fly_leg`
-has them carried out for a batch. Plans and physics of a period do not wait for each other. Times
-count from the first plan.
+The robot (`sims.robot.Robot`, in the world) defines its references and commands. The task's pilot
+defines what is planned and what counts as a contact with a ball. Both are written for one flight;
+`fly_leg` batches them. Planning and physics of a period run concurrently. Times count from the
+start of the first plan.
 """
 
 import dataclasses
@@ -30,11 +30,11 @@ from planner_jax.sims.model import ball_states, ball_velocity, step
 from planner_jax.sims.scoring import moment, nearest
 from planner_jax.sims.sensing import Estimate
 
-_FEW = 1024  # flights at once, for which compilation takes longer than all else
+_FEW = 1024  # largest batch for which compilation takes longer than the flights themselves
 
 
 def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
-    """Physics and control from one look to the next, and what that look says."""
+    """Simulate physics and control up to the next observation, and update the estimates with it."""
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
@@ -85,7 +85,7 @@ def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Fli
 
 
 def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
-    """The estimates (N, ...) after one look (N, 3)."""
+    """Return the estimates (N, ...) after one observation (N, 3)."""
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
@@ -97,7 +97,7 @@ def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
 
 
 def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
-    """The balls `ahead` [s] from now, as they are believed, leaves (N, 3)."""
+    """Return the predicted states of the balls `ahead` [s] from now, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
     span = jnp.asarray(ahead + loop.sensing.latency, dtype)
@@ -108,7 +108,10 @@ def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
 def _pose_problems(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any
 ) -> tuple[Outlook, Any]:
-    """What is to be planned for the end of this period (B, ...), and what is then expected."""
+    """Return the expected situation at the end of this period, and the planning problem for it.
+
+    Both have leaves (B, ...).
+    """
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
         when = flight.time + loop.period
@@ -128,7 +131,7 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """The plans (B, ...) of one of the pilot's searches."""
+    """Return the plans (B, ...) that one of the pilot's searches finds."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -136,7 +139,7 @@ def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
 def _fly(
     loop: Loop, pilot: Pilot, flights: FlightState, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Flights (B, ...) some periods on, by the plans that they have; records (B, K, ...)."""
+    """Fly some periods by the current plans; return flights (B, ...) and records (B, K, ...)."""
 
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
         def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -160,7 +163,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Flights (B, ...) at the end of a period, with what was found for it where that is good."""
+    """Return flights (B, ...) at the end of a period, with the new plans that the pilot accepts."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)
@@ -175,7 +178,7 @@ def _with_plans(
 
 
 def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
-    """Where everything is, and how wrong the balls' predictions are."""
+    """Return the state of the flight, and the errors of the predicted ball positions."""
     world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)
@@ -198,7 +201,7 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Whether each part of a period is a program of its own."""
+    """Return whether each part of a period is compiled as its own program."""
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
 
@@ -206,7 +209,7 @@ def in_parts(flights: FlightState) -> bool:
 def _next_period(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, begin: Callable
 ) -> tuple[FlightState, Any]:
-    """Flights (B, ...) one period on, with plans that were made meanwhile, and their records.
+    """Return flights (B, ...) one period later, with plans made meanwhile, and their records.
 
     Args:
         loop: of the flights.
@@ -214,7 +217,8 @@ def _next_period(
         flights: at the start of the period.
         cases: of the task, leaves (B, ...).
         drag: (B, N) K_D [1/m].
-        begin: begins a part of the period with what it is given, and returns what waits for it.
+        begin: starts one part of the period with its arguments, and returns a function that waits
+            for the result.
     """
     outlook, asked = _pose_problems(loop, pilot, flights, cases)
     found = [begin(_search_plans, pilot, number, asked) for number in range(len(pilot.searches))]
@@ -227,7 +231,7 @@ def _next_period(
 def _fly_and_plan(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """As `_fly`, with plans made anew, in one program."""
+    """Fly some periods with replanning, in one program; return the same as `_fly`."""
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
     def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -241,22 +245,21 @@ def _fly_and_plan(
 def fly_leg(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, *, num_periods: int
 ) -> tuple[FlightState, list[Record]]:
-    """A batch of flights for some periods.
+    """Fly a batch of flights for some periods.
 
-    Many are flown in one program. Of few on a GPU each part of a period is a program of its own,
-    since these take half as long to compile, if at the same time, and a third longer to carry out.
+    A large batch runs in one program. For a small batch on a GPU each part of a period is its own
+    program: compiled concurrently, these take half as long to compile and a third longer to run.
 
     Args:
-        loop: what shapes the programs.
+        loop: settings that shape the programs.
         pilot: of the task.
         flights: at the start of the leg, leaves (B, ...).
         cases: of the task, leaves (B, ...); their times count like the flights'.
         drag: (B, N) K_D [1/m], the true one.
-        num_periods: how many.
+        num_periods: number of planning periods.
 
     Returns:
-        The flights at the end, and with `loop.record` the looks, leaves (B, K, ...), one behind
-        another.
+        The flights at the end, and with `loop.record` the consecutive records, leaves (B, K, ...).
     """
     if loop.replan == 0.0:
         flights, record = _fly(loop, pilot, flights, drag, num_periods)
@@ -276,24 +279,25 @@ def fly_leg(
 def begin_compiling(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array
 ) -> Callable[[], Any]:
-    """Have the programs of a leg compiled by another thread, while something else is done.
+    """Start to compile the programs of a leg in another thread.
 
-    Only where each part of a period is a program of its own; elsewhere nothing is begun. For the
-    programs to be those of `fly_leg`, one period is flown by plans that are nothing but zeros.
+    This applies only where each part of a period is its own program; elsewhere nothing is started.
+    The thread flies one period with plans of zeros, so that the programs are those that `fly_leg`
+    needs.
 
     Args:
-        loop: what shapes the programs.
+        loop: settings that shape the programs.
         pilot: of the task.
         flights: leaves (B, ...), which may be without plans.
         cases: as for `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
         drag: (B, N) K_D [1/m].
 
     Returns:
-        What waits for its end, to be called before `fly_leg`.
+        A function that waits for the compilation, to be called before `fly_leg`.
     """
     if loop.replan == 0.0 or not in_parts(flights):
         return lambda: None
-    # By way of the host, as plans are that are made there.
+    # Created from NumPy arrays, like plans that are made on the host.
     zeros = functools.partial(
         jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     )

@@ -20,43 +20,43 @@ from planner_jax.sims.sensing import Estimate
 
 @struct.dataclass
 class Outlook:
-    """What a plan is made of: the moment from which it is to be flown, as expected."""
+    """The expected situation at the time from which a new plan is flown."""
 
     time: Array  # () [s]
-    elapsed: Array  # () [s], since the plan flown until then began
-    balls: BallState  # leaves (N, 3), where they are believed to be then
-    drag: Array  # (N,) K_D [1/m], believed
-    present: Array  # (N,) bool, which are in flight and not yet met
-    head_state: Array  # of the robot, (4, 3) for a quadrotor
+    elapsed: Array  # () [s], since the current plan started
+    balls: BallState  # leaves (N, 3), predicted for that time
+    drag: Array  # (N,) K_D [1/m], estimated
+    present: Array  # (N,) bool, balls that are in flight and not yet met
+    head_state: Array  # state of the robot, (4, 3) for a quadrotor
 
 
 class Pilot(Protocol):
     """A task's part of the loop: a frozen dataclass, static under jit."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
-        """What is to be planned anew, while a plan is flown."""
+        """Return the planning problem at the outlook, while a plan is flown."""
         ...
 
     @property
     def searches(self) -> tuple[Callable[[Any], Any], ...]:
-        """Each makes a plan of what is asked; none waits for another."""
+        """Independent searches; each maps a planning problem to a plan."""
         ...
 
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
-        """One of the plans that the searches found; and () bool, whether to fly it."""
+        """Return one of the plans that the searches found; and () bool, whether to fly it."""
         ...
 
     def times(self, plan: Any) -> Array:
-        """When each ball is to be met (N,) [s] since the plan began, in the balls' order."""
+        """Return planned contact times (N,) [s] since the start of the plan, in balls' order."""
         ...
 
     def plan_shapes(self, cases: Any) -> Any:
-        """What plans (B, ...) of cases (B, ...) look like, leaves `jax.ShapeDtypeStruct`."""
+        """Return the shapes of plans (B, ...) of cases (B, ...), leaves `jax.ShapeDtypeStruct`."""
         ...
 
     @property
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
-        """What says which balls are met or missed within a step, like `scoring.passage`."""
+        """The function that finds the contacts and misses of a step, like `scoring.passage`."""
         ...
 
 
@@ -65,15 +65,15 @@ class Loop:
     """Everything that shapes a flight's program; static under jit.
 
     Raises:
-        ValueError: a period is not a whole number of the next shorter one.
+        ValueError: a period is not a whole multiple of the next shorter one.
     """
 
     world: World
     sensing: Sensing = Sensing()
-    replan: float = 0.0  # [Hz]; 0 flies the first plan
-    kalman: bool = True  # filter of what is seen of the balls
+    replan: float = 0.0  # [Hz]; 0 flies the first plan to its end
+    kalman: bool = True  # filter the observations of the balls
     estimate_drag: bool = True  # from the energy that a ball loses
-    record: bool = False  # path and prediction errors, look by look
+    record: bool = False  # store path and prediction errors at every observation
 
     def __post_init__(self) -> None:
         sensing, control_rate = self.sensing, 1.0 / self.world.timestep
@@ -85,26 +85,26 @@ class Loop:
 
     @property
     def steps_per_look(self) -> int:
-        """Physics steps from look to look."""
+        """The number of physics steps from one observation to the next."""
         return round(1.0 / (self.sensing.rate * self.world.timestep))
 
     @property
     def looks_per_plan(self) -> int:
-        """Looks from plan to plan; one where nothing is planned anew."""
+        """The number of observations from one plan to the next; one without replanning."""
         return self.sensing.looks_per_plan(self.replan)
 
     @property
     def period(self) -> float:
-        """[s] from plan to plan."""
+        """The time [s] from one plan to the next."""
         return self.looks_per_plan / self.sensing.rate
 
     @property
     def late_looks(self) -> int:
-        """How many looks old is what a look shows."""
+        """The latency of an observation, in observation periods."""
         return round(self.sensing.latency * self.sensing.rate)
 
     def num_periods(self, duration: float) -> int:
-        """How many periods cover a duration [s]."""
+        """Return the number of planning periods that cover a duration [s]."""
         return int(np.ceil(duration / self.period - 1e-6))
 
 
@@ -113,45 +113,45 @@ class FlightState:
     """Everything that changes during a flight."""
 
     physics: Physics
-    shown: Array  # (L, N, 3) [m], true positions of the balls that looks are still to show
+    shown: Array  # (L, N, 3) [m], true ball positions that are still to be observed
     estimates: Estimate  # leaves (N, ...)
-    earlier: Estimate  # those of one planning period ago
+    earlier: Estimate  # the estimates of one planning period ago
     launched: Array  # (N,) bool
-    present: Array  # (N,) bool, planned for and not yet met by plan
+    present: Array  # (N,) bool, balls with a plan whose contact time has not passed
     plan: Any
-    began: Array  # () [s], when the plan began
+    began: Array  # () [s], start time of the plan
     contact: Contact  # leaves (N, ...)
-    worst_tracking: Array  # () [m], of the robot from its plan, up to the last contact
-    squared_tracking: Array  # () [m^2 s]
-    tracked: Array  # () [s]
+    worst_tracking: Array  # () [m], greatest distance from the plan, up to the last contact
+    squared_tracking: Array  # () [m^2 s], integral of the squared distance
+    tracked: Array  # () [s], time over which it is integrated
     time: Array  # () [s]
     key: Array
 
 
 @struct.dataclass
 class Record:
-    """One look of a flight."""
+    """The state of a flight at one observation."""
 
     time: Array  # () [s]
     physics: Physics
-    wanted: Array  # (3,) [m], where the robot is to be
-    horizon: Array  # (N,) [s], until each ball is to be met
-    error: Array  # (N, 3) [m], of the prediction for then
+    wanted: Array  # (3,) [m], planned position of the robot
+    horizon: Array  # (N,) [s], time until the planned contact with each ball
+    error: Array  # (N, 3) [m], error of the predicted ball position at that contact
 
 
 @dataclasses.dataclass(frozen=True)
 class Flown:
-    """What came of a batch of flights, on the host; leaves with a leading axis B."""
+    """The result of a batch of flights, on the host; leaves with a leading axis B."""
 
     contact: Contact  # leaves (B, N, ...)
     plan: Any  # the last one
-    began: np.ndarray  # (B,) [s], when that began
-    tracking: np.ndarray  # (B, 2) [m], root mean square and worst, up to the last contact planned
+    began: np.ndarray  # (B,) [s], start time of that plan
+    tracking: np.ndarray  # (B, 2) [m], rms and worst, up to the last planned contact
     record: Record | None  # leaves (B, K, ...)
 
 
 def collect_flights(flights: FlightState, records: list[Record]) -> Flown:
-    """Of flights (B, ...) at their end, and what was recorded of them, in order."""
+    """Return the result of flights (B, ...) at their end, with their records in order."""
     there, records = jax.device_get((dataclasses.replace(flights, key=None), records))
     joined = functools.partial(jax.tree.map, lambda *leaves: np.concatenate(leaves, axis=1))
     mean = np.sqrt(there.squared_tracking / np.maximum(there.tracked, 1e-6))

@@ -1,19 +1,18 @@
-# MuJoCo's names come from a compiled module.
+# Pyright cannot see the names of MuJoCo's compiled module.
 # pyright: reportAttributeAccessIssue=false
 """The simulated world: MJCF of a robot, balls and ground, for MuJoCo and for MJX.
 
-World frame, z up, SI units. `qpos` holds the robot's joint positions and then the balls'
-positions; `qvel` the robot's joint velocities and then the balls' velocities. A ball does not
-spin [Yu2023bat, Section II], so three slides are its joint. Ball drag is a force in
-`qfrc_applied`.
+World frame, z up, SI units. `qpos` holds the robot's joint positions and then the balls' positions;
+`qvel` the robot's joint velocities and then the balls' velocities. A ball does not spin [Yu2023bat,
+Section II], so that its joint consists of three slides. Ball drag is a force in `qfrc_applied`.
 
-In flight nothing touches: the racket's impact is the library's map and a caught ball has
-crossed the hoop's disc (`scoring`), so the model has no contacts. Scenery and pitching machine are
-there to be looked at: they touch nothing and cost no step anything.
+The model has no contacts. The racket's impact is a map of the library, and a ball counts as caught
+when it has crossed the hoop's disc (`scoring`). Scenery and pitching machine are visual only: they
+touch nothing and cost no computing time.
 
-MuJoCo's Euler is semi-implicit: the velocity it keeps lies half a step before the position. For
-a ball that is taken care of at both ends, by `place_balls` and `ball_velocity`, which makes its
-flight second order.
+MuJoCo's Euler integrator is semi-implicit: its stored velocity belongs to half a step before the
+position. `place_balls` and `ball_velocity` correct for this half step, so that the flight of a ball
+is integrated with second order.
 """
 
 import contextlib
@@ -50,14 +49,14 @@ _TOWARDS_NET = np.pi  # [rad], heading of a machine that throws along -x
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """Everything that shapes the simulated model; static under jit."""
+    """The settings of the simulated model; static under jit."""
 
     robot: Robot
     gravity: float  # [m/s^2], magnitude
     num_balls: int = 1
     timestep: float = 0.002  # [s]
-    scenery: tuple[Part, ...] = ()  # what else stands there, to be looked at
-    mouth: tuple[float, float, float] | None = None  # [m], of the pitching machine, if any
+    scenery: tuple[Part, ...] = ()  # visual parts of the surroundings
+    mouth: tuple[float, float, float] | None = None  # [m], where balls leave the machine
 
     def __post_init__(self) -> None:
         if self.num_balls < 0:
@@ -67,7 +66,7 @@ class World:
 
     @property
     def carrier(self) -> ToolRobot:
-        """The robot as one that meets balls.
+        """The robot, as one that carries a tool.
 
         Raises:
             TypeError: it carries no tool.
@@ -80,7 +79,7 @@ class World:
 
 
 def mjcf(world: World) -> str:
-    """The model as MJCF text."""
+    """Return the model as MJCF text."""
     body, actuators = world.robot.mjcf()
     machine = machine_parts(world.mouth, _TOWARDS_NET) if world.mouth else []
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
@@ -113,15 +112,15 @@ def mjcf(world: World) -> str:
 
 @functools.cache
 def mujoco_model(world: World) -> mujoco.MjModel:
-    """The model for plain MuJoCo."""
+    """Return the model for plain MuJoCo."""
     return mujoco.MjModel.from_xml_string(mjcf(world))
 
 
 @functools.cache
 def _mjx_model(world: World) -> tuple[mjx.Model, mjx.Data]:
-    """The model for MJX's JAX implementation, and data whose state is to be filled in.
+    """Return the model for MJX's JAX implementation, and data whose state is to be filled in.
 
-    NumPy leaves, so that what is kept belongs to no trace.
+    Leaves are NumPy arrays, so that cached values belong to no trace.
     """
     model = mujoco_model(world)
     with jax.ensure_compile_time_eval():
@@ -131,12 +130,12 @@ def _mjx_model(world: World) -> tuple[mjx.Model, mjx.Data]:
 
 
 def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics:
-    """One time step of one world in MJX; pure, so scan, vmap and jit it.
+    """Return the physics after one time step of one world in MJX; pure, so scan, vmap and jit it.
 
     Args:
         world: the model.
         physics: before the step.
-        command: (A,), what is asked of the robot's actuators.
+        command: (A,), for the robot's actuators.
         drag: (N,) K_D [1/m] of the balls.
     """
     model, data = _mjx_model(world)
@@ -154,14 +153,14 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
 
 
 def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
-    """Quadratic drag  -m K_D |v| v  of every ball as generalised forces (3 N,)."""
+    """Return the quadratic drag  -m K_D |v| v  of every ball as generalised forces (3 N,)."""
     vel = qvel.reshape(world.num_balls, 3)
     speed = jnp.sqrt(jnp.sum(vel**2, axis=1, keepdims=True))
     return (-BALL_MASS * drag[:, None] * speed * vel).ravel()
 
 
 def at_rest(world: World, place: Array) -> Physics:
-    """The robot at rest at a place (3,) [m]; the balls lie far off."""
+    """Return the robot at rest at a position (3,) [m]; the balls lie far away."""
     place = jnp.asarray(place)
     qpos, qvel, act = world.robot.at_rest(place, world.gravity)
     away = jnp.tile(jnp.array([100.0, 0.0, 0.0], place.dtype), world.num_balls)
@@ -175,7 +174,7 @@ def at_rest(world: World, place: Array) -> Physics:
 def place_balls(
     world: World, physics: Physics, balls: BallState, drag: Array, which: Array
 ) -> Physics:
-    """The same with some balls in flight.
+    """Return the physics with some balls set to new states.
 
     Args:
         world: the model.
@@ -196,13 +195,13 @@ def place_balls(
 
 
 def ball_states(world: World, physics: Physics) -> tuple[Array, Array]:
-    """Positions and kept velocities of the balls, (N, 3) each."""
+    """Return positions and stored velocities of the balls, (N, 3) each."""
     pos, vel = physics.qpos[world.robot.num_pos :], physics.qvel[world.robot.num_vel :]
     return pos.reshape(world.num_balls, 3), vel.reshape(world.num_balls, 3)
 
 
 def ball_velocity(world: World, vel: Array, drag: Array) -> Array:
-    """Velocities (N, 3) at the time of the positions, from the kept ones and K_D (N,)."""
+    """Return velocities (N, 3) at the time of the positions, from the stored ones and K_D (N,)."""
     return vel + 0.5 * world.timestep * _ball_accelerations(world, vel, drag)
 
 

@@ -1,6 +1,6 @@
-"""How well a flight's balls and robot are seen: rates, latency and noise, with presets.
+"""Rates, latencies and noise of the sensing of balls and robots, with presets.
 
-Nothing here needs JAX or MuJoCo, so that settings can be checked before either is imported.
+This module needs neither JAX nor MuJoCo, so that settings can be checked before either is imported.
 """
 
 import dataclasses
@@ -22,12 +22,12 @@ class Sensing:
         ValueError: a value is out of its range.
     """
 
-    rate: float = 100.0  # [Hz], of the looks at the balls
+    rate: float = 100.0  # [Hz], of the observations of the balls
     position_std: float = 0.0  # [m], of a ball's coordinate
-    dropout: float = 0.0  # probability that a look shows nothing
-    latency: float = 0.0  # [s], age of what a look shows
-    # Standard deviations of the robot's own state, one for each field of the state in its units;
-    # the errors are drawn anew at every look. Empty: the robot knows its state.
+    dropout: float = 0.0  # probability that an observation is missing
+    latency: float = 0.0  # [s], age of an observation when it arrives
+    # Standard deviations of the robot's own state, one for each field of the state in its units.
+    # The errors are redrawn at every observation of the balls. Empty: the state is known exactly.
     robot_stds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -41,35 +41,36 @@ class Sensing:
             raise ArgumentError("dropout", "< 1", self.dropout)
 
     def looks_per_plan(self, replan: float) -> int:
-        """Looks from plan to plan at a rate of planning anew; one where that rate is 0.
+        """Return the number of observations from one plan to the next; one without replanning.
 
         Args:
-            replan: [Hz].
+            replan: [Hz], rate of replanning; 0 for never.
 
         Raises:
-            ValueError: the rate is negative or does not divide that of the looks.
+            ValueError: the rate is negative or does not divide the rate of observations.
         """
         if not replan >= 0.0:
             raise ArgumentError("replan", ">= 0", replan)
         if replan == 0.0:
             return 1
-        rule = f"a divisor of the looks' {self.rate:g} Hz"
+        rule = f"a divisor of the observations' {self.rate:g} Hz"
         require_whole(self.rate / replan, "replan", rule, replan)
         return round(self.rate / replan)
 
 
 NOISES = {
     "none": Sensing(),
-    # Both papers see with Vicon and run every module within 20 ms (002, Section VI-C), which is
-    # the latency; neither gives noise, rate or dropout. 5 mm a coordinate on a 40 mm ball at
-    # 7 m/s, 100 looks a second and 2 % of them lost are assumptions, as are the errors of the
-    # quadrotor's own state, an EKF of pose and IMU in both papers: of its position [m], velocity
-    # [m/s], attitude [rad] and body rate [rad/s].
+    # [Yu2023bat] and [Yu2023catch] observe with Vicon and run every module within 20 ms
+    # [Yu2023bat, Section VI-C]; that is the latency here. They give no noise, rate or dropout, so
+    # that all other numbers are assumptions: 5 mm a coordinate for a 40 mm ball, 100 observations
+    # a second, 2 % of them lost, and the errors of the quadrotor's own state. Both papers estimate
+    # that state with an EKF of pose and IMU: position [m], velocity [m/s], attitude [rad] and body
+    # rate [rad/s].
     "lab": Sensing(
         position_std=0.005, dropout=0.02, latency=0.02, robot_stds=(0.002, 0.02, 0.005, 0.02)
     ),
-    # Worse than the papers' halls: three times the noise, twice the latency, one look in ten
-    # lost; an assumption throughout.
+    # Worse than the papers' laboratories: three times the noise, twice the latency, and one
+    # observation in ten lost. All numbers are assumptions.
     "harsh": Sensing(
         position_std=0.015, dropout=0.1, latency=0.04, robot_stds=(0.006, 0.06, 0.015, 0.06)
     ),
@@ -77,15 +78,15 @@ NOISES = {
 
 
 CONTROL_RATE = 200  # [Hz], of the control steps of a drive
-FRAME_RATE = 50  # [Hz], of the poses of a drive that are kept and held against obstacles
+FRAME_RATE = 50  # [Hz], of the stored poses of a drive, which are checked for collisions
 
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSensing:
-    """How a car sees a target and movers in the plane, and itself; static under jit.
+    """Sensing of a car's target, of movers, and of the car's own pose; static under jit.
 
-    What is shown is a latency old. Poses of the car come at every control step; its own speed and
-    steering angle it knows at once.
+    Observations arrive one latency late. Poses of the car are measured at every control step. The
+    car knows its own speed and steering angle without delay.
 
     Raises:
         ValueError: a value is out of its range.
@@ -93,8 +94,9 @@ class PlaneSensing:
 
     target_std: float = 0.0  # [m], of a coordinate of the target or of a mover
     pose_stds: tuple[float, float] = (0.0, 0.0)  # of a coordinate [m] and of the heading [rad]
-    observation_rate: float = 1.0  # [Hz], of looks at the target during the drive; 0 for none
-    latency: float = 0.05  # [s]; that of the planner is a part of it
+    # [Hz], of observations of the target during the drive; 0 for none
+    observation_rate: float = 1.0
+    latency: float = 0.05  # [s], which includes the latency of the planner
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -105,13 +107,13 @@ class PlaneSensing:
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
-        """Frames from plan to plan at a rate of planning anew; those of a second if it is 0.
+        """Return the number of frames per plan; the frames of one second without replanning.
 
         Args:
-            replan: [Hz].
+            replan: [Hz], rate of replanning; 0 for never.
 
         Raises:
-            ValueError: the rate is negative or does not divide that of the frames.
+            ValueError: the rate is negative or does not divide the rate of frames.
         """
         if not replan >= 0.0:
             raise ArgumentError("replan", ">= 0", replan)
@@ -123,7 +125,7 @@ class PlaneSensing:
 
 PLANE_NOISES = {
     "none": PlaneSensing(),
-    # [Qu2022, Section V-A], sees targets once a second with a variance of 0.01 m^2 a coordinate,
-    # and says nothing of the car's own pose, of which 1 cm and 0.01 rad are assumptions.
+    # [Qu2022, Section V-A] observes targets once a second with a variance of 0.01 m^2 a coordinate.
+    # It does not specify the error of the car's own pose: 1 cm and 0.01 rad are assumptions.
     "paper": PlaneSensing(target_std=0.1, pose_stds=(0.01, 0.01)),
 }

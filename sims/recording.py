@@ -1,8 +1,8 @@
-"""What is kept of a run's first flights, so that they can be drawn, filmed and played again.
+"""Recordings of a run's first flights, from which they are drawn, filmed and replayed.
 
-They are the dataset `flights/` in the run folder: a row a flight, lists flat, SI units, meanings
-in the column metadata. Looks are at equal steps. They begin when the first ball leaves its
-machine, before there is a plan, and end when the last returned ball is down.
+A recording is the dataset `flights/` in the run folder: one row per flight, flat lists, SI units,
+meanings in the column metadata. Samples are equally spaced in time. They start when the first ball
+leaves its machine, before the first plan, and end when the last returned ball is on the ground.
 """
 
 import dataclasses
@@ -21,43 +21,43 @@ from planner_jax.sims.robot import Robot
 from planner_jax.task.hit.court import fly, landing
 
 FLIGHTS = "flights"
-_FAR = 20.0  # [m], where balls wait that are not in flight
-_LONGEST = 3.0  # [s], that a returned ball is followed
+_FAR = 20.0  # [m], distance at which balls wait that are not in flight
+_LONGEST = 3.0  # [s], longest path of a returned ball that is recorded
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """F flights of N balls at K looks each; NumPy leaves, world frame, z up.
+    """F flights of N balls at K samples each; NumPy leaves, world frame, z up.
 
-    The robot has R joint positions, for a quadrotor three of the propeller plane's centre [m] and
-    the quaternion w x y z. A target that drives counts as a ball. Times count from the first
-    plan. NaN stands for a ball that is not in flight, a robot that is no longer simulated, a ball
-    that is never met and a flight without target.
+    The robot has R joint positions. For a quadrotor these are the position of the propeller plane's
+    centre [m] and the quaternion w x y z. A target that drives counts as a ball. Times count from
+    the start of the first plan. NaN stands for a ball that is not in flight, a robot that is no
+    longer simulated, a ball that is never met, and a flight without a target.
     """
 
-    index: np.ndarray  # (F,) place in the run
+    index: np.ndarray  # (F,) index in the run
     success: np.ndarray  # (F,) bool
     time: np.ndarray  # (F, K) [s]
     robot: np.ndarray  # (F, K, R), its joint positions
-    wanted: np.ndarray  # (F, K, 3) [m], where the plan that is flown has the robot
+    wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot
     balls: np.ndarray  # (F, K, N, 3) [m]
-    met: np.ndarray  # (F, N) [s]
-    contact: np.ndarray  # (F, N, 3) [m], of the ball's centre when it is met
+    met: np.ndarray  # (F, N) [s], time of the contact with each ball
+    contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
     target: np.ndarray  # (F, 3) [m]
-    # (F, K, M, 3) [m], where the first ball was expected to be from then on; M = 0 if not kept
+    # (F, K, M, 3) [m], predicted path of the first ball from each sample on; M = 0 if not recorded
     expected: np.ndarray
 
     def __len__(self) -> int:
         return len(self.index)
 
     def num_looks(self, flight: int) -> int:
-        """How many looks of a flight show anything that moves."""
+        """Return the number of samples of a flight up to the last one with a moving object."""
         there = np.isfinite(self.robot[flight]).all(axis=1)
         there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
         return int(np.flatnonzero(there)[-1]) + 1
 
     def launch(self, flight: int) -> tuple[np.ndarray, float] | None:
-        """Where the first ball is launched (3,) [m], and in which heading [rad]; None if never."""
+        """Return launch position (3,) [m] and heading [rad] of the first ball, or None."""
         path = self.balls[flight, :, 0]
         path = path[np.isfinite(path).all(axis=1)]
         if len(path) < 2:
@@ -67,39 +67,39 @@ class Recording:
 
 
 class Frame(NamedTuple):
-    """Where everything is at one look."""
+    """The positions of robot and balls at one sample."""
 
     time: float  # [s]
     robot: np.ndarray  # (R,), its joint positions
-    wanted: np.ndarray  # (3,) [m]
-    balls: np.ndarray  # (N, 3) [m], NaN for those not to be seen
+    wanted: np.ndarray  # (3,) [m], planned position of the robot
+    balls: np.ndarray  # (N, 3) [m], NaN for invisible ones
 
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """What is known of the N balls of F flights besides what was simulated; NumPy leaves."""
+    """The states of the N balls of F flights before and after the simulation; NumPy leaves."""
 
-    balls: BallState  # leaves (F, N, 3), each when it is planned for
+    balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
     drag: Any  # (F, N) K_D [1/m], the true one
-    begins: np.ndarray  # (N,) [s], when each ball is planned for
-    seen: float  # [s] that it has been in flight by then
+    begins: np.ndarray  # (N,) [s], start of the plan for each ball
+    seen: float  # [s], how long a ball has been in flight by then
     returned: BallState | None = None  # leaves (F, 3), the first ball just after its impact
     target: Any = None  # (F, 3) [m], of a returned ball
 
 
 def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
-    """Where everything is at a look of a flight.
+    """Return the positions of robot and balls at a sample of a flight.
 
-    The robot stays where it was last simulated, and a caught ball lies in its net.
+    After the end of its simulation the robot stays where it was. A caught ball lies in its net.
 
     Args:
         recording: of the run.
         robot: that was flown.
         flight: row of the recording.
-        look: of the flight.
+        look: index of the sample.
 
     Raises:
-        ValueError: there is no such flight or look.
+        ValueError: there is no such flight or sample.
     """
     for name, value, number in (
         ("flight", flight, len(recording)),
@@ -120,13 +120,15 @@ def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
 def make_recording(
     world: World, flown: Flown, launches: Launches, *, index: np.ndarray, success: np.ndarray
 ) -> Recording:
-    """The recording of some flights: what was simulated, the balls before, and what came back.
+    """Return the recording of some flights.
+
+    It joins the balls' paths before the simulation, the simulated flight and the returned balls.
 
     Args:
         world: that was flown.
         flown: F flights with their record.
         launches: of their balls.
-        index: (F,) places in the run.
+        index: (F,) indices in the run.
         success: (F,) bool.
     """
     record: Any = flown.record
@@ -135,7 +137,7 @@ def make_recording(
     apart = float(np.median(np.diff(steps[0])))
     number, looks = steps.shape
     met = np.where(flown.contact.met, flown.contact.time, np.nan)
-    down = np.full((number, 1), np.nan)  # when the returned balls are on the ground
+    down = np.full((number, 1), np.nan)  # times at which returned balls reach the ground
     if returned is not None:
         away = landing(returned.pos, returned.vel, drag[:, 0], np.full(number, world.gravity))[0]
         down = met[:, :1] + np.minimum(np.nan_to_num(away, nan=_LONGEST), _LONGEST)[:, None]
@@ -145,13 +147,13 @@ def make_recording(
     time = np.broadcast_to(grid, (number, grid.size))
 
     def extend(leaf: np.ndarray) -> np.ndarray:
-        """The first value before the record, and NaN after it."""
+        """Extend a leaf over all samples: its first value before the record, NaN after it."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
         whole[:, before : before + looks], whole[:, :before] = leaf, leaf[:, :1]
         return whole
 
     def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
-        """Places (F, K, ..., 3) of balls (F, ..., 3) after spans (F, K, ...) [s]."""
+        """Return positions (F, K, ..., 3) of balls (F, ..., 3) after times (F, K, ...) [s]."""
         pos, vel = (np.asarray(leaf, float)[:, None] for leaf in (ball.pos, ball.vel))
         return fly(pos, vel, span, drag[:, None], np.full(span.shape, world.gravity))[0]
 
@@ -187,36 +189,36 @@ def make_recording(
 
 
 def _or_never(time: np.ndarray) -> np.ndarray:
-    """Infinity in the place of NaN."""
+    """Replace NaN by infinity."""
     return np.nan_to_num(time, nan=np.inf)
 
 
 _COLUMNS = leaves_of(
     "verdict",
-    ("index", "", "place in the run", pa.int64()),
-    ("success", "", "as its task counts it", BOOL),
-    ("time", "s", "of each look", LIST),
-    ("robot", "", "looks x R, flat; joint positions as MuJoCo has them, m and rad", LIST),
-    ("wanted", "m", "looks x 3, flat; where the plan has the robot", LIST),
-    ("balls", "m", "looks x balls x 3, flat; NaN where not in flight", LIST),
-    ("met", "s", "when each ball is met, NaN for never", LIST),
-    ("contact", "m", "balls x 3, flat; where each ball is met", LIST),
+    ("index", "", "index in the run", pa.int64()),
+    ("success", "", "by the task's criterion", BOOL),
+    ("time", "s", "of each sample", LIST),
+    ("robot", "", "samples x R, flat; joint positions in MuJoCo's order, m and rad", LIST),
+    ("wanted", "m", "samples x 3, flat; planned position of the robot", LIST),
+    ("balls", "m", "samples x balls x 3, flat; NaN where not in flight", LIST),
+    ("met", "s", "time of the contact with each ball, NaN for never", LIST),
+    ("contact", "m", "balls x 3, flat; position of each ball at its contact", LIST),
     ("target", "m", "of a returned ball, NaN for catches", VECTOR),
-    ("expected", "m", "looks x points x 3, flat; the way expected of what is to be met", LIST),
+    ("expected", "m", "samples x points x 3, flat; predicted path of the ball or target", LIST),
 )
 
 
 def to_rows(recording: Recording) -> pa.Table:
-    """A row a flight."""
+    """Return a table with one row per flight."""
     batch = RefereedBatch(Chunk(recording.index, None), None, recording)
-    return rows_of(_COLUMNS, batch, "world, z up; times from the first plan")
+    return rows_of(_COLUMNS, batch, "world, z up; times from the start of the first plan")
 
 
 def read_recording(table: pa.Table) -> Recording:
-    """Return the recording whose rows `to_rows` returned.
+    """Return the recording from a table that `to_rows` returned.
 
     Raises:
-        ValueError: columns are missing, or do not fit each other.
+        ValueError: columns are missing, or their sizes do not fit each other.
     """
     wanted = {column.name: column.type for column in _COLUMNS}
     found = dict(zip(table.column_names, table.schema.types, strict=True))

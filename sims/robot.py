@@ -1,8 +1,8 @@
-"""What the simulated world, the closed loop and the pictures ask of a robot.
+"""The interface of a robot to the simulated world, the closed loop and the pictures.
 
-A robot is a frozen dataclass, static under jit: `robots/quadrotor/robot.py` is one, which carries a
-tool, `robots/car/robot.py` and `robots/arm/robot.py` are two without. Its part of MuJoCo's state
-comes first in `qpos` and `qvel`, before that of the balls; all of `act` is its own.
+A robot is a frozen dataclass, static under jit. `robots/quadrotor/robot.py` carries a tool;
+`robots/car/robot.py` and `robots/arm/robot.py` do not. The robot's part of MuJoCo's state comes
+first in `qpos` and `qvel`, before the balls. All of `act` belongs to the robot.
 """
 
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -17,36 +17,39 @@ from planner_jax.robot.quadrotor_model import QuadrotorModel, Tool
 
 @struct.dataclass
 class Physics:
-    """What changes from step to step, for R joint positions of the robot and N balls."""
+    """The part of MuJoCo's state that changes from step to step.
+
+    The robot has R joint positions and R' joint velocities; there are N balls and A actuators.
+    """
 
     qpos: Array  # (R + 3 N,)
     qvel: Array  # (R' + 3 N,)
-    act: Array  # (A,), what the actuators have reached, in their units
+    act: Array  # (A,), states of the actuators, in their units
 
 
 class Solid(NamedTuple):
-    """The surface of a body, closed and convex."""
+    """The surface of a closed convex body."""
 
     corners: np.ndarray  # (V, 3) [m]
-    triangles: np.ndarray  # (T, 3) int, seen from outside counter-clockwise
+    triangles: np.ndarray  # (T, 3) int, counter-clockwise when seen from outside
 
 
 class Shape(NamedTuple):
-    """A rigid part of a robot as it is drawn, in the part's own frame."""
+    """A rigid part of a robot for drawing, in the part's own frame."""
 
     lines: list[np.ndarray]  # each (M, 3) [m]
-    discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], across the z axis
+    discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], normal to the z axis
     tool: bool = False  # whether the last line is the tool's rim
     solids: tuple[Solid, ...] = ()
     colour: str = "#D9A441"  # of the solids
 
 
 def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
-    """Rotation matrix (3, 3), body to world, of a unit quaternion (4,).
+    """Return the rotation matrix (3, 3), body to world, of a unit quaternion (4,).
 
     Args:
         quat_wxyz: w x y z.
-        array_library: `jax.numpy`, or `numpy` for a result in the precision of the host.
+        array_library: `jax.numpy`, or `numpy` for a result in float64.
     """
     w, x, y, z = quat_wxyz
     return array_library.array(
@@ -61,56 +64,59 @@ def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
 class Robot(Protocol):
     """A robot's part of a flight. `World` is `sims.model.World`, which holds the robot."""
 
-    WORDS: ClassVar[str]  # how it is simulated and controlled, for the page of a run
-    num_pos: ClassVar[int]  # R, of its joint positions in `qpos`
-    num_vel: ClassVar[int]  # R', of its joint velocities in `qvel`
-    noise_shape: ClassVar[tuple[int, ...]]  # of the standard normal noise that `sense` takes
+    WORDS: ClassVar[str]  # description of its simulation and control, for the report of a run
+    num_pos: ClassVar[int]  # R, number of its joint positions in `qpos`
+    num_vel: ClassVar[int]  # R', number of its joint velocities in `qvel`
+    noise_shape: ClassVar[tuple[int, ...]]  # shape of the standard normal noise that `sense` uses
 
     def mjcf(self) -> tuple[str, str]:
-        """Its body and its actuators as MJCF text."""
+        """Return its body and its actuators as MJCF text."""
         ...
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Its part of `qpos` and `qvel`, and `act`, at rest at a place (3,) [m]."""
+        """Return its part of `qpos` and `qvel`, and `act`, at rest at a position (3,) [m]."""
         ...
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """What a command (A,) makes of its controls (A,), and forces on its joints (R',).
+        """Return MuJoCo's controls (A,) for a command (A,), and extra forces on the joints (R',).
 
-        The forces are those that no actuator of the model has, such as those of tyres.
+        The forces are those that the model has no actuators for, such as tyre forces.
         """
         ...
 
     def state(self, physics: Physics) -> Any:
-        """Its state, a pytree."""
+        """Return its state, a pytree."""
         ...
 
     def sense(self, state: Any, noise: Array, stds: Any) -> Any:
-        """Its state as it is estimated, with errors of some standard deviations."""
+        """Return its estimated state: the true state with errors of some standard deviations."""
         ...
 
     def references(self, plan: Any, times: Array, world: Any) -> Any:
-        """What it tracks (K,) [s] after a plan's begin, leaves (K, ...); `pos` is the place."""
+        """Return its references at times (K,) [s] since the start of a plan, leaves (K, ...).
+
+        Every reference has a position `pos`.
+        """
         ...
 
     def command(self, state: Any, reference: Any, world: Any) -> Array:
-        """What is asked of the actuators (A,) to track one reference."""
+        """Return the command (A,) that makes the actuators track one reference."""
         ...
 
     def shapes(self) -> list[Shape]:
-        """Its rigid parts as they are drawn."""
+        """Return its rigid parts for drawing."""
         ...
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Position (3,) [m] and attitude (4,), w x y z, of each shape at joint positions (R,)."""
+        """Return position (3,) [m] and quaternion (4,), w x y z, of each shape at a pose (R,)."""
         ...
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """The point (..., 3) [m] that stands for the robot at joint positions (..., R)."""
+        """Return the point (..., 3) [m] that represents the robot at joint positions (..., R)."""
         ...
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Centre (3,) [m] of a ball that lies in the tool; NaN if the tool holds none."""
+        """Return the centre (3,) [m] of a ball in the tool; NaN if the tool holds none."""
         ...
 
 
@@ -119,18 +125,24 @@ class ToolRobot(Robot, Protocol):
 
     @property
     def model(self) -> QuadrotorModel:
-        """What plans are made for."""
+        """The model for which plans are made."""
         ...
 
     @property
     def tool(self) -> Tool:
-        """What it meets balls with."""
+        """The tool that hits or catches balls."""
         ...
 
     def tool_motion(self, state: Any) -> tuple[Array, Array, Array, Array]:
-        """Of the body with the tool, in the world: place, velocity, rate and z axis, (3,) each."""
+        """Return position, velocity, angular rate and z axis of the body with the tool, (3,) each.
+
+        All are in the world frame.
+        """
         ...
 
     def head_state(self, plan: Any, time: Array) -> Array:
-        """Its state () [s] after a plan's begin, from where another begins; first row the place."""
+        """Return its planned state at a time () [s] since the start of a plan.
+
+        The first row is the position. A new plan may start from this state.
+        """
         ...

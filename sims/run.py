@@ -1,4 +1,4 @@
-"""A run of flights into a run folder: manifest, rows, table, picture, page and film."""
+"""Runs of flights in a run folder: manifest, rows, table, picture, report page and film."""
 
 import dataclasses
 import datetime
@@ -40,18 +40,20 @@ from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.report import require_counted
 
-_FILMED = 3  # flights at most
-_RECORDED = 256  # flights of a batch that are recorded whole
-_FRAME = "world, z up; times from the first plan"
+_FILMED = 3  # flights in a film, at most
+_RECORDED = 256  # largest batch of flights that is recorded completely
+_FRAME = "world, z up; times from the start of the first plan"
 
 
 _COLUMNS = (
     INDEX,
-    *leaves_of("verdict", ("success", "", "as its task counts it", BOOL)),
+    *leaves_of("verdict", ("success", "", "by the task's criterion", BOOL)),
     status_column("of the first plan"),
     *leaves_of("plans", ("iterations", "", "of the first plan", COUNT)),
-    Column("tracking_rms", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 0]),
-    Column("tracking_worst", "m", "on the way", NUMBER, lambda b: b.verdict.flown.tracking[:, 1]),
+    Column("tracking_rms", "m", "from the plan", NUMBER, lambda b: b.verdict.flown.tracking[:, 0]),
+    Column(
+        "tracking_worst", "m", "from the plan", NUMBER, lambda b: b.verdict.flown.tracking[:, 1]
+    ),
 )
 
 
@@ -62,19 +64,16 @@ def start_flights(
     *,
     record: int = 16,
 ) -> dict[str, Any]:
-    """Fly into a new folder.
+    """Fly into a new folder, and return the manifest of the run.
 
     Args:
         settings: of the run, of the task's own class.
         out: folder, new or empty.
-        video: name of a film in the folder, .gif or .mp4; None makes none.
-        record: how many flights are kept look by look, the first ones.
-
-    Returns:
-        The manifest.
+        video: name of a film in the folder, .gif or .mp4; None for no film.
+        record: number of flights that are recorded, the first ones.
 
     Raises:
-        ArgumentError: an argument breaks a rule; nothing is left behind.
+        ArgumentError: an argument breaks a rule; no files are left behind.
     """
     folder = RunFolder(out)
     require(1 <= record <= _RECORDED, "record", f">= 1 and <= {_RECORDED}", record)
@@ -109,7 +108,7 @@ def start_flights(
 
 
 def _discard_unfinished(folder: RunFolder) -> str:
-    """Remove what was written of flights that are not finished, and say so."""
+    """Remove the files of flights that are not finished, and return a message about it."""
     try:
         if folder.read_manifest()["state"] == "complete":
             return f"the flights are finished: {folder.path}"
@@ -122,7 +121,7 @@ def _discard_unfinished(folder: RunFolder) -> str:
 def _fly_into(
     folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
 ) -> dict[str, Any]:
-    """Fly, and write everything; gives the manifest."""
+    """Fly, write all files of the run, and return the manifest."""
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.plans.write_rows(rows)
     recording = flight.recording(cases, flights, np.arange(kept))
@@ -136,10 +135,10 @@ def _fly_into(
 
 
 def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recording]:
-    """Manifest, task and recording of a finished run of flights.
+    """Return manifest, task and recording of a finished run of flights.
 
     Raises:
-        ArgumentError: the folder is not that of such a run.
+        ArgumentError: the folder does not hold such a run.
     """
     manifest = folder.read_manifest()
     flights = Dataset(folder.path / FLIGHTS)
@@ -161,7 +160,7 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `ArgumentError` unless files of flights are whole, and their summary counts them."""
+    """Raise `ArgumentError` unless the files of flights are complete and match their summary."""
     manifest, flight, _ = read_flights(folder)
     try:
         counted = _summary(flight, folder.plans.read())
@@ -174,9 +173,9 @@ def require_sound(folder: RunFolder) -> None:
 
 
 def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
-    """Rows of all flights, batch by batch, seconds, and the first flights with their record.
+    """Return the rows of all flights, the times [s], and the first flights with their record.
 
-    A run of few flights records them all, which saves compiling another program.
+    A run of few flights records them all, which saves compiling a second program.
     """
     num = flight.settings.num
     size = min(flight.settings.batch or 4096, num)
@@ -184,7 +183,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
     parts, compiling, warm, warm_flights, recorded = [], 0.0, 0.0, 0, None
     watch = Stopwatch()
     for first in range(0, num, size):
-        lanes = np.arange(first, first + size) % num  # the last batch is filled up
+        lanes = np.arange(first, first + size) % num  # the last batch is padded
         with CompileClock() as clock:
             lap = Stopwatch()
             flights = flight.fly(cases[lanes], record)
@@ -208,7 +207,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
 
 
 def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
-    """Counts of a run."""
+    """Return the counts and rates of a run."""
     success = np.asarray(rows["success"])
     low, high = wilson_interval(int(success.sum()), success.size)
     return {
@@ -223,7 +222,7 @@ def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
 
 
 def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
-    """Success and times of a run, a sentence each."""
+    """Return success and times of a run, one sentence per line."""
     summary, times, device = manifest["summary"], manifest["times"], manifest["device"]
     settings = flight.settings
     rate = percent(summary["successes"], summary["num"])
@@ -247,13 +246,13 @@ def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
 
 
 def write_flight_report(folder: RunFolder) -> None:
-    """Write `table.md`, `figures/` and `index.html` of a run of flights anew.
+    """Write `table.md`, `figures/` and `index.html` of a run; existing ones are replaced.
 
     Args:
         folder: with `manifest.json`, `plans/` and `flights/`; a film may be there.
 
     Raises:
-        ArgumentError: the folder is not that of a finished run of flights.
+        ArgumentError: the folder does not hold a finished run of flights.
     """
     manifest, flight, recording = read_flights(folder)
     folder.figures.mkdir(exist_ok=True)
@@ -299,5 +298,5 @@ def write_flight_report(folder: RunFolder) -> None:
 
 
 def _image(name: str) -> str:
-    """A figure of the run folder as HTML."""
+    """Return a figure of the run folder as HTML."""
     return f'<p><img src="figures/{name}" alt="{name.partition(".")[0]}"></p>\n'

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_block_library import made_up
+from test_block_library import make_library
 
 import planner_jax as pj
 from planner_jax.baselines.block.library.file import save_library
@@ -408,7 +408,7 @@ def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
 
 def test_flights_take_a_library_of_their_limits_and_scene_alone(tmp_path):
     path = tmp_path / "a.lib"
-    save_library(path, made_up(regime="R1"))
+    save_library(path, make_library(regime="R1"))
     assert BlockFly(planner=f"library:{path}", regime="R1").flight().settings.regime == "R1"
     for options in ({"regime": "R2"}, {"regime": "R1", "suite": "open"}):
         with pytest.raises(ArgumentError, match="^library must be of the cases' arm, limits and"):

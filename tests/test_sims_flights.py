@@ -9,7 +9,7 @@ import jax
 import numpy as np
 import pytest
 from flax import struct
-from test_solve import GOALS, TRACES, Well, WellPlanner
+from test_solve import GOALS, Well, WellPlanner
 
 import planner_jax as pj
 from planner_jax.core.planner import Planner
@@ -33,6 +33,8 @@ from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
+
+TRACES = []
 
 
 def planned_places(flown):
@@ -268,12 +270,23 @@ def test_a_heavy_robot_with_a_large_net_catches():
     assert flights.caught.mean() >= 0.75
 
 
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class TracedPlanner(WellPlanner):
+    """A planner that counts how often it is traced."""
+
+    def prepare(self, case):
+        TRACES.append(case)
+        return case
+
+
 def test_what_was_compiled_ahead_is_not_traced_again():
     first, second = WellPlanner().rounds
     own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
-    planner, easy = WellPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
+    planner, easy = TracedPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
     compile_attempts(planner, easy)
     before = len(TRACES)
+    assert before > 0
     plans = plan(planner, Well(np.append(GOALS, np.float32(np.nan))))
     assert is_solved(plans.status).tolist() == [True] * 5 + [False]
     assert len(TRACES) == before

@@ -1,6 +1,6 @@
 """Noisy observations of a target in the plane, centred for a fit.
 
-World frame, SI units, one target. An observation that is not finite, or of weight zero, counts as
+World frame, SI units, one target. An observation that is not finite, or has weight zero, counts as
 absent, so that shapes stay fixed. Inside the fits points are pairs (x, y) of arrays.
 """
 
@@ -19,21 +19,21 @@ class Centred(NamedTuple):
     """Observations relative to their weighted means."""
 
     weight: Array  # (L,), 0 where absent
-    after: Array  # (L,) [s], from the middle on
-    place: Pair  # each (L,) [m], from the centre
-    middle: Array  # () [s]
-    centre: Pair  # each () [m]
+    after: Array  # (L,) [s], time of each observation minus the mean time
+    place: Pair  # each (L,) [m], position minus the mean position
+    middle: Array  # () [s], weighted mean time
+    centre: Pair  # each () [m], weighted mean position
     total: Array  # () sum of the weights; 1 if all are absent
-    num: Array  # () how many are present
+    num: Array  # () number of present observations
 
 
 def centre(
     times: ArrayLike, positions: ArrayLike, weights: ArrayLike | None, least: int
 ) -> Centred:
-    """Centre observations at times (L,) of positions (L, 2), with weights (L,), for a fit.
+    """Return weighted observations of positions (L, 2) at times (L,), centred at their means.
 
     Raises:
-        ValueError: the shapes do not match, or there is no room for `least` observations; one
+        ValueError: the shapes do not match, or the arrays hold fewer than `least` observations; one
             line.
     """
     times, positions = jnp.asarray(times), jnp.asarray(positions)
@@ -65,6 +65,6 @@ def centre(
 
 
 def safe_sqrt(value: Array) -> Array:
-    """Return the roots of numbers (...) >= 0; the slope at zero is zero."""
+    """Return the square roots of numbers (...) >= 0, with a derivative of zero at zero."""
     positive = value > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, value, 1.0)), 0.0)

@@ -1,7 +1,7 @@
 """Polynomials through observations of a target [Qu2022, eqs 9-11].
 
-Each additional degree multiplies the noise of a prediction, and a straight line misses targets
-that turn: `planner_jax.sims.prediction.select_path.select` usually does better than any of them.
+Each additional degree amplifies the noise of a prediction, and a straight line misses targets that
+turn. `planner_jax.sims.prediction.select_path.select` usually predicts better than any polynomial.
 """
 
 import jax.numpy as jnp
@@ -18,20 +18,20 @@ def fit_polynomial(
 ) -> PolynomialPath:
     """Fit a polynomial to observations by least squares [Qu2022, eqs 9 and 10].
 
-    Orthogonal columns in normalised time stand for the normal equations of eq. 11, whose H is
-    printed as the sum T'T, and would there be squared once too often. With fewer observations
-    than coefficients the degree is as high as they allow.
+    Orthogonal columns in normalised time replace the normal equations of eq. 11. The paper prints
+    their H as the sum T'T, which is squared once too often. With fewer observations than
+    coefficients the degree is reduced to what the observations determine.
 
     Args:
         times: (L,) [s].
         positions: (L, 2) [m].
         degree: n, 1 to 3.
-        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 if not
-            given. One of weight zero, or not finite, is absent.
+        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
+            An observation of weight zero, or not finite, is absent.
 
     Raises:
-        ValueError: the degree is another one, there is no room for degree + 1 observations, or
-            the shapes do not match; one line.
+        ValueError: the degree is another one, the arrays hold fewer than degree + 1 observations,
+            or the shapes do not match; one line.
     """
     if degree not in (1, 2, 3):
         raise ArgumentError("degree", "1, 2 or 3", degree)
@@ -45,7 +45,7 @@ def fit_polynomial(
         root * jnp.stack(seen.place, axis=-1),
     )
     rows, right = [], []
-    for k in range(degree + 1):  # Gram-Schmidt, each column off all that follow
+    for k in range(degree + 1):  # Gram-Schmidt: make the later columns orthogonal to column k
         total = jnp.sum(columns[:, k] ** 2)
         length = jnp.sqrt(jnp.where(total > 0.0, total, 1.0))
         unit = jnp.where(total > 0.0, columns[:, k] / length, 0.0)[:, None]
@@ -60,7 +60,7 @@ def fit_polynomial(
 def _coefficients(root: Array, values: Array, span: Array) -> Array:
     """Solve R X = Y for X (n + 1, 2) [m/s^k], and undo the normalisation of time.
 
-    Zero where R (n + 1, n + 1) has no more than rounding on its diagonal.
+    A coefficient is zero where the diagonal of R (n + 1, n + 1) is zero up to rounding.
     """
     found = jnp.zeros_like(values)
     rounding = (32.0 * jnp.finfo(root.dtype).eps) ** 2

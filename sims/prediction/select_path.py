@@ -1,9 +1,9 @@
 """Prediction of a target's position in the plane, and of its error, from noisy observations.
 
-[Qu2022, Section III-A], fits a polynomial (`polynomial_fit.py`) of a degree that it does not
-give. `select` weighs a straight line against an even turn instead, and its prediction says how
-far it can be trusted: `covariance`, `chance_within`. World frame in the plane, SI units, one
-target; `jax.vmap` makes many. Noise is Gaussian, equal on both axes.
+[Qu2022, Section III-A] fits a polynomial (`polynomial_fit.py`) of a degree that it does not
+specify. `select` compares a straight line with a path of constant turn rate instead. Its prediction
+also estimates its own error: `covariance`, `chance_within`. World frame in the plane, SI units, one
+target; use `jax.vmap` for several. Noise is Gaussian, equal on both axes.
 """
 
 import jax
@@ -18,8 +18,8 @@ from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
 from planner_jax.sims.prediction.turn_fit import best_turn, fit_rate, path_of, tangent
 
-_REACH = 5.0  # standard deviations of the turn rate that are looked at, to either side
-_OFFSETS = np.linspace(-1.0, 1.0, 49)  # where, in reaches
+_REACH = 5.0  # half width of the interval of turn rates, in standard deviations
+_OFFSETS = np.linspace(-1.0, 1.0, 49)  # evaluated turn rates, relative to that half width
 # Gauss-Legendre nodes and weights on (-1, 1).
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
 
@@ -28,19 +28,19 @@ _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
 class TurnPrior:
     """Prior knowledge about targets before the first observation.
 
-    They go straight, or turn at a rate whose size has a log-normal distribution, to either side
-    alike. The numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03 to 0.1 rad/s. Faster
-    turns lose little by them, but slower ones are mistaken for straight paths more often than
-    the stated errors say: for these take a wider prior, such as `TurnPrior(0.5, 0.03, 1.0)`,
-    which predicts straight targets less well.
+    A target moves straight, or turns left or right with equal probability, at a rate whose
+    magnitude is log-normal. The default numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03
+    to 0.1 rad/s. For faster turns predictions are hardly worse. Slower turns are mistaken for
+    straight paths more often than the predicted errors state: use a wider prior for them, such as
+    `TurnPrior(0.5, 0.03, 1.0)`, which predicts straight targets less well.
     """
 
-    chance: ArrayLike = 0.4  # () of a turn, between 0 and 1
-    typical: ArrayLike = 0.065  # () [rad/s] > 0, median size of the turn rate
-    spread: ArrayLike = 0.4  # () > 0, standard deviation of the logarithm of its size
+    chance: ArrayLike = 0.4  # () probability that a target turns, between 0 and 1
+    typical: ArrayLike = 0.065  # () [rad/s] > 0, median magnitude of the turn rate
+    spread: ArrayLike = 0.4  # () > 0, standard deviation of the logarithm of the magnitude
 
     def log_density(self, rate: Array) -> Array:
-        """Return the logarithm (...) of the density [s/rad] of rates (...) [rad/s] of turns."""
+        """Return the logarithm (...) of the prior density [s/rad] at turn rates (...) [rad/s]."""
         turns = rate != 0.0
         size = jnp.log(jnp.where(turns, jnp.abs(rate), 1.0))
         apart = (size - jnp.log(self.typical)) / self.spread
@@ -58,18 +58,18 @@ USUAL = TurnPrior()
 
 @struct.dataclass
 class Alternatives:
-    """Paths that the observations allow, and their probabilities; the first path is straight.
+    """Paths that agree with the observations, and their probabilities; the first path is straight.
 
-    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers, where g is how
-    far a target of its turn rate goes that begins at unit velocity along x, less the lever. Its
-    error there is Gaussian and round, of the variance  centre_variance +
-    velocity_variance_k |g_k(t - middle)|^2.
+    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers. Here g_k is the
+    displacement of a target with turn rate k that starts at unit velocity along x, minus the lever.
+    Its error there is Gaussian and isotropic, with variance  centre_variance + velocity_variance_k
+    |g_k(t - middle)|^2.
     """
 
     chance: Array  # (K,), sum 1
     turn_rate: Array  # (K,) [rad/s]
-    velocity: Array  # (K, 2) [m/s], at the middle
-    lever: Array  # (K, 2) [s], weighted mean of the ways at the times of observation
+    velocity: Array  # (K, 2) [m/s], at time `middle`
+    lever: Array  # (K, 2) [s], weighted mean of the displacements at the times of observation
     centre: Array  # (2,) [m], weighted mean of the observations
     middle: Array  # () [s], weighted mean of the times of observation
     centre_variance: Array  # () [m^2]
@@ -78,14 +78,14 @@ class Alternatives:
 
 @struct.dataclass
 class Prediction:
-    """The expected path, and what is known about its error."""
+    """The expected path, and an estimate of its error."""
 
-    path: TurningPath  # of turn rate 0 if it is straight
-    is_turning: Array  # () bool, which model was chosen
-    chance_turning: Array  # () that the target turns
-    gain: Array  # () by how much the best turn lowers the sum of squared residuals, in noise^2
-    residual: Array  # () [m], root mean square a coordinate, of the observations from the path
-    noise: Array  # () [m], standard deviation of a coordinate, given or estimated
+    path: TurningPath  # with turn rate 0 if it is straight
+    is_turning: Array  # () bool, which of the two models was selected
+    chance_turning: Array  # () probability that the target turns
+    gain: Array  # () reduction of the sum of squared residuals by the best turn, in noise^2
+    residual: Array  # () [m], root mean square per coordinate, of the observations from the path
+    noise: Array  # () [m], standard deviation of a coordinate, passed or estimated
     alternatives: Alternatives
 
 
@@ -99,37 +99,36 @@ def select(
     threshold: ArrayLike | None = None,
     fastest: ArrayLike = 1.0,
 ) -> Prediction:
-    """Select a straight path or one that turns evenly.
+    """Select a straight path or a path of constant turn rate.
 
-    Every turn rate gets its probability by Bayes, with the prior for turns and none for place and
-    velocity, by quadrature along the rate. The path is that of the median rate, which is zero
-    unless the target turns to one side rather than not: a weak turn is taken for less than it
-    looks, and the path does not jump as observations change (posterior median thresholding
-    [Johnstone2004]). With a threshold a test chooses instead
-    between the line and the turn of least squares. What the prediction says about its error is
-    the same for both: all rates at their probabilities, zero among them.
+    The posterior probability of every turn rate follows from Bayes' rule and quadrature over the
+    rate. The prior of position and velocity is flat. The selected path has the median turn rate.
+    The median is zero unless a turn to one side is more probable than everything else. So weak
+    turns are shrunk towards zero, and the path does not jump as observations change (posterior
+    median thresholding [Johnstone2004]). With a threshold, a test chooses between the straight line
+    and the least-squares turn instead. The error estimates are the same for both: they average over
+    all rates, zero included.
 
-    A residual well above the noise says that the target does neither: then do not trust the rest.
-    Where fewer than three observations are present, or four if the noise is to be estimated, the
-    path is straight and the error unbounded.
+    A residual well above the noise means that the target does neither: then do not trust the
+    prediction. With fewer than three observations, or four if the noise is to be estimated, the
+    path is straight and the error is unbounded.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far.
+        times: (L,) [s]. The path counts from time 0, which should not be far from them.
         positions: (L, 2) [m].
-        noise: () [m] > 0, standard deviation of a coordinate of an observation of weight 1. If
-            not given, it is estimated from the residuals of the best turn.
-        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 if not
-            given. One of weight zero, or not finite, is absent.
+        noise: () [m] > 0, standard deviation of a coordinate of an observation of weight 1. By
+            default it is estimated from the residuals of the best turn.
+        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
+            An observation of weight zero, or not finite, is absent.
         prior: how often targets turn, and how fast.
-        threshold: () of the gain, above which a target turns; that of a straight one exceeds 6.6
-            once in a hundred times.
-        fastest: () [rad/s], where the search for a turn begins at most. The target should not
-            turn at that rate by more than 24 rad within the observations, and by less than pi
-            between two.
+        threshold: () of the gain, above which a target turns; the gain of a straight target exceeds
+            6.6 once in a hundred times.
+        fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
+            should turn by at most 24 rad within the observations, and by less than pi between two.
 
     Raises:
-        ValueError: there is no room for as many observations, the shapes do not match, or the
-            noise is a number that is not positive; one line.
+        ValueError: the arrays hold too few observations, the shapes do not match, or the noise is a
+            number that is not positive; one line.
     """
     if isinstance(noise, int | float) and not noise > 0.0:
         raise ArgumentError("noise", "> 0", noise)
@@ -142,17 +141,17 @@ def select(
         extent = jnp.sum(seen.weight * (seen.place[0] ** 2 + seen.place[1] ** 2))
         rounding = (4.0 * jnp.finfo(dtype).eps) ** 2 * extent
         variance = jnp.maximum(best.squares / freedom, jnp.maximum(rounding, 1e-30))
-        # The variance of Student's distribution, which an error has in terms of such an estimate.
+        # With an estimated noise an error has Student's distribution, which has this variance.
         error_variance = variance * freedom / (freedom - 2.0)
     else:
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Return twice the logarithm of the ratio of likelihoods, the best turn's over this one."""
+        """Return 2 log(L_best / L), the log likelihood ratio of the best turn to this fit."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
-    # Around the best turn rate, or where the observations say little of it, those of the prior.
+    # Evaluate rates around the best one, or around zero where the observations determine little.
     information = tangent(seen, best)[1] / variance
     precision = information + 1.0 / jnp.asarray(prior.variance, dtype)
     reach = _REACH / jnp.sqrt(precision)
@@ -190,9 +189,9 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median () of a rate that is zero or in cells around rates (K,), rising."""
+    """Return the median () of a rate that is zero or in cells around increasing rates (K,)."""
     below = jnp.cumsum(chance) - chance
-    right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # the median is not negative
+    right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)
     wide = chance > jnp.finfo(chance.dtype).eps
     inside = jnp.clip((level - below) / jnp.where(wide, chance, 1.0), 0.0, 1.0)
@@ -202,7 +201,7 @@ def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
 
 
 def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
-    """Return the mean (2,) [m] of all alternatives at a time () [s]."""
+    """Return the mean (2,) [m] of the positions of all alternatives at a time () [s]."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
     return prediction.path.at(jnp.asarray(time)).pos + mean
@@ -211,8 +210,8 @@ def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
 def covariance(prediction: Prediction, time: ArrayLike) -> Array:
     """Return the mean square (2, 2) [m^2] of the error of the path's position at a time () [s].
 
-    About that position, not about the mean of the alternatives. Its diagonal is infinite where
-    there were too few observations.
+    The error is measured from the position on the path, not from the mean of the alternatives. The
+    diagonal is infinite where there were too few observations.
     """
     offset, variance = _errors(prediction, time)
     chance = prediction.alternatives.chance
@@ -236,9 +235,9 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 
 
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
-    """Return each alternative relative to the chosen path, (K, 2) [m], and its variance (K,) [m^2].
+    """Return each alternative minus the chosen path, (K, 2) [m], and its variance (K,) [m^2].
 
-    The variance of the centre, which is the same for all, is to be added.
+    The variance of the centre, which all alternatives share, is not included.
     """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)
@@ -251,9 +250,10 @@ def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
 
 
 def _chance_in_circle(distance: Array, std: Array, radius: Array) -> Array:
-    """Return the probability () of a circle whose centre is at a distance from a round Gaussian.
+    """Return the probability () of a circle at a distance from an isotropic Gaussian.
 
-    Strips of the circle across the line of centres, equally spaced in angle near the Gaussian.
+    The circle is integrated in strips across the line of centres, by quadrature in angle near the
+    Gaussian.
     """
 
     def angle(along: Array) -> Array:

@@ -1,9 +1,9 @@
 """Paths of constant speed and turn rate through observations of a target.
 
-Once the turn rate is known, a path of constant speed is linear in a place and a velocity. In terms
-of complex numbers it is  place + velocity g(t), with the arc g(t) = (exp(i w t) - 1) / (i w). Both
-follow from the rate in closed form, and one unknown remains (variable projection). Their errors
-are Gaussian and round, since a turn of the plane turns both. Here complex numbers are pairs.
+At a given turn rate w, such a path is linear in a position and a velocity. In complex numbers it is
+position + velocity g(t), with the arc g(t) = (exp(i w t) - 1) / (i w). Position and velocity then
+follow in closed form, and only w is searched for (variable projection). Their errors are Gaussian
+and isotropic, since a rotation of the plane rotates both. In this module complex numbers are pairs.
 """
 
 from collections.abc import Callable
@@ -17,15 +17,15 @@ from jax.typing import ArrayLike
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import Centred, Pair, centre
 
-_RATES = 33  # turn rates from which the best one is refined
-_STEPS = 8  # of Gauss-Newton, in the turn rate alone
+_RATES = 33  # number of turn rates from which the best one is refined
+_STEPS = 8  # Gauss-Newton iterations, over the turn rate alone
 
 
 class TurnFit(NamedTuple):
-    """The place and the velocity that suit a turn rate best."""
+    """The best position and velocity for one turn rate."""
 
     rate: Array  # () [rad/s]
-    velocity: Pair  # each () [m/s], in the middle of the observations
+    velocity: Pair  # each () [m/s], at the mean time of the observations
     lever: Pair  # each () [s], weighted mean of the arcs
     power: Array  # () [s^2], weighted sum of |arc - lever|^2
     residual: Pair  # each (L,) [m]
@@ -41,19 +41,20 @@ def fit_turn(
 ) -> TurningPath:
     """Fit a path of constant speed and turn rate to observations by least squares.
 
-    Gauss-Newton in the rate from the best of 33 equally spaced ones. The path is straight where
-    fewer than three observations are present.
+    Gauss-Newton refines the best of 33 equally spaced rates. The path is straight where fewer than
+    three observations are present.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far.
+        times: (L,) [s]. The path counts from time 0, which should not be far from them.
         positions: (L, 2) [m].
-        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 if not
-            given. One of weight zero, or not finite, is absent.
-        fastest: () [rad/s], where the search begins at most. The target should not turn at that
-            rate by more than 24 rad within the observations, and by less than pi between two.
+        weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
+            An observation of weight zero, or not finite, is absent.
+        fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
+            should turn by at most 24 rad within the observations, and by less than pi between two.
 
     Raises:
-        ValueError: there is no room for three observations, or the shapes do not match; one line.
+        ValueError: the arrays hold fewer than three observations, or the shapes do not match; one
+            line.
     """
     seen = centre(times, positions, weights, 3)
     return path_of(seen, best_turn(seen, fastest))
@@ -71,15 +72,18 @@ def fit_rate(seen: Centred, rate: Array) -> TurnFit:
 
 
 def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array]:
-    """Return how the path moves with the turn rate if position and velocity are fitted to it.
+    """Return the derivative of the fitted path with respect to the turn rate.
+
+    Position and velocity are refitted as the rate changes.
 
     Returns:
-        slope: of times (...) [s] after the middle the slopes, each (...) [m s/rad].
+        slope: function from times (...) [s] after the mean time to derivatives, each (...) [m
+            s/rad].
         information: () [m^2 s^2/rad^2], weighted sum of their squares over the observations.
     """
 
     def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
-        """Return arcs, and how the paths along them move with the rate alone."""
+        """Return arcs, and the derivatives of the paths along them by the rate alone."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -96,18 +100,18 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit a turn by least squares; its derivatives are the derivatives of the optimum."""
+    """Fit a turn by least squares; the fit is differentiable like the exact optimum."""
 
     def downhill(rate: Array) -> Array:
-        """Return half the negative slope of the sum of squares by the rate, () [m^2 s/rad]."""
+        """Return minus half the derivative of the sum of squares by the rate, () [m^2 s/rad]."""
         fit = fit_rate(seen, rate)
         _, slopes = jax.jvp(lambda rate: arc(rate, seen.after), (rate,), (jnp.ones_like(rate),))
         return _sum(seen, _times(fit.velocity, slopes), fit.residual)
 
     spacing = jnp.asarray(fastest, seen.after.dtype) * (2.0 / (_RATES - 1))
     rate = lax.stop_gradient(_search_rate(lax.stop_gradient(seen), spacing))
-    # By the implicit function theorem a step of Newton from where the slope vanishes has the
-    # derivatives of the optimum, the curvature taken as constant.
+    # By the implicit function theorem, a Newton step from a point of zero slope has the derivatives
+    # of the optimum; the curvature is treated as constant.
     slope, curvature = jax.jvp(downhill, (rate,), (jnp.ones_like(rate),))
     curved = (curvature < 0.0) & (seen.num >= 3)
     step = slope / lax.stop_gradient(jnp.where(curved, curvature, -1.0))
@@ -117,8 +121,8 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
 def _search_rate(seen: Centred, spacing: Array) -> Array:
     """Search the best turn rate by Gauss-Newton (Kaufman's variable projection).
 
-    It begins from the best of rates that are equally spaced around zero, and goes no further than
-    the next ones.
+    The search starts from the best of equally spaced rates around zero, and stays between the
+    neighbours of that rate.
     """
     rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
     squares = jax.vmap(lambda rate: fit_rate(seen, rate).squares)(rates)
@@ -136,7 +140,7 @@ def _search_rate(seen: Centred, spacing: Array) -> Array:
 
 
 def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
-    """Return the path of a fit, which counts from time 0."""
+    """Return the path of a fit, with times that count from time 0."""
     place = jnp.stack(_minus(seen.centre, _times(fit.velocity, fit.lever)))
     start = TurningPath(place, jnp.stack(fit.velocity), fit.rate).at(-seen.middle)
     return TurningPath(start.pos, start.vel, fit.rate)
@@ -164,6 +168,9 @@ def _mean(seen: Centred, a: Pair) -> Pair:
 
 
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
-    """Return the complex factor by which arms of a power fit points by least squares."""
+    """Return the complex factor by which arms fit points best.
+
+    `power` is the weighted sum of the arms' squared lengths.
+    """
     safe = jnp.where(power > 0.0, power, 1.0)
     return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe

@@ -1,1 +1,1 @@
-"""The arm: drives of its joints, control and its form in MuJoCo."""
+"""The arm: its drives, its controller and its model in MuJoCo."""

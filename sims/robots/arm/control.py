@@ -1,8 +1,8 @@
-"""How an arm follows a plan: the torques that the motion needs, and feedback on what is off.
+"""Tracking control of an arm: computed torque.
 
-Computed torque: inverse dynamics are asked for the acceleration of the plan and, on top of it,
-one that takes away the errors of angle and rate like a spring and a damper, the same for all
-joints whatever their inertia.
+The commanded acceleration is the planned acceleration plus feedback. The feedback acts on the
+errors of angle and rate like a spring and a damper, with equal gains for all joints. Inverse
+dynamics convert the commanded acceleration to torques.
 """
 
 import dataclasses
@@ -18,24 +18,24 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, tot
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """The feedback; static under jit."""
+    """Feedback gains; static under jit."""
 
-    frequency: float = 50.0  # [rad/s], of an error that dies out
-    damping: float = 1.0  # 1 for the fastest way without swinging over
+    frequency: float = 50.0  # [rad/s], natural frequency of the error dynamics
+    damping: float = 1.0  # damping ratio; 1 for the fastest response without overshoot
 
 
 @struct.dataclass
 class Course:
-    """A motion of the joints, from when on it is followed, and how it is brought to an end."""
+    """A motion of the joints, its start time, and how the joints brake after its end."""
 
     motion: PiecewisePolynomial  # (M, D + 1, 6) [rad]
-    begin: Array  # () [s]
-    braking: Array  # (6,) [rad/s^2], of joints that turn when the motion ends
+    begin: Array  # () [s], start time
+    braking: Array  # (6,) [rad/s^2], deceleration of joints that still move when the motion ends
 
 
 @struct.dataclass
 class JointState:
-    """The joints at one instant, as they are or as they are read."""
+    """The joints at one instant: true, measured or estimated."""
 
     angles: Array  # (6,) [rad]
     rates: Array  # (6,) [rad/s]
@@ -43,7 +43,7 @@ class JointState:
 
 @struct.dataclass
 class JointReference:
-    """What is to be tracked at one instant."""
+    """The reference of the joints at one instant."""
 
     angles: Array  # (6,) [rad]
     rates: Array  # (6,) [rad/s]
@@ -51,17 +51,17 @@ class JointReference:
 
 
 def reference_at(course: Course, time: Array) -> JointReference:
-    """Return the course at a time () [s].
+    """Return the reference of a course at a time () [s].
 
-    Before it begins the joints turn as evenly as they do when it does, mostly not at all. Where it
-    ends each joint brakes evenly, and stays where it stands.
+    Before the start each joint moves at its initial rate, which is mostly zero. After the end each
+    joint brakes at a constant deceleration, and then stands still.
     """
     motion = course.motion
     elapsed, end = time - course.begin, total_duration(motion)
     within = jnp.clip(elapsed, 0.0, end)
     angles, rates, accelerations = (evaluate(motion, within, order) for order in range(3))
     early, late = jnp.minimum(elapsed, 0.0), jnp.maximum(elapsed - end, 0.0)
-    stands = jnp.abs(rates) / course.braking  # [s], after the end
+    stands = jnp.abs(rates) / course.braking  # [s], from the end of the motion to standstill
     brake = jnp.where(late > 0.0, -jnp.sign(rates) * course.braking, 0.0)
     braked = jnp.minimum(late, stands)
     beyond = (elapsed < 0.0) | (elapsed >= end)
@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Return torques (6,) [N m] to ask for, of an arm as it is believed to be."""
+    """Return commanded torques (6,) [N m], from the believed masses and inertias of the arm."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

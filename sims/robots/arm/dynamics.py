@@ -1,4 +1,4 @@
-"""Inverse dynamics of an arm: recursive Newton-Euler, its recursions written as running sums."""
+"""Inverse dynamics of an arm: recursive Newton-Euler, its recursions written as cumulative sums."""
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -9,14 +9,14 @@ from planner_jax.robot.arm import Arm, joint_axes, link_frames, product
 def inverse_dynamics(
     arm: Arm, angles: Array, velocity: Array, acceleration: Array, gravity: float | Array = 9.81
 ) -> Array:
-    """Return torques of the joints (6,) [N m] of a motion, without friction and rotors.
+    """Return the joint torques (6,) [N m] of a motion, without friction and rotor inertia.
 
-    The forward recursion [Luh1980] in the base frame adds to the motion of each
-    link what its joint adds; the backward one adds up the forces and moments of the links beyond
-    a joint, moments about the origin of the base frame.
+    The recursions are those of [Luh1980], in the base frame. The forward recursion adds each
+    joint's contribution to the motion of its link. The backward recursion adds up the forces and
+    moments of the links beyond a joint; moments are about the origin of the base frame.
 
     Args:
-        arm: one arm; the shield has the mass that its links have.
+        arm: one arm; the shield has no mass of its own.
         angles: (6,) [rad].
         velocity: (6,) [rad/s].
         acceleration: (6,) [rad/s^2].
@@ -33,7 +33,7 @@ def inverse_dynamics(
         return jnp.cross(spin_rate, arm_to) + jnp.cross(spin, jnp.cross(spin, arm_to))
 
     between = positions[1:] - positions[:-1]
-    # A base that accelerates upwards stands for gravity; joint 1 turns in place.
+    # Gravity is modelled as an upward acceleration of the base. The origin of link 1 does not move.
     first = jnp.zeros((1, 3), positions.dtype).at[0, 2].set(gravity)
     of_joints = jnp.concatenate([first, accelerate_points(between, spin[:-1], spin_rate[:-1])])
     lever = product(rotations, jnp.asarray(arm.centre)[:, :, None])[:, :, 0]

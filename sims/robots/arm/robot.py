@@ -1,9 +1,8 @@
-"""The arm as the closed loop knows it: `sims.robot.Robot`, six hinges on a base that stands still.
+"""The simulated arm, a `sims.robot.Robot`: six hinges on a fixed base.
 
-`qpos` begins with the angles of the joints, `qvel` with their rates, and its actuators are their
-torques. The base frame, that of plans, has the axes of the world's and lies above the ground.
-There are no stops at the position limits, and nothing that the arm runs into holds it up; flights
-are scored for that.
+`qpos` starts with the joint angles, `qvel` with the joint rates, and the actuators are joint
+torques. The base frame of plans is parallel to the world frame and lies above the ground. The
+simulation has no joint limit stops and no collisions; flights are scored for both afterwards.
 """
 
 import dataclasses
@@ -44,7 +43,7 @@ def _arm(xml: str) -> Any:
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Return one arm as the referee's kinematics take a batch of one lane."""
+    """Return one arm as a batch of one, by the leaf names of the referee's kinematics."""
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
@@ -53,12 +52,13 @@ def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
 class ShieldArm:
     """A six-axis arm with a shield; static under jit."""
 
-    xml: str = dataclasses.field(default=_IRB1600, repr=False)  # MJCF, as `read_arm` takes it
-    base_height: float = 0.0  # [m], of the base frame above the ground
+    # MJCF, in the form that `read_arm` accepts
+    xml: str = dataclasses.field(default=_IRB1600, repr=False)
+    base_height: float = 0.0  # [m], height of the base frame above the ground
     gains: Gains = Gains()
 
     WORDS: ClassVar[str] = (
-        "an arm with torques, their limits and lag, computed torque on what its encoders say"
+        "an arm with limited torques that lag, computed-torque control from encoder measurements"
     )
     num_pos: ClassVar[int] = 6
     num_vel: ClassVar[int] = 6
@@ -66,17 +66,17 @@ class ShieldArm:
 
     @property
     def arm(self) -> Any:
-        """The `Arm` that plans are made for, NumPy float64 leaves."""
+        """The `Arm` for which plans are made, NumPy float64 leaves."""
         return _arm(self.xml)
 
     def mjcf(self) -> tuple[str, str]:
-        """Return the chain of links with capsules and shield, and a motor a joint."""
+        """Return the chain of links with capsules and shield, and one motor per joint."""
         arm = self.arm
         solids = {k: [] for k in range(-1, 6)}
         for link, ends, radius in zip(
             arm.capsule_link, arm.capsule_ends, arm.capsule_radius, strict=True
         ):
-            # MuJoCo takes no capsule without a length.
+            # MuJoCo rejects capsules of length zero.
             ends = ends + [[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0]]
             solids[link].append(
                 f'<geom type="capsule" fromto="{xml_numbers(*np.ravel(ends))}" '
@@ -99,7 +99,7 @@ class ShieldArm:
         return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
 
     def _link(self, k: int) -> str:
-        """Return the begin of link k + 1: its body, joint and inertial."""
+        """Return the opening tag of link k + 1, with its joint and inertial."""
         arm = self.arm
         inertia = arm.inertia[k]
         full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -112,12 +112,12 @@ class ShieldArm:
         )
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at home; the arm stands at its base, whatever the position (3,) [m]."""
+        """Return the state at the home position; the argument `place` (3,) [m] is ignored."""
         home = jnp.asarray(self.arm.home, place.dtype)
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the torques (6,) [N m] as they are, and no other forces."""
+        """Return the command as torques (6,) [N m], and no other forces."""
         return command, jnp.zeros_like(command)
 
     def state(self, physics: Physics) -> JointState:
@@ -138,7 +138,8 @@ class ShieldArm:
     def references(self, plan: Course, times: Array, world: World) -> JointReference:
         """Return the references at times (K,) [s]; leaves (K, ...).
 
-        MuJoCo keeps rates of half a step before, and applies a torque until a step later.
+        MuJoCo's stored rates belong to half a step before the angles, and a torque acts until one
+        step later. The references are shifted accordingly.
         """
         half = 0.5 * world.timestep
 
@@ -152,7 +153,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return torques (6,) [N m] of an arm whose believed masses have a relative error."""
+        """Return torques (6,) [N m] of a controller whose masses have a relative error."""
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error
@@ -181,7 +182,7 @@ class ShieldArm:
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and attitude, w x y z, of base, links and shield."""
+        """Return position [m] and quaternion, w x y z, of base, links and shield."""
         turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]
@@ -198,10 +199,10 @@ class ShieldArm:
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Return naN (3,): it holds none."""
+        """Return NaN (3,): the shield holds no ball."""
         return np.full(3, np.nan)
 
 
 def _box(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return middle and half edges (3,) [m] of a box of two corners (2, 3)."""
+    """Return centre and half edges (3,) [m] of the box between two corners (2, 3)."""
     return 0.5 * (corners[0] + corners[1]), 0.5 * (corners[1] - corners[0])

@@ -1,1 +1,1 @@
-"""The car: chassis, tyres, control and its form in MuJoCo."""
+"""The car: its chassis, tyres, controller and model in MuJoCo."""

@@ -1,9 +1,9 @@
-"""How the car follows a plan: what the plan does, and linear feedback on the way.
+"""Tracking control of the car: feedforward of the plan, and linear feedback on the path error.
 
-Feedback on the errors across the way is that of the linear-quadratic regulator in distance: with
-e' = psi and psi' = the extra curvature, per metre, the gains that minimise the integral of
-(e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2 do not depend on the speed; in time
-they rise with it, as those of a time-varying regulator do.
+Lateral feedback is a linear-quadratic regulator in distance. Per metre, the lateral error e and the
+heading error psi obey e' = psi and psi' = the extra curvature. The gains minimise the integral of
+(e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2. These gains do not depend on the speed;
+as rates over time they grow with it, as in a time-varying regulator.
 """
 
 import dataclasses
@@ -19,46 +19,46 @@ from planner_jax.sims.robots.car.vehicle import Vehicle
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """What the regulator weighs; static under jit."""
+    """Weights of the lateral regulator, and gains along the path; static under jit."""
 
-    reach: float = 0.05  # [m], across the way
-    turn: float = 0.15  # [rad]
-    bend: float = 0.4  # [1/m]
-    place: float = 4.0  # [1/s^2], acceleration per error along the way
-    speed: float = 4.0  # [1/s], per error in speed
+    reach: float = 0.05  # [m], weight of the lateral error
+    turn: float = 0.15  # [rad], weight of the heading error
+    bend: float = 0.4  # [1/m], weight of the extra curvature
+    place: float = 4.0  # [1/s^2], acceleration per position error along the path
+    speed: float = 4.0  # [1/s], acceleration per speed error
 
     @property
     def across(self) -> tuple[float, float]:
-        """Extra curvature per error across the way [1/m^2] and in heading [1/m]."""
+        """Extra curvature per lateral error [1/m^2] and per heading error [1/m]."""
         place = self.bend / self.reach
         return place, float(np.sqrt((self.bend / self.turn) ** 2 + 2.0 * place))
 
 
 @struct.dataclass
 class CarState:
-    """The car at one instant, as it is or as it is believed to be."""
+    """The car at one instant, true or estimated."""
 
-    pose: Array  # (3,) x, y [m] of the rear axle's middle and heading [rad]
+    pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
     speed: Array  # () [m/s], along the heading
     steering: Array  # () [rad], of the front wheels
 
 
 @struct.dataclass
 class Reference:
-    """What is to be tracked at one instant."""
+    """The reference of the car at one instant."""
 
-    pos: Array  # (2,) [m], of the rear axle's middle
+    pos: Array  # (2,) [m], of the rear axle's centre
     heading: Array  # () [rad]
     speed: Array  # () [m/s]
-    acceleration: Array  # () [m/s^2], one drive lag later
-    curvature: Array  # () [1/m], one steering lag later
-    turning: Array  # () [1/(m s)], rate of change of that curvature
+    acceleration: Array  # () [m/s^2], planned for one drive lag later
+    curvature: Array  # () [1/m], planned for one steering lag later
+    turning: Array  # () [1/(m s)], rate of change of the curvature, one drive lag later
 
 
 def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
-    """The plan at a time () [s] since its begin; what drive and steering lag behind, earlier.
+    """Return the plan at a time () [s] since its start, with inputs advanced by the actuator lags.
 
-    A first-order lag that is asked for a ramp gives it a lag later, and a step on average.
+    A first-order lag delays a ramp by exactly its time constant, and a step by it on average.
     """
     knots = plan.time, plan.speed, plan.curvature
     pose = pose_at(plan.start, *knots, time)
@@ -76,7 +76,7 @@ def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
 
 
 def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gains) -> Array:
-    """Drive force [N] and steering angle [rad] to ask for, (2,)."""
+    """Return the commanded drive force [N] and steering angle [rad], (2,)."""
     cos, sin = jnp.cos(reference.heading), jnp.sin(reference.heading)
     away = state.pose[:2] - reference.pos
     along, across = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
@@ -86,7 +86,7 @@ def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gain
     curvature = reference.curvature - per_place * across - per_heading * off
     speed_error = reference.speed - state.speed
     wanted = reference.acceleration - gains.place * along + gains.speed * speed_error
-    # What turns with the car is to be sped up as well: of kinetic energy, m + turning k^2.
+    # Rotation adds to the effective mass. At curvature k it is m + turning k^2, by kinetic energy.
     turning = vehicle.yaw_inertia + vehicle.mass * vehicle.mass_ahead**2
     bent = jnp.tan(state.steering) / vehicle.wheelbase
     mass = vehicle.mass + turning * bent**2

@@ -1,9 +1,9 @@
-"""The car as the closed loop knows it: `sims.robot.Robot`, on slides and a hinge in the plane.
+"""The simulated car, a `sims.robot.Robot`: two slides and a hinge in the plane.
 
-`qpos` begins with x, y of the rear axle's middle and the heading, `qvel` with their rates, in the
-world. The rear wheels are driven by a force with a first-order lag; the steering angle is the
-state of an actuator that integrates its rate, both limited. The lateral forces of the tyres
-(`tyres.py`) act beside the actuators.
+`qpos` starts with x, y of the rear axle's centre and the heading, `qvel` with their rates, in the
+world frame. A force with a first-order lag drives the rear wheels. The steering angle is the state
+of an actuator that integrates its rate; angle and rate are limited. The lateral tyre forces
+(`tyres.py`) act in addition to the actuators.
 """
 
 import dataclasses
@@ -21,8 +21,8 @@ from planner_jax.sims.robots.car.tyres import tyre_forces
 from planner_jax.sims.robots.car.vehicle import Vehicle
 from planner_jax.sims.scenery import LOOK, xml_numbers
 
-_HEIGHT = 0.1  # [m], of the body, above the ground's clearance
-_CLEARANCE = 0.03  # [m]
+_HEIGHT = 0.1  # [m], of the body
+_CLEARANCE = 0.03  # [m], of the body above the ground
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,14 +33,14 @@ class Car:
     gains: Gains = Gains()
 
     WORDS: ClassVar[str] = (
-        "a car with tyre forces, lag and limits of drive and steering, feedback on its way"
+        "a car with tyre forces, lag and limits of drive and steering, path-tracking feedback"
     )
     num_pos: ClassVar[int] = 3
     num_vel: ClassVar[int] = 3
     noise_shape: ClassVar[tuple[int, ...]] = (3,)
 
     def mjcf(self) -> tuple[str, str]:
-        """Body with wheels, drive and steering."""
+        """Return the body with its wheels, and the actuators of drive and steering."""
         vehicle = self.vehicle
         middle = 0.5 * vehicle.length - vehicle.rear_overhang
         body = np.array([0.5 * vehicle.length, 0.5 * vehicle.width, 0.5 * _HEIGHT])
@@ -70,19 +70,22 @@ class Car:
         return text, actuators
 
     def _wheels(self) -> np.ndarray:
-        """Middles of the rear and then of the front wheels, (4, 3) [m]."""
+        """Return the centres of the rear and then of the front wheels, (4, 3) [m]."""
         vehicle = self.vehicle
         aside = 0.5 * vehicle.width - 0.015
         ends = [(x, y) for x in (0.0, vehicle.wheelbase) for y in (-aside, aside)]
         return np.array([(x, y, vehicle.wheel_radius) for x, y in ends])
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Standing with the rear axle at a place (3,) [m], along the x axis."""
+        """Return the state at rest with the rear axle at a position (3,) [m], heading along x."""
         none = jnp.zeros(3, place.dtype)
         return none.at[:2].set(place[:2]), none, none[:2]
 
     def moving(self, pose: Array, speed: Array, curvature: Array) -> Physics:
-        """At a pose (3,) and a speed () [m/s] on a way of a curvature () [1/m], alone."""
+        """Return the state at a pose (3,), speed () [m/s] and path curvature () [1/m].
+
+        The world has no balls.
+        """
         ahead = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2]), curvature])
         steering = jnp.arctan(self.vehicle.wheelbase * curvature)
         return Physics(
@@ -90,11 +93,11 @@ class Car:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """The drive force and the rate of the steering angle, and the forces of the tyres.
+        """Return the drive force and the rate of the steering angle, and the tyre forces.
 
         Args:
             physics: before the step.
-            command: (2,), drive force [N] and steering angle [rad] that are asked for.
+            command: (2,), commanded drive force [N] and steering angle [rad].
             timestep: [s].
         """
         vehicle = self.vehicle
@@ -113,7 +116,7 @@ class Car:
         return jnp.stack([command[0], rate]), forces
 
     def saturation(self, physics: Physics, command: Array) -> Array:
-        """Whether drive and steering are asked for more than they can do, (2,) bool."""
+        """Return whether the commands of drive and steering exceed their limits, (2,) bool."""
         vehicle = self.vehicle
         rate = (command[1] - physics.act[1]) / vehicle.steering_lag
         fast = jnp.abs(rate) > vehicle.steering_rate
@@ -123,7 +126,7 @@ class Car:
         )
 
     def state(self, physics: Physics) -> CarState:
-        """The car's part of the simulated state."""
+        """Return the car's part of the simulated state."""
         heading, vel = physics.qpos[2], physics.qvel
         return CarState(
             pose=physics.qpos[:3],
@@ -132,7 +135,7 @@ class Car:
         )
 
     def sense(self, state: CarState, noise: Array, stds: Any) -> CarState:
-        """The car's state as it is estimated.
+        """Return the car's estimated state.
 
         Args:
             state: the true one.
@@ -143,15 +146,15 @@ class Car:
         return dataclasses.replace(state, pose=state.pose + errors)
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """What is tracked (K,) [s] after a plan's begin; leaves (K, ...)."""
+        """Return the references at times (K,) [s] since the start of a plan; leaves (K, ...)."""
         return jax.vmap(lambda time: reference_at(plan, time, self.vehicle))(times)
 
     def command(self, state: CarState, reference: Reference, world: World) -> Array:
-        """Drive force [N] and steering angle [rad]."""
+        """Return commanded drive force [N] and steering angle [rad]."""
         return control(state, reference, self.vehicle, self.gains)
 
     def shapes(self) -> list[Shape]:
-        """The body as a box, and its wheels."""
+        """Return the body as a box, and its wheels."""
         vehicle = self.vehicle
         low, high = -vehicle.rear_overhang, vehicle.length - vehicle.rear_overhang
         half = 0.5 * vehicle.width
@@ -167,16 +170,16 @@ class Car:
         return [Shape([*wheels, *corners, bottom, top], [], tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Position [m] and attitude, w x y z, of the one shape."""
+        """Return position [m] and quaternion, w x y z, of the one shape."""
         half = 0.5 * pose[2]
         return [
             (np.append(pose[:2], 0.0), np.array([np.cos(half), 0.0, 0.0, np.sin(half)])),
         ]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """The rear axle's middle on the ground, (..., 3) [m]."""
+        """Return the rear axle's centre on the ground, (..., 3) [m]."""
         return np.concatenate([poses[..., :2], 0.0 * poses[..., :1]], axis=-1)
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """NaN (3,): it holds none."""
+        """Return NaN (3,): the car holds no ball."""
         return np.full(3, np.nan)

@@ -1,9 +1,9 @@
-"""Lateral forces of a car's tyres: those that hinder slip, or those that slip makes.
+"""Lateral forces of a car's tyres, with or without slip.
 
-The single-track model: an axle is one wheel in its middle. Forces are found together with the
-velocity at the end of the step that they act in (implicit Euler), so that stiff tyres, and tyres
-at rest, are as stable as soft ones; a tyre that cannot slip is the limit of a stiff one. World
-frame in the plane, SI units; velocities are those of the rear axle's middle.
+The single-track model: an axle is one wheel at its centre. Forces are solved for together with the
+velocity at the end of their step (implicit Euler). So stiff tyres, and tyres at rest, are as stable
+as soft ones. A tyre that cannot slip is the limit of infinite stiffness. World frame in the plane,
+SI units; velocities are of the rear axle's centre.
 """
 
 import jax.numpy as jnp
@@ -12,22 +12,21 @@ from jax import Array
 
 from planner_jax.sims.robots.car.vehicle import Vehicle
 
-_STANDING = 0.05  # [m/s], below which a tyre's slip angle is taken at this speed
+_STANDING = 0.05  # [m/s], least speed in the denominator of a tyre's slip angle
 
 
 def tyre_forces(
     vehicle: Vehicle, pose: Array, vel: Array, steering: Array, drive: Array, timestep: float
 ) -> Array:
-    """Generalised forces (3,) [N, N, N m] of both axles on the rear axle's middle.
+    """Return generalised forces (3,) [N, N, N m] of both axles on the rear axle's centre.
 
-    Unknown are the lateral forces f of the axles. With mass matrix M, forces F of everything else
-    and rows J that give the axles' lateral velocities, the velocity after the step of length h is
-    v + h M^-1 (F + J' f); a tyre of stiffness c at speed u then bears  f = -(c / u) J v_after.
+    The unknowns are the lateral forces f of the axles. With mass matrix M, all other forces F, and
+    rows J that give the axles' lateral velocities, the velocity after a step of length h is v + h
+    M^-1 (F + J' f). A tyre of stiffness c at speed u then bears  f = -(c / u) J v_after.
 
     Args:
         vehicle: with its tyres.
-        pose: (3,) x, y [m] of the rear axle's middle and heading [rad], half a step ago from the
-            middle of the step.
+        pose: (3,) x, y [m] of the rear axle's centre and heading [rad], at the start of the step.
         vel: (3,) [m/s, m/s, rad/s].
         steering: () [rad], the front wheels' angle in the middle of the step.
         drive: () [N], along the heading, at the rear axle.
@@ -35,7 +34,7 @@ def tyre_forces(
     """
     dtype, b = vel.dtype, vehicle.mass_ahead
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    # M turned into the heading has one pair of coupled entries, m b between sway and yaw.
+    # In the body frame M has one pair of off-diagonal entries, m b between lateral motion and yaw.
     coupling, turning = vehicle.mass * b, vehicle.yaw_inertia + vehicle.mass * b**2
     determinant = vehicle.mass * turning - coupling**2
     inverse = np.array(
@@ -50,7 +49,7 @@ def tyre_forces(
     own = jnp.stack([along, cos * vel[1] - sin * vel[0], vel[2]])
     pull = jnp.stack([drive + coupling * vel[2] ** 2, jnp.zeros((), dtype), jnp.zeros((), dtype)])
     free = own + timestep * jnp.sum(inverse * pull, axis=1)
-    # Rows in the frame of the heading in the middle of the step.
+    # Lateral directions of both axles in the middle of the step, in the frame at its start.
     half = 0.5 * timestep * vel[2]
     zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
     front, wheelbase = steering + half, vehicle.wheelbase
@@ -62,7 +61,7 @@ def tyre_forces(
     )
     slip = jnp.sum(rows * free, axis=1)
     tyres, loads = vehicle.tyres, jnp.asarray(vehicle.loads, dtype)
-    give = jnp.zeros_like(loads)  # of each axle, slip per force
+    give = jnp.zeros_like(loads)  # [m/(s N)], lateral slip velocity per force, of each axle
     if tyres is not None:
         give = jnp.maximum(jnp.abs(along), _STANDING) / (tyres.stiffness * loads)
     moved = jnp.sum(rows[:, None, :] * inverse, axis=2)  # J M^-1, (2, 3)

@@ -1,8 +1,8 @@
-"""Sizes and limits of the simulated car, and its tyres.
+"""Dimensions and limits of the simulated car, and its tyres.
 
-A model car of scale 1:10, as `planner_jax.task.intercept.case` has it; [Qu2022] gives none of
-these numbers. Drive and steering can do half as much again as plans ask for, which is what
-control works with.
+A model car of scale 1:10, as in `planner_jax.task.intercept.case`; [Qu2022] gives none of these
+numbers. Drive and steering have 50 % more authority than plans use, which leaves a margin for
+control.
 """
 
 import dataclasses
@@ -14,12 +14,12 @@ GRAVITY = 9.81  # [m/s^2]
 
 @dataclasses.dataclass(frozen=True)
 class Tyres:
-    """Lateral forces of both axles, linear in the slip angle up to what friction allows.
+    """Lateral forces of both axles, proportional to the slip angle up to the friction limit.
 
     The numbers are for hard rubber on a smooth floor: an assumption.
     """
 
-    stiffness: float = 5.0  # [1/rad], of lateral force over load, per slip angle
+    stiffness: float = 5.0  # [1/rad], lateral force over load per slip angle
     friction: float = 0.5  # greatest lateral force over load
 
     def __post_init__(self) -> None:
@@ -46,10 +46,10 @@ class Vehicle:
     steering_rate: float = 3.0  # [rad/s], greatest
     drive_lag: float = 0.05  # [s], first order
     steering_lag: float = 0.05  # [s], first order
-    tyres: Tyres | None = None  # that slip; None for tyres that do not
+    tyres: Tyres | None = None  # None for tyres without slip
 
     @property
     def loads(self) -> tuple[float, float]:
-        """What rests on the rear axle and on the front axle [N]."""
+        """The vertical loads on the rear axle and on the front axle [N]."""
         front = self.mass_ahead / self.wheelbase
         return (1.0 - front) * self.mass * GRAVITY, front * self.mass * GRAVITY

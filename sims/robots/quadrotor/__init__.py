@@ -1,1 +1,1 @@
-"""The simulated quadrotor: its parts, its body in MuJoCo, what it tracks, and how."""
+"""The simulated quadrotor: its parts, model in MuJoCo, references and controller."""

@@ -1,4 +1,4 @@
-"""How a wanted thrust and torque are shared among the rotors, each within what it can do."""
+"""Control allocation: distribution of a commanded thrust and torque among the limited rotors."""
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -7,20 +7,21 @@ from planner_jax.robot.quadrotor_model import Rotors
 
 
 def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) -> Array:
-    """Rotor thrusts (4,) [N] that make a wrench, each within what a rotor can do.
+    """Return rotor thrusts (4,) [N] that produce a wrench, each within the limits of a rotor.
 
-    Where they cannot make all of it, roll and pitch go before the thrust, without which it
-    would point elsewhere, and the thrust before yaw, which a round tool does not feel. Roll and
-    pitch are cut where they would raise a rotor's thrust by more than is spared for them.
+    If the rotors cannot produce all of it, roll and pitch have priority over thrust, because
+    without them the thrust would point elsewhere. Thrust has priority over yaw, which does not
+    matter for a round tool. Roll and pitch torques are scaled down where they would need a rotor to
+    be raised by more than `spare`.
 
     Args:
         rotors: of the quadrotor.
         thrust: () [N], along body z.
         torque: (3,) [N m], body frame.
-        spare: [N], by which a rotor's thrust may be raised to make room for a torque.
+        spare: [N], greatest increase of a rotor's thrust in favour of a torque.
     """
     least, most = rotors.min_thrust, rotors.max_thrust
-    # What carries the body without turning it: 1 for each rotor where all are as far away.
+    # Shares of a thrust without torque: 1 for each rotor if all are equally far from the centre.
     share = jnp.asarray(4.0 * rotors.shares, torque.dtype)
     inverse = jnp.asarray(rotors.mixer, torque.dtype)
     turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)

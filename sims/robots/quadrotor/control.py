@@ -1,10 +1,9 @@
-"""Cascade SE(3) control by differential flatness and the Hopf fibration.
+"""Cascaded SE(3) control by differential flatness and the Hopf fibration.
 
-[Yu2023bat, Section VI-C], and [Yu2023catch, Section VII-A]: position and velocity feedback with the
-plan's acceleration and jerk gives the wanted thrust and, at zero heading, attitude and body
-rate [Watterson2020]; the
-attitude's error corrects the body rate, and the body rate's error asks for a torque. What the
-rotors take up only with a lag is asked of them with that lag undone.
+The cascade is that of [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Position and
+velocity feedback, with the plan's acceleration and jerk as feedforward, gives the desired thrust
+and, at zero heading, attitude and body rate [Watterson2020]. The attitude error corrects the body
+rate. The error of the body rate gives a torque. Feedforward commands lead by the rotors' lag.
 
 World frame, z up; body rates and torques in the body frame; quaternions w x y z.
 """
@@ -27,19 +26,20 @@ from planner_jax.sims.robots.quadrotor.reference import Reference
 class Gains:
     """All gains of the cascade; static under jit.
 
-    Behind rotors with a lag of 20 ms the loops are near each other, and a velocity gain that damps
-    the position alone shakes the attitude. These damp every mode of the cascade by half and more.
+    With a rotor lag of 20 ms the loops are not well separated: a velocity gain that damps the
+    position loop alone excites the attitude. With these gains every mode of the cascade has a
+    damping ratio of at least 0.5.
     """
 
     position: float = 30.0  # [1/s^2]
     velocity: float = 6.0  # [1/s]
     attitude: float = 14.0  # [1/s]
-    heading: float = 4.0  # [1/s], of the attitude's error about body z
+    heading: float = 4.0  # [1/s], of the attitude error about body z
     rate: float = 32.0  # [1/s]
-    share: float = 0.3  # of the plan's thrust, largest correction of it
-    correction: float = 10.0  # [rad/s], largest body rate against an attitude's error
-    # By which a rotor's thrust may be raised to make room for a torque, of its greatest: 1 N of the
-    # papers' quadrotors.
+    share: float = 0.3  # largest feedback acceleration, as a share of the plan's thrust
+    correction: float = 10.0  # [rad/s], largest body rate that corrects an attitude error
+    # Greatest increase of a rotor's thrust in favour of a torque, over its greatest thrust: 1 N for
+    # the papers' quadrotors.
     spare: float = 1.0 / 11.8
 
 
@@ -54,9 +54,10 @@ class RobotState:
 
 
 def rotation_error(R: Array, R_wanted: Array) -> Array:
-    """Rotation vector (3,) [rad], body frame, from one attitude to another up to half a turn.
+    """Return the rotation vector (3,) [rad], body frame, from one attitude to another, up to pi.
 
-    sin(angle) axis is exact; from it and the cosine the angle follows without an arc cosine.
+    The vector sin(angle) axis is exact; the angle follows from its length and the cosine by atan2,
+    without an arc cosine.
     """
     E = jnp.matmul(R.T, R_wanted, precision=lax.Precision.HIGHEST)
     sine_axis = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
@@ -68,22 +69,22 @@ def rotation_error(R: Array, R_wanted: Array) -> Array:
 def control(
     state: RobotState, reference: Reference, model: QuadrotorModel, gains: Gains, world: World
 ) -> Array:
-    """Rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
+    """Return rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
 
     Args:
-        state: of the quadrotor, as it is estimated.
+        state: of the quadrotor, estimated.
         reference: to be tracked.
-        model: what the quadrotor is made of.
+        model: parameters of the quadrotor.
         gains: of the cascade.
-        world: whose gravity and time step count.
+        world: with gravity and time step.
     """
     gravity = jnp.asarray(world.gravity, state.pos.dtype)
     R = rotation(state.quat_wxyz)
-    half = 0.5 * world.timestep  # the velocities of MuJoCo's Euler are that much older
+    half = 0.5 * world.timestep  # MuJoCo's velocities are older than its positions by this time
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
     pull = net_thrust(reference.acc, gravity)
     back = gains.position * ahead + gains.velocity * faster
-    # Unbounded, an error would turn a weak thrust any way, and the plan's with it.
+    # Without a bound, a large error would tilt a weak thrust in any direction.
     most = gains.share * jnp.sqrt(jnp.sum(pull**2))
     back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
     acc = reference.acc + back
@@ -94,7 +95,7 @@ def control(
     stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)
     highest = lax.Precision.HIGHEST
     turn = jnp.matmul(R.T, jnp.matmul(R_wanted, rate_wanted, precision=highest), precision=highest)
-    # Unbounded, a large error would ask for a rate that saturated rotors cannot stop in time.
+    # Without a bound, a large error would command a rate that saturated rotors cannot stop in time.
     back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
     rate = turn - half * reference.angular_acc + back
     inertia = jnp.asarray(model.inertia, acc.dtype)

@@ -17,11 +17,10 @@ def describe_mjcf(path: Path) -> dict[str, Value]:
 
     Mass and inertia are the sums of all bodies below the only free joint, about their centre of
     mass. A rotor is an actuator on a site whose `gear` has a force along z and a torque about z.
-    Its bounds of thrust are `ctrlrange` times gain and `gear`; its lag is its filter's time
-    constant.
+    Its thrust limits are `ctrlrange` times gain and `gear`; its lag is its filter's time constant.
 
     Raises:
-        RobotError: the model is not of this kind; one line.
+        RobotError: the model does not have this form; one line.
     """
     try:
         model = mujoco.MjModel.from_xml_path(str(path))  # type: ignore[attr-defined]
@@ -80,9 +79,9 @@ def _rotor(
     centre: np.ndarray,
     turn: np.ndarray,
 ) -> dict[str, Value]:
-    """Return position (2,) [m], bounds of thrust (2,) [N], torque ratio [m] and lag [s] of a rotor.
+    """Return position (2,) [m], thrust limits (2,) [N], torque ratio [m] and lag [s] of a rotor.
 
-    `k` is its actuator; `centre` (3,) [m] and `turn` (3, 3) are the frame of the body in the world.
+    `k` is its actuator; `centre` (3,) [m] and `turn` (3, 3) are the pose of the body in the world.
     """
     name = model.actuator(k).name or k
     site = int(model.actuator_trnid[k, 0])

@@ -1,4 +1,4 @@
-"""What a quadrotor tracks: a plan's trajectory, at rest after its end, and its attitude.
+"""References of a quadrotor: a plan's trajectory and attitude, followed by a braking piece to rest.
 
 World frame, z up; body rates in the body frame.
 """
@@ -12,33 +12,34 @@ from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_BRAKING = 0.8  # [s] from the end of a plan to rest
-_LOWEST_REST = 0.5  # [m]
+_BRAKING = 0.8  # [s], from the end of a plan to rest
+_LOWEST_REST = 0.5  # [m], least height of the position at rest
 
 
 @struct.dataclass
 class Reference:
-    """What is to be tracked at one instant."""
+    """The reference at one instant."""
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
     acc: Array  # (3,) [m/s^2]
     jerk: Array  # (3,) [m/s^3]
-    thrust_lead: Array  # () [m/s^2], to be asked of the rotors beyond the thrust, for their lag
+    # () [m/s^2], addition to the commanded thrust that compensates the rotors' lag
+    thrust_lead: Array
     angular_acc: Array  # (3,) [rad/s^2], body frame
-    torque_lead: Array  # (3,) [rad/s^2], to be asked of them beyond that, for their lag
+    torque_lead: Array  # (3,) [rad/s^2], the same for the angular acceleration
 
 
 def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
-    """The trajectory with one more piece that comes to rest, so that it goes on after its end.
+    """Return the trajectory with one more piece that brakes to rest after its end.
 
-    The piece is the polynomial of degree 7 from the last state to rest at the end of an even
-    braking, no lower than half a metre.
+    The piece is the polynomial of degree 7 from the last state to rest. Its end point is where a
+    constant deceleration would stop, but no lower than half a metre.
     """
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
     coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    # Pieces of balls that are not there come last and last no time.
+    # Pieces of absent balls come last and have zero duration.
     last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
     piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
     unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
@@ -67,13 +68,14 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 def reference_at(
     trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
 ) -> Reference:
-    """The plan at a time () [s] since its start, with what rotors of a lag [s] are asked ahead."""
+    """Return the plan at a time () [s] since its start, with leads for rotors of a lag [s]."""
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
     step = 2.0 * world.timestep
-    # What is asked for now is taken up by the next step, and its force counts around that step's
-    # beginning: MuJoCo's Euler is a leapfrog. In between it rises by itself, on average half way.
+    # A command changes the thrust in the next step, whose force acts around the start of that step,
+    # because MuJoCo's Euler integrator is a leapfrog. Meanwhile the thrust changes as well, on
+    # average by half. Hence half a step of lead.
     ahead = time + 0.5 * world.timestep
 
     def flat(at: Array) -> tuple[Array, Array]:
@@ -82,7 +84,7 @@ def reference_at(
         return size, flat_attitude(acc_then, order(3, at), gravity)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
-    # A first-order lag undone: the value and `lag` times its rate of change.
+    # The inverse of a first-order lag: the value plus `lag` times its rate of change.
     growth = (more - less) / (2.0 * step)
     angular_acc = (after - before) / (2.0 * step)
     angular_jerk = (after - 2.0 * rate + before) / step**2

@@ -1,6 +1,6 @@
-"""The quadrotor as the closed loop knows it: `sims.robot.Robot`, with a tool on the body z axis.
+"""The simulated quadrotor, a `sims.robot.Robot` with a tool on the body z axis.
 
-`qpos` begins with the position and the quaternion (w x y z), `qvel` with the velocity (world) and
+`qpos` starts with the position and the quaternion (w x y z), `qvel` with the velocity (world) and
 the body rate (body frame). Rotors are MuJoCo actuators with a first-order lag.
 """
 
@@ -20,7 +20,7 @@ from planner_jax.sims.robots.quadrotor.reference import Reference, reference_at,
 from planner_jax.sims.scenery import LOOK, xml_numbers
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 
-_SEGMENTS = 12  # capsules of the hoop
+_SEGMENTS = 12  # number of capsules of the hoop
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +37,11 @@ class Quadrotor:
 
     @property
     def tool(self) -> Tool:
-        """What it meets balls with."""
+        """The tool that hits or catches balls."""
         return self.model.tool
 
     def mjcf(self) -> tuple[str, str]:
-        """Body with rotors and tool, and the motors."""
+        """Return the body with rotors and tool, and the motors."""
         model, rotors = self.model, self.model.rotors
         discs = "".join(
             f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
@@ -64,7 +64,7 @@ class Quadrotor:
         return body, motors
 
     def _tool_xml(self) -> str:
-        """The hoop as a ring of capsules over a plate, or the racket as a plate."""
+        """Return the hoop as a ring of capsules over a plate, or the racket as a plate."""
         tool = self.tool
         low = tool.height - BALL_RADIUS * (1.0 if tool.kind == RACKET else 3.0)
         plate = (
@@ -82,7 +82,7 @@ class Quadrotor:
         return plate + ring
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Hover at a place (3,) [m], with the rotors at their speed: `qpos`, `qvel`, `act`."""
+        """Return `qpos`, `qvel` and `act` of a hover at a position (3,) [m], with steady rotors."""
         upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
         lift = self.model.mass * gravity * self.model.rotors.shares
         return (
@@ -92,16 +92,16 @@ class Quadrotor:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """The thrusts asked for, and no other forces."""
+        """Return the command as thrusts, and no other forces."""
         return command, jnp.zeros(self.num_vel, command.dtype)
 
     def state(self, physics: Physics) -> RobotState:
-        """The quadrotor's part of the simulated state."""
+        """Return the quadrotor's part of the simulated state."""
         qpos, qvel = physics.qpos, physics.qvel
         return RobotState(pos=qpos[:3], vel=qvel[:3], quat_wxyz=qpos[3:7], rate=qvel[3:6])
 
     def sense(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
-        """The quadrotor's state as it is estimated.
+        """Return the quadrotor's estimated state.
 
         Args:
             state: the true one.
@@ -120,29 +120,35 @@ class Quadrotor:
         )
 
     def tool_motion(self, state: RobotState) -> tuple[Array, Array, Array, Array]:
-        """Place [m], velocity [m/s], rate [rad/s] and z axis of the body, in the world."""
+        """Return the body's position [m], velocity [m/s], rate [rad/s] and z axis, in the world."""
         R = rotation(state.quat_wxyz)
         return state.pos, state.vel, jnp.sum(R * state.rate, axis=1), R[:, 2]
 
     def head_state(self, plan: Any, time: Array) -> Array:
-        """Position to jerk (4, 3), () [s] after a plan's begin; at rest some time after its end."""
+        """Return position to jerk (4, 3) at a time () [s] since the start of a plan.
+
+        The state stays at rest after the end of the braking piece.
+        """
         path = with_rest(plan.trajectory)
         time = jnp.minimum(time, total_duration(path))
         return jnp.stack([evaluate(path, time, k) for k in range(4)])
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """What is tracked (K,) [s] after a plan's begin, or at its end; leaves (K, ...)."""
+        """Return the references at times (K,) [s] since the start of a plan, at most at its end.
+
+        Leaves are (K, ...).
+        """
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
         times = jnp.minimum(times, total_duration(path) - 2.0 * lag)
         return jax.vmap(lambda time: reference_at(path, time, lag, world))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
-        """Rotor thrusts (4,) [N]."""
+        """Return rotor thrusts (4,) [N]."""
         return control(state, reference, self.model, self.gains, world)
 
     def shapes(self) -> list[Shape]:
-        """Arms, stick, rotors and tool, which are one rigid part."""
+        """Return arms, stick, rotors and tool, which are one rigid part."""
         rotors = self.model.rotors
         arms, top = rotors.positions, np.array([0.0, 0.0, self.tool.height])
         discs = [(arm, rotors.radius) for arm in arms] + [(top, self.tool.radius)]
@@ -151,20 +157,20 @@ class Quadrotor:
         return [Shape(lines, discs, tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Position [m] and attitude, w x y z, of the one shape."""
+        """Return position [m] and quaternion, w x y z, of the one shape."""
         return [(pose[:3], pose[3:7])]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Centre of the propeller plane (..., 3) [m]."""
+        """Return the centre of the propeller plane (..., 3) [m]."""
         return poses[..., :3]
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Centre (3,) [m] of a ball that lies in the net; NaN with a racket."""
+        """Return the centre (3,) [m] of a ball that lies in the net; NaN with a racket."""
         up = self.tool.height - BALL_RADIUS if self.tool.kind == NET else np.nan
         return pose[:3] + up * rotation(pose[3:7], np)[:, 2]
 
 
 def _circle(centre: np.ndarray, radius: float, segments: int) -> np.ndarray:
-    """A closed polygon (segments + 1, 3) [m] around a centre (3,), across the z axis."""
+    """Return a closed polygon (segments + 1, 3) [m] around a centre (3,), normal to the z axis."""
     turn = 2.0 * np.pi * np.arange(segments + 1) / segments
     return centre + radius * np.stack([np.cos(turn), np.sin(turn), 0.0 * turn], axis=1)
