@@ -79,7 +79,7 @@ class Loop:
         sensing, control_rate = self.sensing, 1.0 / self.world.timestep
         rule = f"a divisor of {control_rate:g} Hz"
         require_whole(control_rate / sensing.rate, "rate", rule, sensing.rate)
-        rule = f"a multiple of the looks' {1.0 / sensing.rate:g} s"
+        rule = f"a multiple of the observations' {1.0 / sensing.rate:g} s"
         require_whole(sensing.latency * sensing.rate, "latency", rule, sensing.latency)
         sensing.looks_per_plan(self.replan)
 

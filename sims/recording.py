@@ -224,7 +224,9 @@ def read_recording(table: pa.Table) -> Recording:
     found = dict(zip(table.column_names, table.schema.types, strict=True))
     if found != wanted:
         odd = sorted(name for name in wanted | found if found.get(name) != wanted.get(name))
-        raise ArgumentError("columns", "those of a recording", shown=f"others for {', '.join(odd)}")
+        raise ArgumentError(
+            "columns", "the columns of a recording", shown=f"others for {', '.join(odd)}"
+        )
     if not len(table):
         raise ArgumentError("flights", "one or more", shown="none")
     columns = {

@@ -121,7 +121,7 @@ def _discard_unfinished(folder: RunFolder) -> str:
 def _fly_into(
     folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
 ) -> dict[str, Any]:
-    """Fly, write all files of the run, and return the manifest."""
+    """Fly all cases, write all files of the run, and return the manifest."""
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.plans.write_rows(rows)
     recording = flight.recording(cases, flights, np.arange(kept))

@@ -1,4 +1,4 @@
-"""What stands around a flight and touches nothing, and its form in MJCF: parts, and a machine."""
+"""Visual surroundings of a flight: solid parts, a pitching machine, and their MJCF."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,47 +9,48 @@ from scipy.spatial import ConvexHull
 from planner_jax.sims.robot import Solid
 
 GROUND_COLOUR = "#A9C4A9"
-FLAT = 0.01  # [m]: parts that are no higher lie on the ground
-LOOK = 'mass="0" contype="0" conaffinity="0"'  # MJCF, of what is there to be looked at
+FLAT = 0.01  # [m]; parts that are no higher lie flat on the ground
+LOOK = 'mass="0" contype="0" conaffinity="0"'  # MJCF attributes of visual geoms
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
-_SIDES, _RINGS = 14, 3  # of a capsule as it is drawn, around it and at each end
+_SIDES, _RINGS = 14, 3  # facets of a drawn capsule, around its axis and at each end
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """A solid that stands upright."""
+    """An upright solid."""
 
     kind: str  # "box" or "cylinder"
-    size: tuple[float, float, float]  # [m]: length, width, height; a cylinder's are its diameter
+    # [m]: length, width, height; the length and width of a cylinder are its diameter
+    size: tuple[float, float, float]
     centre: tuple[float, float, float]  # [m], world frame
     colour: str  # as #RRGGBB
     turn: float = 0.0  # [rad] about z
-    opacity: float = 1.0  # less than 1 for what is to be looked through
+    opacity: float = 1.0  # less than 1 for transparent parts
 
     @property
     def quat_wxyz(self) -> tuple[float, float, float, float]:
-        """Attitude."""
+        """The attitude as a quaternion."""
         return (float(np.cos(0.5 * self.turn)), 0.0, 0.0, float(np.sin(0.5 * self.turn)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Prism:
-    """An upright prism on the ground that stands, or moves evenly without turning."""
+    """An upright prism on the ground, at rest or at constant velocity without rotation."""
 
-    corners: np.ndarray  # (V, 2) [m], of its base at time 0, convex, in either sense
+    corners: np.ndarray  # (V, 2) [m], of its base at time 0, convex, in either orientation
     height: float  # [m]
     colour: str  # as #RRGGBB
     velocity: tuple[float, float] = (0.0, 0.0)  # [m/s]
 
     def outlines(self, time: float) -> list[np.ndarray]:
-        """Its edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
+        """Return its edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
         base = self.corners + time * np.asarray(self.velocity)
         ring = np.concatenate([base, base[:1]])
         low, high = (np.pad(ring, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height))
         return [low, high, *(np.stack([low[k], high[k]]) for k in range(len(base)))]
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners (2 V, 3) [m] at time 0 and triangles (T, 3) of sides and top."""
+        """Return corners (2 V, 3) [m] at time 0, and triangles (T, 3) of sides and top."""
         num = len(self.corners)
         low, high = (
             np.pad(self.corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height)
@@ -62,11 +63,11 @@ class Prism:
 
 
 def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[Part]:
-    """A pitching machine: two wheels beside the mouth, a case behind it, mast and foot.
+    """Return a pitching machine: two wheels beside the mouth, a case behind it, mast and foot.
 
     Args:
         mouth: (3,) [m], where balls leave it, above the ground.
-        heading: [rad] from the x axis, in which it throws.
+        heading: [rad] of the throws, from the x axis.
     """
     ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
     aside = np.array([-np.sin(heading), np.cos(heading), 0.0])
@@ -88,7 +89,7 @@ def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[P
 
 
 def outlines(part: Part) -> list[np.ndarray]:
-    """A part's edges as lines, each (M, 3) [m], world frame."""
+    """Return a part's edges as lines, each (M, 3) [m], world frame."""
     if part.kind == "box":
         angle = np.linspace(0.25, 2.25, 5) * np.pi
         ring = np.sign(np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -107,7 +108,7 @@ def outlines(part: Part) -> list[np.ndarray]:
 
 
 def hull(points: np.ndarray) -> Solid:
-    """The convex hull of points (P, 3) [m] that are all on it."""
+    """Return the convex hull of points (P, 3) [m]; all points must be vertices of it."""
     found = ConvexHull(points)
     a, b, c = (points[found.simplices[:, k]] for k in range(3))
     inward = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
@@ -116,13 +117,13 @@ def hull(points: np.ndarray) -> Solid:
 
 
 def box_solid(lower: np.ndarray, upper: np.ndarray) -> Solid:
-    """A box along the axes between two corners (3,) [m]."""
+    """Return the axis-aligned box between two corners (3,) [m]."""
     share = np.stack(np.meshgrid(*[[0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     return hull(lower + share * (np.asarray(upper) - lower))
 
 
 def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid:
-    """A capsule around the segment of two ends (3,) [m], as rings of points about its axis."""
+    """Return a capsule around the segment between two ends (3,) [m], as rings of points."""
     along = np.asarray(second, float) - first
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
@@ -140,22 +141,22 @@ def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid
 
 
 def part_solid(part: Part) -> Solid:
-    """The surface of a part in the world."""
+    """Return the surface of a part in the world frame."""
     return hull(np.concatenate([line[:-1] for line in outlines(part)[:2]]))
 
 
 def xml_numbers(*values: float) -> str:
-    """Numbers as MJCF writes them."""
+    """Return numbers as MJCF text."""
     return " ".join(f"{value:.9g}" for value in values)
 
 
 def xml_colour(colour: str, opacity: float = 1.0) -> str:
-    """The MJCF colour of #RRGGBB."""
+    """Return the MJCF colour of #RRGGBB."""
     return xml_numbers(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), opacity)
 
 
 def part_xml(part: Part) -> str:
-    """A part as a geom of MJCF."""
+    """Return a part as a geom of MJCF."""
     length, width, height = (0.5 * size for size in part.size)
     half = (length, width, height) if part.kind == "box" else (length, height)
     return (

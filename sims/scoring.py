@@ -1,8 +1,8 @@
-"""Did the tool meet the ball?
+"""Detection of contacts between tool and balls.
 
-A tool is a disc on the z axis of the body that carries it. The event is the passage of the ball's
-centre through the disc's plane from above, found between two steps by interpolation. A net has
-caught the ball that passes within its radius; a racket hits it there.
+A tool is a disc on the z axis of the body that carries it. A contact is the passage of the ball's
+centre through the disc's plane from above; its time is interpolated between two steps. A ball that
+passes within the disc's radius is caught by a net, or hit by a racket.
 """
 
 import jax
@@ -16,22 +16,22 @@ from planner_jax.sims.robot import Physics
 
 @struct.dataclass
 class Contact:
-    """The nearest passage of one ball so far, or that in which it was met; world frame."""
+    """The nearest passage of one ball so far, or the passage at which it was met; world frame."""
 
     met: Array  # () bool, within the radius
     time: Array  # () [s]
-    offset: Array  # () [m], of the ball from the disc's centre; inf before any passage
+    offset: Array  # () [m], distance of the ball from the disc's centre; inf before any passage
     ball_pos: Array  # (3,) [m]
     ball_vel: Array  # (3,) [m/s]
     robot_pos: Array  # (3,) [m], of the body with the tool
-    tool_vel: Array  # (3,) [m/s], of the tool at the ball, rotation included
-    normal: Array  # (3,) z axis of that body
-    planned_time: Array  # () [s], of the plan that was flown then
-    tracking: Array  # () [m], distance of the robot from its plan
+    tool_vel: Array  # (3,) [m/s], velocity of the tool at the ball, rotation included
+    normal: Array  # (3,) z axis of the body with the tool
+    planned_time: Array  # () [s], of the plan that was active then
+    tracking: Array  # () [m], distance of the robot from its plan then
 
 
 def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
-    """Before any passage, leaves (N, ...)."""
+    """Return contacts before any passage, leaves (N, ...)."""
     number, vector = jnp.zeros(num_balls, dtype), jnp.zeros((num_balls, 3), dtype)
     return Contact(
         met=jnp.zeros(num_balls, bool),
@@ -49,9 +49,9 @@ def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
 
 @struct.dataclass
 class Moment:
-    """What a passage is looked for in: tool and balls at one instant.
+    """Tool and balls at one instant.
 
-    Velocities are MuJoCo's, of half a step before.
+    Velocities are MuJoCo's: they belong to half a step before.
     """
 
     robot_pos: Array  # (3,) [m]
@@ -63,7 +63,7 @@ class Moment:
 
 
 def moment(world: World, physics: Physics) -> Moment:
-    """Tool and balls in a simulated state."""
+    """Return tool and balls of a simulated state."""
     motion = world.carrier.tool_motion(world.robot.state(physics))
     return Moment(*motion, *ball_states(world, physics))
 
@@ -71,22 +71,22 @@ def moment(world: World, physics: Physics) -> Moment:
 def passage(
     world: World, before: Moment, after: Moment, time: Array, planned: Array, reference: Array
 ) -> tuple[Array, Contact]:
-    """Whether each ball passes the disc's plane from above within a step, and how.
+    """Return whether each ball passes the disc's plane from above within a step, and the passage.
 
     Args:
         world: with the tool and the time step.
         before: at `time`.
         after: one step later.
         time: () [s].
-        planned: (N,) [s], when each ball is to be met.
-        reference: (3,) [m], where the robot is to be at `time`.
+        planned: (N,) [s], planned contact times.
+        reference: (3,) [m], planned position of the robot at `time`.
 
     Returns:
         (N,) bool, and contacts with leaves (N, ...).
     """
 
     def gap(at: Moment) -> Array:
-        """Height (N,) [m] of the balls over the disc's plane."""
+        """Return the height (N,) [m] of the balls over the disc's plane."""
         return jnp.sum((at.ball_pos - at.robot_pos) * at.normal, axis=1) - world.carrier.tool.height
 
     start, end = gap(before), gap(after)
@@ -116,7 +116,10 @@ def passage(
 
 
 def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
-    """The contact so far, or a later passage that is nearer, unless the ball is met already."""
+    """Return the nearer of two passages: the contact so far, or a later passage.
+
+    The contact so far is returned if the ball is already met.
+    """
     take = passes & ~contact.met & (later.offset < contact.offset)
 
     def pick(old: Array, new: Array) -> Array:

@@ -1,8 +1,8 @@
-"""A ball in an image by its colour, and where it is by the depth of its pixels.
+"""Detection of a ball in an image by its colour, and its position from the depth of its pixels.
 
-[Natarajan2024, Section IV-F]: thresholds of hue, saturation and value make a mask; pixels
-of little confidence and depths that do not belong to the ball are dropped, and what is left, if
-there is enough of it, has a centroid.
+The method follows [Natarajan2024, Section IV-F]. Thresholds of hue, saturation and value give a
+mask. Pixels of low confidence and depths of other objects are dropped. The ball's position is the
+centroid of the remaining pixels, if there are enough of them.
 """
 
 import jax
@@ -14,21 +14,21 @@ from jax import Array, lax
 from planner_jax.studies.block.camera import Camera, back_project, from_numbers
 from planner_jax.studies.block.noise import StereoNoise
 
-WINDOW = 64  # [px], edge of the square around the mask's middle that is looked at closely
-# Of a sphere's visible half, seen from afar: mean height above the plane through its middle, in
+WINDOW = 64  # [px], edge of the square around the mask's median that is evaluated
+# Mean height of a sphere's visible half, seen from afar, above the plane through its centre, in
 # radii.
 _MEAN_HEIGHT = 2.0 / 3.0
-_WHOLE = 0.7  # least share of the pixels that a ball at its depth has
+_WHOLE = 0.7  # least visible share of a ball's pixels at its depth
 
 
 @struct.dataclass
 class BallLook:
-    """What tells a ball's pixels from others."""
+    """Thresholds that separate a ball's pixels from others."""
 
     lower: Array  # (3,) hue, saturation and value, each 0 to 1
-    upper: Array  # (3,) likewise; a hue below the lower one is reached by way of 1
+    upper: Array  # (3,) the same; an upper hue below the lower one means a range across hue 1
     radius: Array  # () [m], of the ball
-    confidence: Array  # () least of a pixel
+    confidence: Array  # () least confidence of a pixel
     pixels: Array  # () least number of pixels of a ball
     reach: Array  # () [m], greatest depth
 
@@ -42,7 +42,7 @@ def ball_look(
     pixels: float = 4,
     reach: float = 14.0,
 ) -> BallLook:
-    """The look of a ball as NumPy float32 leaves; an orange one if no colours are given.
+    """Return thresholds of a ball as NumPy float32 leaves; the default ball is orange.
 
     Raises:
         ValueError: a colour is not between 0 and 1, or the radius is not positive; one line.
@@ -66,16 +66,16 @@ def ball_look(
 
 @struct.dataclass
 class Sighting:
-    """A ball in one frame; NaN where it is not seen."""
+    """A ball detected in one frame; NaN where it is not seen."""
 
-    place: Array  # (3,) [m], of the ball's middle, world frame
+    place: Array  # (3,) [m], of the ball's centre, world frame
     pixel: Array  # (2,) [px], column and row
-    depth: Array  # () [m], of the ball's middle, along the camera's axis
-    pixels: Array  # () int32, how many its depth was made of
+    depth: Array  # () [m], of the ball's centre, along the camera's axis
+    pixels: Array  # () int32, number of pixels from which the depth was computed
 
 
 def hue_saturation_value(rgb: Array) -> Array:
-    """Hue, saturation and value (..., 3), each 0 to 1, of colours (..., 3) from 0 to 1."""
+    """Return hue, saturation and value (..., 3), each 0 to 1, of colours (..., 3) from 0 to 1."""
     red, green, blue = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     value = jnp.max(rgb, axis=-1)
     span = value - jnp.min(rgb, axis=-1)
@@ -91,14 +91,14 @@ def hue_saturation_value(rgb: Array) -> Array:
 
 
 def colour_mask(image: Array, look: BallLook) -> Array:
-    """Which pixels of an image (rows, columns, 3) of bytes have the ball's colour, (rows, columns).
+    """Return which pixels have the ball's colour, (rows, columns), of bytes (rows, columns, 3).
 
-    The same as to compare `hue_saturation_value`, but without a division a pixel.
+    The result equals a comparison with `hue_saturation_value`, but needs no division per pixel.
     """
     red, green, blue = (image[..., k].astype(jnp.float32) for k in range(3))
     value = jnp.maximum(jnp.maximum(red, green), blue)
     span = value - jnp.minimum(jnp.minimum(red, green), blue)
-    # Six times the hue times the span, from 0 to 6 spans.
+    # The quantity 6 hue span, from 0 to 6 span.
     turn = jnp.where(
         value == red,
         green - blue + jnp.where(green < blue, 6.0, 0.0) * span,
@@ -115,22 +115,28 @@ def colour_mask(image: Array, look: BallLook) -> Array:
 def sighting(
     image: Array, depth: Array, confidence: Array, camera: Camera, look: BallLook
 ) -> Sighting:
-    """The ball in one frame.
+    """Return where the ball is in one frame.
 
-    The middle of the mask is where half of its pixels are on either side, which stray pixels do not
-    move far. In a window of 64 pixels around it those tell the depth that have confidence, and a
-    depth no more than three robust standard deviations (1.48 times the median deviation) and a
-    radius off the median; the centroid is that of all the mask's pixels near them. Depths are of
-    the ball's surface, whose mean over the visible half is two thirds of a radius before its
-    middle. A ball of which less than 0.7 is to be seen, such as behind a pole, counts as not seen:
-    its middle would be off.
+    1. The medians of the mask's columns and rows, which stray pixels hardly affect, give the centre
+    of a window of 64 pixels.
+
+    2. In the window the depth uses the confident pixels near the median depth: within three robust
+    standard deviations (1.48 times the median deviation) and a radius of it.
+
+    3. The centroid uses all pixels of the mask near the centroid of those pixels.
+
+    4. Depths are of the ball's surface. Their mean over the visible half is two thirds of a radius
+    in front of the ball's centre, which is corrected.
+
+    A ball counts as not seen if less than 0.7 of it is visible, such as behind a pole: its centroid
+    would be biased.
 
     Args:
         image: (rows, columns, 3) bytes, red, green and blue; at least 64 each way.
         depth: (rows, columns) [m]; NaN where there is none.
         confidence: (rows, columns), 0 to 1.
-        camera: that took it.
-        look: of the ball.
+        camera: that took the frame.
+        look: thresholds of the ball.
     """
     mask = colour_mask(image, look)
     corner = [_middle(jnp.sum(mask, axis=1 - axis)) - WINDOW // 2 for axis in range(2)]
@@ -152,8 +158,8 @@ def sighting(
     across = (first + jnp.stack(corner[::-1]) - camera.centre) / camera.focal
     along = jnp.sqrt(1.0 + jnp.sum(across**2))
     deep = mean(depth, usable) + _MEAN_HEIGHT * look.radius / along
-    # Holes in the depth leave an image of the ball that is not round: where it is in the image,
-    # all of its colour say that are as near as it is large. Off the axis it is seen drawn out.
+    # Holes in the depth would bias the centroid. So it uses all pixels of the ball's colour within
+    # its apparent radius. Away from the camera's axis the image of a ball is stretched.
     round_px = camera.focal * look.radius / jnp.maximum(deep, look.radius)
     within = 1.5 * along * round_px + 1.0
     near = mask & ((column - first[0]) ** 2 + (row - first[1]) ** 2 <= within**2)
@@ -172,11 +178,10 @@ def sighting(
 def noisy_depth(
     key: Array, camera: Camera, noise: StereoNoise, depth: Array
 ) -> tuple[Array, Array]:
-    """A depth image as a stereo camera would have it, from the true one.
+    """Return a stereo camera's depth image, from the true one.
 
-    One error of disparity is common to the image, as if one thing were looked at; pixels have
-    errors of their own beside it, none at all (NaN), or the depth of something else, up to twice
-    as near or far.
+    One disparity error is common to the whole image. Each pixel also has its own error. A pixel may
+    have no depth at all (NaN), or a mismatched one: up to twice or half the true depth.
 
     Args:
         key: of the noise.
@@ -186,8 +191,8 @@ def noisy_depth(
 
     Returns:
         depth: (rows, columns) [m].
-        confidence: (rows, columns), 0 to 1; an assumption: evenly spread over 0.4 to 1 where the
-            pixel was matched well, and over 0 to 0.6 where with something else.
+        confidence: (rows, columns), 0 to 1; an assumption: uniform over 0.4 to 1 for well-matched
+            pixels, and over 0 to 0.6 for mismatched ones.
     """
     common, own, hole, other, factor, trust = jax.random.split(key, 6)
     dtype = depth.dtype
@@ -204,13 +209,13 @@ def noisy_depth(
 
 
 def _middle(counts: Array) -> Array:
-    """The place () in counts (n,) before which half of them lie."""
+    """Return the index () in counts (n,) at which the cumulative count reaches one half."""
     until = jnp.cumsum(counts)
     return jnp.searchsorted(until, 0.5 * until[-1])
 
 
 def _median(values: Array, usable: Array) -> Array:
-    """Median () of those values that are usable; 0 if none is."""
+    """Return the median () of the usable values; 0 if none is usable."""
     num = jnp.sum(usable)
     ordered = jnp.sort(jnp.where(usable, values, jnp.inf).reshape(-1))
     both = ordered[jnp.maximum(num - 1, 0) // 2] + ordered[num // 2]

@@ -1,8 +1,8 @@
-"""What is seen of the balls by motion capture, and what is made of it.
+"""Observations of the balls by motion capture, and their estimated states.
 
-A look at a ball shows where it was a latency ago, with noise, or nothing at all. The library's
-Kalman filter turns looks into position and velocity; the energy that the ball has lost since it
-was first seen well says what its drag is [Yu2023bat, eqs 6 and 7]. World frame, SI units.
+An observation shows a ball one latency ago, with noise, or nothing. The library's Kalman filter
+estimates position and velocity from the observations. The energy that the ball has lost since the
+first good estimate gives its drag [Yu2023bat, eqs 6 and 7]. World frame, SI units.
 """
 
 import dataclasses
@@ -22,17 +22,17 @@ from planner_jax.ball.estimation import (
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.sims.noise import Sensing
 
-_LEAST_STD = 1e-3  # [m], that the filter believes of a sensor without noise
-_ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of what the filter's flight leaves out
-_FLIGHT_STEPS = 4  # of a prediction over latency and planning
-_DRAG_SPREAD = 0.2  # relative standard deviation of the drag believed at first
+_LEAST_STD = 1e-3  # [m], that the filter assumes of a sensor without noise
+_ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of the filter's process noise
+_FLIGHT_STEPS = 4  # integration steps of a prediction over latency and planning
+_DRAG_SPREAD = 0.2  # relative standard deviation of the initial drag estimate
 
 
 def specific_energy(ball: BallState, gravity: Array) -> Array:
     """Return the mechanical energy per unit mass  |v|^2 / 2 + g z  [m^2/s^2], g > 0 the magnitude.
 
-    [Yu2023bat] prints  + g' s  above eq. 6; with its own g, which points down, that sum would
-    not be conserved in free flight.
+    [Yu2023bat] prints  + g' s  above eq. 6. With the paper's own g, which points down, that sum
+    would not be conserved in free flight.
     """
     return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
 
@@ -42,7 +42,8 @@ class RlsState:
     """Recursive least squares for one unknown x in  y = h x + noise of unit variance."""
 
     estimate: Array  # () x
-    variance: Array  # () of the estimate; 1/variance of the start counts as that many y, h = 1
+    # () of the estimate; an initial variance v counts like 1 / v measurements, h = 1
+    variance: Array
 
 
 def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
@@ -55,7 +56,7 @@ def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsStat
     """
     usable = jnp.isfinite(measurement)
     y = jnp.where(usable, measurement, 0.0)
-    # P / (1 + h^2 P) is the textbook's (1 - K h) P without its cancellation.
+    # P / (1 + h^2 P) equals the textbook's (1 - K h) P, but without cancellation.
     variance = state.variance / (1.0 + regressor**2 * state.variance)
     error = y - regressor * state.estimate
     after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
@@ -64,18 +65,18 @@ def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsStat
 
 @struct.dataclass
 class Estimate:
-    """What is believed of one ball; the belief is as old as the looks' latency."""
+    """The estimate of one ball; the belief is one latency old."""
 
     belief: EkfState
-    energy: Array  # () [m^2/s^2], specific, when the ball was first seen well
-    energy_variance: Array  # () [m^4/s^4], of that
+    energy: Array  # () [m^2/s^2], specific, at the first good estimate
+    energy_variance: Array  # () [m^4/s^4], of that energy
     lever: Array  # () [m^3/s^2], integral of |v|^3 since then
-    prior: RlsState  # of K_D [1/m]
-    drag: Array  # () K_D [1/m]
+    prior: RlsState  # of K_D [1/m], before any energy loss
+    drag: Array  # () K_D [1/m], current estimate
 
 
 def observe(key: Array, pos: Array, sensing: Sensing) -> Array:
-    """What a look shows of balls at (N, 3) [m]; a row of NaN where it shows nothing."""
+    """Return an observation of balls at (N, 3) [m]; a row of NaN where one is missing."""
     noise_key, drop_key = jax.random.split(key)
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
     lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout
@@ -92,7 +93,10 @@ def _model(sensing: Sensing, drag: Array, gravity: Array) -> EkfModel:
 
 
 def first_estimate(pos: Array, drag: Array) -> Estimate:
-    """Of a ball that leaves a machine at (3,) [m] at an unknown velocity, believed drag ()."""
+    """Return the estimate of a ball that leaves a machine at (3,) [m].
+
+    Its velocity is unknown; its drag is estimated as `drag` ().
+    """
     zero = jnp.zeros_like(drag)
     wide = ekf_init(pos, jnp.zeros_like(pos), pos_std=zero + 0.1, vel_std=zero + 10.0)
     prior = RlsState(estimate=drag, variance=(_DRAG_SPREAD * drag) ** 2 + 1e-8)
@@ -102,7 +106,7 @@ def first_estimate(pos: Array, drag: Array) -> Estimate:
 
 
 def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
-    """The estimate of one ball one look (3,) later."""
+    """Return the estimate of one ball after one more observation (3,)."""
     model = _model(sensing, estimate.drag, gravity)
     period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
     ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
@@ -112,11 +116,14 @@ def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> E
 
 
 def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
-    """The estimate one look later without a filter: the place seen, and the velocity to there."""
+    """Return the estimate after one more observation without a filter.
+
+    The position is the observed one; the velocity follows from the previous position.
+    """
     period = 1.0 / sensing.rate
     before = estimate.belief.ball
     flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
-    # The mean velocity on the way, and half of what it changes on the way.
+    # The mean velocity over the period, plus half of the change of velocity over the period.
     vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
     taken = jnp.concatenate([seen, vel])
     blind = jnp.concatenate([flown.pos, flown.vel])
@@ -125,7 +132,7 @@ def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: 
 
 
 def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
-    """The estimate with its energy as it is now, from which losses count."""
+    """Return the estimate with its current energy as reference for energy losses."""
     energy, variance = _energy(estimate.belief, gravity)
     return dataclasses.replace(
         estimate, energy=energy, energy_variance=variance, lever=jnp.zeros_like(estimate.lever)
@@ -133,17 +140,17 @@ def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
 
 
 def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
-    """Specific energy and its variance, to first order."""
+    """Return the specific energy and its variance, to first order."""
     slope = jnp.concatenate([jnp.stack([0.0 * gravity, 0.0 * gravity, gravity]), belief.ball.vel])
     variance = jnp.sum(slope[:, None] * belief.covariance * slope)
     return specific_energy(belief.ball, gravity), variance
 
 
 def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
-    """The estimate with K_D from the energy lost since the anchor [Yu2023bat, eq. 7].
+    """Return the estimate with K_D from the energy lost since the reference [Yu2023bat, eq. 7].
 
-    The one loss over all that time is weighed against what was believed at first; the paper's
-    running mean of losses between looks would count the same noise again and again.
+    The total loss is combined once with the prior. The paper's running mean of losses between
+    observations would count the same noise repeatedly.
     """
     energy, variance = _energy(estimate.belief, gravity)
     std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))
@@ -152,5 +159,5 @@ def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
 
 
 def predict(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:
-    """The ball `ahead` [s] after the time of the belief."""
+    """Return the predicted ball `ahead` [s] after the time of the belief."""
     return fly(estimate.belief.ball, ahead, estimate.drag, gravity, num_steps=_FLIGHT_STEPS)[0]

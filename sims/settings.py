@@ -1,6 +1,6 @@
-"""What a run of flights is asked to do, a class a task; the command line is made from its fields.
+"""Settings of a run of flights, one class per task; their fields become command-line options.
 
-Nothing here imports JAX or MuJoCo; `FlySettings.flight` does.
+This module imports neither JAX nor MuJoCo; `FlySettings.flight` does.
 """
 
 import dataclasses
@@ -21,22 +21,22 @@ from planner_jax.task.catch.spec import TASK as CATCH
 from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
-_REPLAN = "plans a second, 0 for the first only (default: {} with {}, 0 with other planners)"
-# Flights have no order or times of their own to be given.
+_REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
+# The decision "given" needs an order and times in the case, which flights do not have.
 _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
-_AT_ONCE = 4096  # flights, by default
-# As estimated, bytes of a flight that is simulated with others, and of the rows that it leaves.
+_AT_ONCE = 4096  # flights per batch, by default
+# Estimated bytes of a simulated flight in a batch, and of the rows of a finished flight.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz]
-_MOST_BALLS = 12  # of one flight, as of the largest suite: every one makes the program longer
-INTERVAL = 0.8  # [s], from throw to throw [Yu2023catch, Fig. 1]
+_MOST_BALLS = 12  # of one flight, as in the largest suite; compile time grows with every ball
+INTERVAL = 0.8  # [s], between throws [Yu2023catch, Fig. 1]
 
 
 def fly_settings(task: str) -> type["FlySettings"]:
-    """The settings of a task's flights.
+    """Return the class of settings of a task's flights.
 
     Args:
-        task: its name in the registry, which knows the settings as the task's `flight`.
+        task: its name in the registry, whose entry names the class as the task's `flight`.
 
     Raises:
         ArgumentError: there is no task of that name, or it has no flights.
@@ -50,8 +50,8 @@ def require_interval(sensing: Sensing, replan: float) -> None:
     """Raise `ValueError` unless the interval of throws is a whole number of planning periods.
 
     Args:
-        sensing: whose looks divide such a period.
-        replan: [Hz], of planning anew; 0 for never.
+        sensing: whose observation periods divide a planning period.
+        replan: [Hz], rate of replanning; 0 for never.
     """
     period = sensing.looks_per_plan(replan) / sensing.rate
     rule = f"such that its period divides {INTERVAL:g} s"
@@ -60,21 +60,21 @@ def require_interval(sensing: Sensing, replan: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class FlySettings:
-    """The settings that the flights of all tasks have; a task's own class adds its own.
+    """The settings that the flights of all tasks share; a task's own class adds more.
 
     Raises:
         ArgumentError: a value breaks its rule; one line that begins with its name.
     """
 
-    num: int = option(64, "N", "flights")
-    seed: int = option(0, "K", "of what is drawn and of noise")
-    batch: int | None = option(None, "B", "flights at once (default: all up to 4096)")
-    planner: str = option("exact", "NAME", "that makes the plans from scratch")
+    num: int = option(64, "N", "number of flights")
+    seed: int = option(0, "K", "random seed of cases and noise")
+    batch: int | None = option(None, "B", "flights per batch (default: all, at most 4096)")
+    planner: str = option("exact", "NAME", "planner of plans from scratch")
     replan: float | None = option(None, "HZ", _REPLAN.format("the task's own rate", "the first"))
 
-    TASK: ClassVar[Task]  # with its name and planners; the first one is also planned anew
-    FLIGHT: ClassVar[str]  # the `FlightTask` that flies it, as "module:Class"
-    RATE: ClassVar[float]  # [Hz], of planning anew by default
+    TASK: ClassVar[Task]  # with its name and planners; only the first planner can replan
+    FLIGHT: ClassVar[str]  # its `FlightTask`, as "module:Class"
+    RATE: ClassVar[float]  # [Hz], default rate of replanning
 
     def __post_init__(self) -> None:
         for name in ("num", "batch"):
@@ -88,7 +88,7 @@ class FlySettings:
         self.check_rate()
 
     def require_memory(self) -> None:
-        """Raise `ArgumentError` unless flights that are simulated at once fit into memory."""
+        """Raise `ArgumentError` unless the flights of a batch fit into memory."""
         if self.batch is None:
             require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
         else:
@@ -97,7 +97,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """[Hz] of planning anew; only the task's first planner is planned anew."""
+        """The rate of replanning [Hz]; by default zero except for the task's first planner."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -107,21 +107,21 @@ class FlySettings:
         return self.planner == next(iter(self.TASK.planners))
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless plans can be made anew at `rate`."""
+        """Raise `ValueError` unless the flights can replan at `rate`."""
         require(self.rate >= 0.0, "replan", ">= 0", self.rate)
 
     def flight(self) -> Any:
-        """The task's `sims.task.FlightTask` with these settings."""
+        """Return the task's `sims.task.FlightTask` with these settings."""
         return pkgutil.resolve_name(self.FLIGHT)(self)
 
 
 @dataclasses.dataclass(frozen=True)
 class BallFly(FlySettings):
-    """The settings that flights among balls have besides."""
+    """The settings that flights of tasks with balls share."""
 
-    noise: str = option("lab", "NAME", f"of sensing: {', '.join(NOISES)}")
+    noise: str = option("lab", "NAME", f"preset of sensing noise: {', '.join(NOISES)}")
     drag_error: float = option(
-        0.15, "F", "relative, of what is believed of the balls' drag, either way"
+        0.15, "F", "relative error of the initial estimate of the balls' drag, of random sign"
     )
 
     def __post_init__(self) -> None:
@@ -130,24 +130,29 @@ class BallFly(FlySettings):
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless a period of planning is a whole number of looks."""
+        """Raise `ValueError` unless a planning period is a whole number of observation periods."""
         NOISES[self.noise].looks_per_plan(self.rate)
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchFly(BallFly):
-    """Flights that catch thrown balls."""
+    """Flights of a quadrotor that catches thrown balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
-    planner: str = option("exact", "NAME", "of plans from scratch")
-    balls: int = option(1, "N", f"thrown {INTERVAL:g} s apart, {_MOST_BALLS} at most")
+    planner: str = option("exact", "NAME", "planner of plans from scratch")
+    balls: int = option(
+        1, "N", f"number of balls per flight, thrown {INTERVAL:g} s apart, at most {_MOST_BALLS}"
+    )
     decide: str = option(
-        "greedy", "NAME", f"order and first times: {', '.join(_FLOWN_DECISIONS)}, policy:FILE"
+        "greedy",
+        "NAME",
+        "method that decides the order and initial times of catches: "
+        f"{', '.join(_FLOWN_DECISIONS)}, policy:FILE",
     )
     redecide: float | None = option(
         None,
         "HZ",
-        "rate at which order and times are decided anew, 0 for never (default: that of --replan)",
+        "rate at which order and times are decided again, 0 for never (default: same as --replan)",
     )
 
     robot: Any = robot_option("paper-catcher")
@@ -165,11 +170,11 @@ class CatchFly(BallFly):
 
     @property
     def redecide_rate(self) -> float:
-        """[Hz] of deciding anew."""
+        """The rate [Hz] at which order and times are decided again."""
         return self.rate if self.redecide is None else self.redecide
 
     def flight(self) -> Any:
-        """As for every task.
+        """Return the task's `sims.task.FlightTask` with these settings.
 
         Raises:
             ArgumentError: the policy's file cannot be read.
@@ -180,23 +185,23 @@ class CatchFly(BallFly):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless a plan also begins whenever a ball comes into sight."""
+        """Raise `ValueError` unless every throw coincides with the start of a planning period."""
         super().check_rate()
         if self.balls > 1:
             require_interval(NOISES[self.noise], self.rate)
         if self.redecide:
-            rule = f"0 or a divisor of the {self.rate:g} Hz at which plans are made anew"
+            rule = f"0 or a divisor of the {self.rate:g} Hz of replanning"
             require(0.0 < self.redecide <= self.rate, "redecide", rule, self.redecide)
             require_whole(self.rate / self.redecide, "redecide", rule, self.redecide)
 
 
 @dataclasses.dataclass(frozen=True)
 class HitFly(BallFly):
-    """Flights that hit served balls."""
+    """Flights of a quadrotor that hits served balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(50, "exact"))
-    planner: str = option("exact", "NAME", "of plans from scratch")
-    suite: str = option("S.1", "NAME", "of serves")
+    planner: str = option("exact", "NAME", "planner of plans from scratch")
+    suite: str = option("S.1", "NAME", "suite of serves")
 
     robot: Any = robot_option("paper-hitter")
 
@@ -212,19 +217,23 @@ class HitFly(BallFly):
 
 @dataclasses.dataclass(frozen=True)
 class InterceptFly(FlySettings):
-    """Drives of a car that meets a moving target among obstacles."""
+    """Drives of a car that intercepts a moving target among obstacles."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(1, "spacetime"))
-    planner: str = option("spacetime", "NAME", "of plans from scratch")
-    suite: str = option("easy", "NAME", "of interceptions")
-    noise: str = option("paper", "NAME", f"of what is seen: {', '.join(PLANE_NOISES)}")
-    latency: float = option(0.05, "S", "age of what is seen [s]")
-    observation_rate: float = option(1.0, "HZ", "observations of the target during the drive")
+    planner: str = option("spacetime", "NAME", "planner of plans from scratch")
+    suite: str = option("easy", "NAME", "suite of interceptions")
+    noise: str = option("paper", "NAME", f"preset of sensing noise: {', '.join(PLANE_NOISES)}")
+    latency: float = option(0.05, "S", "latency of observations and measured poses")
+    observation_rate: float = option(
+        1.0, "HZ", "rate of observations of the target during the drive"
+    )
     known_target: bool = option(
         False, "", "the target's path is known, not predicted from observations"
     )
-    predict_movers: bool = option(False, "", "movers are predicted from observations, too")
-    slip: bool = option(False, "", "tyres that slip")
+    predict_movers: bool = option(
+        False, "", "paths of moving obstacles are predicted from observations, not known"
+    )
+    slip: bool = option(False, "", "simulate tyres that slip")
 
     TASK: ClassVar[Task] = INTERCEPT
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.intercept_flights:InterceptFlight"
@@ -239,7 +248,7 @@ class InterceptFly(FlySettings):
 
     @property
     def sensing(self) -> PlaneSensing:
-        """How car and target are seen.
+        """The sensing of car and target.
 
         Raises:
             ValueError: a value is out of its range.
@@ -250,45 +259,52 @@ class InterceptFly(FlySettings):
         )
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless a period of planning is a whole number of frames."""
+        """Raise `ValueError` unless a planning period is a whole number of frames."""
         self.sensing.frames_per_plan(self.rate)
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockFly(FlySettings):
-    """Blocks of an arm with a shield."""
+    """Blocks of thrown balls by an arm with a shield."""
 
     replan: float | None = option(
-        None, "HZ", "with --perception: rate at which the motion is decided anew (default: 0, once)"
+        None, "HZ", "with --perception: rate of replanning (default: 0, the arm plans once)"
     )
-    planner: str = option("online", "NAME", "of all plans, made one at a time")
-    suite: str = option("pole", "NAME", "of throws")
-    regime: str = option("R2", "NAME", f"limits that plans keep: {', '.join(REGIMES)}")
+    planner: str = option("online", "NAME", "planner of all plans, which are made one at a time")
+    suite: str = option("pole", "NAME", "suite of throws")
+    regime: str = option("R2", "NAME", f"joint limits of plans: {', '.join(REGIMES)}")
     wide: bool = option(
-        False, "", "the ball may be 0.1 m off the shield's middle and 30 degrees off straight on"
+        False,
+        "",
+        "allow contacts up to 0.1 m from the shield's centre and 30 degrees from its normal",
     )
     perception: bool = option(
-        False, "", "plan with what a camera has seen of the ball, which flies on as it does"
+        False, "", "plan with a camera's observations of the ball instead of its true flight"
     )
     observe: float | None = option(
-        None, "S", "until the ball's flight is known (default: 0.133, with --perception 0.25)"
+        None,
+        "S",
+        "time of observation before the first plan (default: 0.133, with --perception 0.25)",
     )
     planning_budget: float | None = option(
         None,
         "S",
-        "for planning, after which the arm starts (default: 0.03, with --perception 0.05)",
+        "time for planning, after which the arm starts (default: 0.03, with --perception 0.05)",
     )
     noise: float = option(
         0.02,
         "M",
-        "with --perception: standard deviation of each coordinate; 0 for a stereo camera's",
+        "with --perception: standard deviation of each observed coordinate; 0 for the noise of a "
+        "stereo camera",
     )
-    frame_rate: float = option(60.0, "HZ", "with --perception: of the camera")
-    torque: float = option(1.0, "F", "share of the drives' torques that is there")
-    lag: float = option(0.005, "S", "of the torques, first order")
-    latency: float = option(0.0, "S", "by which plans come late to the joints")
-    encoders: str = option("fine", "NAME", f"noise of angles and rates: {', '.join(ENCODERS)}")
-    mass_error: float = option(0.05, "F", "relative, of the masses that control believes")
+    frame_rate: float = option(60.0, "HZ", "with --perception: frame rate of the camera")
+    torque: float = option(1.0, "F", "scale of the drives' torque limits")
+    lag: float = option(0.005, "S", "first-order lag of the torques")
+    latency: float = option(0.0, "S", "delay of plans at the joints")
+    encoders: str = option(
+        "fine", "NAME", f"preset of encoder noise in angles and rates: {', '.join(ENCODERS)}"
+    )
+    mass_error: float = option(0.05, "F", "relative error of the masses that control believes")
 
     TASK: ClassVar[Task] = BLOCK
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.block:BlockFlight"
@@ -304,7 +320,10 @@ class BlockFly(FlySettings):
         require_frame_rate(self.frame_rate)
         own = self.planner.partition(":")[0] != "library"
         require(
-            own or not self.perception, "planner", "one that plans for the very ball", self.planner
+            own or not self.perception,
+            "planner",
+            "one other than 'library' with perception",
+            self.planner,
         )
         require(0.0 < self.torque < math.inf, "torque", "finite and > 0", self.torque)
         least, most = SCALES
@@ -314,21 +333,20 @@ class BlockFly(FlySettings):
 
     @property
     def until_known(self) -> float:
-        """[s], from when the ball is first seen until its flight is known, or first fitted."""
-        # [Natarajan2024, Section VI-B]: 82.9 ms for perception and 50 ms for the rest of the
-        # system.
+        """The time [s] from the first sight of the ball until its flight is known or fitted."""
+        # [Natarajan2024, Section VI-B]: 82.9 ms for perception and 50 ms for the remaining system.
         usual = 0.25 if self.perception else 0.133
         return usual if self.observe is None else self.observe
 
     @property
     def until_set(self) -> float:
-        """[s], from then on until the arm sets out."""
+        """The time [s] for planning, from the end of `until_known` until the arm starts."""
         usual = 0.05 if self.perception else 0.03
         return usual if self.planning_budget is None else self.planning_budget
 
     @property
     def drives(self) -> Drives:
-        """What drives and encoders can do.
+        """The limits of the drives, and the errors of the encoders.
 
         Raises:
             ValueError: a value is out of its range.
@@ -344,10 +362,11 @@ class BlockFly(FlySettings):
         )
 
     def flight(self) -> Any:
-        """As for every task.
+        """Return the task's `sims.task.FlightTask` with these settings.
 
         Raises:
-            ArgumentError: the planner's file is no library, or one of another scene or limits.
+            ArgumentError: the planner's file is no library, or belongs to another scene or other
+                limits.
         """
         if BLOCK.split_planner(self.planner)[1]:
             from planner_jax.task.block import draw
@@ -357,7 +376,7 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless plans can be made anew, and the drives are possible."""
+        """Raise `ValueError` unless the flights can replan at `rate`, and the drives are valid."""
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)

@@ -1,4 +1,4 @@
-"""What a run of flights asks of a task; the classes in `tasks` answer."""
+"""The interface of a task to a run of flights; the classes in `tasks` implement it."""
 
 import abc
 import dataclasses
@@ -21,54 +21,54 @@ from planner_jax.sims.settings import BallFly
 
 @dataclasses.dataclass(frozen=True)
 class FlightCases:
-    """B cases to be flown, NumPy leaves; a task's own class adds what is thrown."""
+    """B cases to fly, NumPy leaves; a task's own class adds the balls or targets."""
 
-    index: np.ndarray  # (B,) place in the whole, which decides the noise
+    index: np.ndarray  # (B,) index in the run, from which the noise is drawn
 
     def __len__(self) -> int:
         return len(self.index)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Some of them, picked as NumPy does."""
+        """Return some of the cases, selected by NumPy indexing."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return type(self)(**jax.tree.map(lambda leaf: leaf[rows], fields))
 
 
 @dataclasses.dataclass(frozen=True)
 class Flights(abc.ABC):
-    """What came of a batch of flights; leaves with a leading axis B."""
+    """The result of a batch of flights; leaves with a leading axis B."""
 
     first_plan: Any
-    flown: Any  # what was simulated; `tracking` (B, 2) [m], root mean square and worst, and more
-    planning_seconds: float  # of the host's clock, spent on plans from scratch
+    flown: Any  # the simulated flights; `tracking` (B, 2) [m], rms and worst, and more
+    planning_seconds: float  # wall time spent on plans from scratch
 
     @property
     @abc.abstractmethod
     def success(self) -> np.ndarray:
-        """Which flights succeeded, (B,) bool."""
+        """Whether each flight succeeded, (B,) bool."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightTask(abc.ABC):
-    """A task as a run of flights knows it, with the settings of the run.
+    """A task with the settings of a run, as the run uses it.
 
-    Its class is named by the settings' `FLIGHT`; `run.py` knows nothing else of a task. One that
-    meets balls inherits from `BallFlightTask`.
+    The settings name this class in `FLIGHT`; `run.py` needs nothing else of a task. A task with
+    balls inherits from `BallFlightTask`.
     """
 
     settings: Any  # of the task's class of `FlySettings`
 
-    THING: ClassVar[str] = "ball"  # what is to be met, in pictures
+    THING: ClassVar[str] = "ball"  # name of the target in pictures
     THING_RADIUS: ClassVar[float] = BALL_RADIUS  # [m]
-    CONTACT: ClassVar[str]  # what a thing is that was met, in pictures: "caught"
-    SUCCESS: ClassVar[str]  # what a flight has done that succeeded: "caught all balls"
-    PUBLISHED: ClassVar[str]  # what is published of the task, for the table
-    COLUMNS: ClassVar[Sequence[Column]]  # of the rows, besides those of all tasks
-    # Corners of what pictures show [m]; None for all that moves and stands.
+    CONTACT: ClassVar[str]  # participle for a met target in pictures: "caught"
+    SUCCESS: ClassVar[str]  # predicate of a successful flight in sentences: "caught all balls"
+    PUBLISHED: ClassVar[str]  # published result of the task, for the table
+    COLUMNS: ClassVar[Sequence[Column]]  # of the rows, in addition to the columns of all tasks
+    # Corners [m] of the region that pictures show; None to fit all drawn objects.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
-    HAS_REACH: ClassVar[bool] = False  # whether `reachable` can say anything
+    HAS_REACH: ClassVar[bool] = False  # whether `reachable` returns anything
     VIEW: ClassVar[tuple[float, float]] = (18.0, -68.0)  # elevation and azimuth of pictures [deg]
-    # Where the eye of the viewer is, and where it looks [m].
+    # Position of the viewer's camera, and the point that it looks at [m].
     EYE: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
         (1.5, -8.0, 3.0),
         (1.9, 0.0, 1.2),
@@ -76,75 +76,78 @@ class FlightTask(abc.ABC):
 
     @abc.abstractmethod
     def world(self) -> World:
-        """The simulated world."""
+        """Return the simulated world."""
 
     @abc.abstractmethod
     def cases(self) -> Any:
-        """All cases of the run, `FlightCases`."""
+        """Return all cases of the run, `FlightCases`."""
 
     @abc.abstractmethod
     def fly(self, cases: Any, record: bool) -> Any:
-        """Plan and fly some cases, with a record of every look or without; `Flights`."""
+        """Plan and fly some cases, and return `Flights`.
+
+        With `record`, the result includes a record of every observation.
+        """
 
     @abc.abstractmethod
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """The recording of some of the flights that were recorded.
+        """Return the recording of some of the recorded flights.
 
         Args:
             cases: that were flown.
-            flights: what came of them.
-            lanes: (F,) which of them.
+            flights: their result.
+            lanes: (F,) indices of the flights.
         """
 
     @property
     @abc.abstractmethod
     def suite(self) -> str:
-        """What was flown, in a word or two for title and table."""
+        """A short name of the cases for title and table."""
 
     @property
     @abc.abstractmethod
     def conditions(self) -> str:
-        """Under what noise and errors was flown, as the begin of a sentence."""
+        """Noise and errors of the flights, as the beginning of a sentence."""
 
     @property
     @abc.abstractmethod
     def simulated(self) -> str:
-        """What is simulated, for the page of a run."""
+        """A description of the simulation, for the report of a run."""
 
     @abc.abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Everything that shapes the simulation, as plain values for the manifest."""
+        """Return all parameters of the simulation, as plain values for the manifest."""
 
     def every_column(self) -> Sequence[Column]:
-        """The task's columns."""
+        """Return all columns of the task."""
         return self.COLUMNS
 
     def surroundings(self, index: int) -> Sequence[Prism]:
-        """What else stands or moves in one flight of the run, to be looked at."""
+        """Return the standing and moving obstacles of one flight of the run, for drawing."""
         return ()
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Where the robot of a flight could be and when: times [s] and points (P, 2) [m]."""
+        """Return where the robot of a flight could be: times [s] and points (P, 2) [m] then."""
         return ()
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """What else is said in numbers of the rows of a run, for the summary."""
+        """Return additional numbers from the rows of a run, for the summary."""
         return {}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """What else is said of a run at its top, a sentence each."""
+        """Return additional sentences for the top of the report."""
         return []
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """What else is told of the rows of a run, in tables under that of the rates."""
+        """Return additional tables from the rows of a run."""
         return ()
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Write more figures of the rows of a run into a folder; the names of their files."""
+        """Write additional figures of the rows of a run into a folder; return their file names."""
         return ()
 
     def title(self, recording: Recording, flight: int) -> str:
-        """Task, place in the run and outcome of a flight."""
+        """Return task, index in the run and outcome of a flight."""
         outcome = "success" if recording.success[flight] else "failure"
         return f"{self.settings.TASK.name} {recording.index[flight]}, {outcome}"
 
@@ -152,54 +155,56 @@ class FlightTask(abc.ABC):
 _CONTACTS = leaves_of(
     "verdict.flown.contact",
     ("contact_time", "s", "of each ball's nearest passage", LIST, "time"),
-    ("planned_time", "s", "of that contact", LIST),
-    ("offset", "m", "ball from the tool's centre", LIST),
-    ("contact_ball_pos", "m", "a point a ball", LIST, "ball_pos"),
-    ("contact_robot_pos", "m", "a point a ball", LIST, "robot_pos"),
-    ("contact_tracking", "m", "robot from its plan then", LIST, "tracking"),
+    ("planned_time", "s", "planned time of that contact", LIST),
+    ("offset", "m", "of the ball from the tool's centre", LIST),
+    ("contact_ball_pos", "m", "balls x 3, flat", LIST, "ball_pos"),
+    ("contact_robot_pos", "m", "balls x 3, flat", LIST, "robot_pos"),
+    ("contact_tracking", "m", "of the robot from its plan then", LIST, "tracking"),
 )
 
 
 @dataclasses.dataclass(frozen=True)
 class BallFlightTask(FlightTask):
-    """A task that meets balls, flown in `sims.loop`."""
+    """A task with balls, flown in `sims.loop`."""
 
     settings: BallFly
 
     @abc.abstractmethod
     def launches(self, cases: Any, flown: Flown) -> Launches:
-        """What is known of the balls of some flights before and after these were simulated."""
+        """Return the states of the balls of some flights before and after their simulation."""
 
     def every_column(self) -> Sequence[Column]:
-        """The contacts, and the task's columns."""
+        """Return the columns of contacts, and the task's own columns."""
         return [*_CONTACTS, *self.COLUMNS]
 
     @property
     def conditions(self) -> str:
-        """Noise and wrong drag."""
+        """Sensing noise and error of the estimated drag, as the beginning of a sentence."""
         settings = self.settings
-        return f"Noise {settings.noise}, drag believed {100 * settings.drag_error:g} % wrong"
+        return (
+            f"Noise {settings.noise}, {100 * settings.drag_error:g} % error of the estimated drag"
+        )
 
     @property
     def simulated(self) -> str:
-        """Robot, motion capture and balls."""
+        """Robot, motion capture and balls, for the report of a run."""
         exact = NOISES[self.settings.noise] == NOISES["none"]
         seen = "without errors or latency" if exact else "with noise, dropout and latency"
         robot = self.world().robot.WORDS
         return f"{robot}, motion capture {seen}, balls with quadratic drag"
 
     def parameters(self) -> dict[str, Any]:
-        """Those of the closed loop."""
+        """Return the parameters of the closed loop."""
         return dataclasses.asdict(self.loop(record=False))
 
     def loop(self, record: bool) -> Loop:
-        """The closed loop of the flights, with a record of every look or without."""
+        """Return the closed loop of the flights, with or without a record of every observation."""
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
 
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """The recording of some of the flights that were recorded; see `FlightTask`."""
+        """Return the recording of some of the recorded flights; see `FlightTask`."""
         pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
         flown = dataclasses.replace(
             flights.flown,

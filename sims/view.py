@@ -1,7 +1,7 @@
-"""A browser viewer of recorded flights: play, scrub, speed, and a choice of flights.
+"""A browser viewer of recorded flights, with time slider, speed and a choice of flights.
 
-Needs the extra `view`. What is to be seen at a look says `recording.frame`; here it is only
-shown. The server plays whether or not a browser looks on.
+It needs the extra `view`. `recording.frame` computes what is visible at a sample; this module only
+displays it. The server plays whether or not a browser is connected.
 """
 
 import errno
@@ -25,27 +25,30 @@ from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
 
-_RATE = 30.0  # [Hz], of playing
-_STEP = 0.01  # [s], of the slider
+_RATE = 30.0  # [Hz], of the displayed frames
+_STEP = 0.01  # [s], of the time slider
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
-    """Of #RRGGBB."""
+    """Convert #RRGGBB to bytes."""
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     return red, green, blue
 
 
 def segments(path: np.ndarray) -> np.ndarray:
-    """The pieces (S, 2, 3) of a path (M, 3) between points that are both there (not NaN)."""
+    """Return the segments (S, 2, 3) of a path (M, 3) between consecutive finite points."""
     pairs = np.stack([path[:-1], path[1:]], axis=1)
     return pairs[np.isfinite(pairs).all(axis=(1, 2))]
 
 
 def free_address(host: str, port: int) -> str:
-    """The numeric address of a host of this machine whose port is free; 0 stands for any.
+    """Return the numeric address of a host name of this machine whose port is free.
+
+    Port 0 stands for any free port.
 
     Raises:
-        ArgumentError: there is none; one line that begins with `host` or `port`.
+        ArgumentError: there is no such address, or the port is taken; one line that begins with
+            `host` or `port`.
     """
     require(0 <= port <= 65535, "port", ">= 0 and <= 65535", port)
     own = ArgumentError("host", "an address of this machine", host)
@@ -65,7 +68,7 @@ def free_address(host: str, port: int) -> str:
 
 
 def _viser() -> Any:
-    """The package.
+    """Return the package viser.
 
     Raises:
         ArgumentError: it is not installed.
@@ -77,28 +80,29 @@ def _viser() -> Any:
 
 
 class Viewer:
-    """A server that shows one flight of a recording at one time.
+    """A server that displays one flight of a recording at a time.
 
     Attributes:
-        url: of the page; beyond this machine with the token that is asked for.
+        url: of the page, with the access token if the host is not the loopback address.
         flight: choice of the flight; its `value` is one of the task's titles.
-        time: slider; its `value` [s] is the time that is shown.
+        time: slider; its `value` [s] is the displayed time.
         playing: check box.
         speed: slider; 1 is real time.
-        reach: check box, whether to show where the robot could be; None if the task cannot say.
-        robot: the places of the robot's shapes in the scene.
+        reach: check box, whether to show where the robot could be; None if the task cannot compute
+            it.
+        robot: frames of the robot's shapes in the scene.
     """
 
     def __init__(
         self, task: FlightTask, recording: Recording, host: str = "localhost", port: int = 8080
     ):
-        """Start to serve and to show the first flight.
+        """Start the server, and display the first flight.
 
         Args:
             task: that was flown.
             recording: of the flights.
-            host: name or address of this machine, under which the page is served.
-            port: 0 takes any that is free.
+            host: name or address of this machine, at which the page is served.
+            port: 0 selects any free port.
 
         Raises:
             ArgumentError: viser is missing, or the page cannot be served there.
@@ -115,7 +119,7 @@ class Viewer:
             self._server.stop()
             raise ArgumentError("viser", "a version that can be guarded", shown="another one")
         bound = self._server.get_port()
-        if port and bound != port:  # someone was faster
+        if port and bound != port:  # another process took the port
             self._server.stop()
             raise ArgumentError("port", "free", port)
         self.url = f"http://{f'[{host}]' if ':' in host else host}:{bound}"
@@ -142,7 +146,7 @@ class Viewer:
 
     @property
     def look(self) -> int:
-        """The look that is shown."""
+        """The index of the displayed sample."""
         times = self.recording.time[self._row]
         nearest = int(np.argmin(np.abs(times - self.time.value)))
         return min(nearest, self.recording.num_looks(self._row) - 1)
@@ -152,13 +156,13 @@ class Viewer:
         return self._titles.index(self.flight.value)
 
     def advance(self, seconds: float) -> None:
-        """Play for a while [s] of the clock; from the start again once the end is passed."""
+        """Play for a time [s]; start again at the beginning once the end is passed."""
         if self.playing.value:
             later = self.time.value + seconds * self.speed.value
             self.time.value = later if later <= self.time.max else self.time.min
 
     def run(self) -> None:
-        """Play until Ctrl-C, then stop serving."""
+        """Play until Ctrl-C, then stop the server."""
         try:
             before = time.monotonic()
             while True:
@@ -172,11 +176,11 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Stop serving."""
+        """Stop the server."""
         self._server.stop()
 
     def _stand(self) -> None:
-        """What is the same for all flights: ground, scenery, robot, balls and their trails."""
+        """Add what all flights share: ground, scenery, robot, balls and their trails."""
         add = self._scene
         add.set_up_direction("+z")
         add.add_grid(
@@ -241,7 +245,7 @@ class Viewer:
         return drawn
 
     def _draw_flight(self) -> None:
-        """What does not move in the flight that is chosen; then its first look."""
+        """Draw the fixed objects of the selected flight, and then its first sample."""
         with self._lock, self._server.atomic():
             recording, row = self.recording, self._row
             for part in self._drawn:
@@ -289,7 +293,7 @@ class Viewer:
             self._show()
 
     def _show(self) -> None:
-        """The moving parts at the time of the slider."""
+        """Draw the moving objects at the time of the slider."""
         with self._lock, self._server.atomic():
             row, look = self._row, self.look
             robot = self.world.robot

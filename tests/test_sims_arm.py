@@ -264,7 +264,7 @@ def test_arms_that_only_see_their_balls_do_what_they_decided_on():
         cases=jax.tree.map(jnp.asarray, cases.cases),
         plans=plan,
         fits=batch(*[sight.fits for sight in sights]),
-        begun=jnp.asarray(none),
+        start=jnp.asarray(none),
         motions=jnp.asarray(2 + np.arange(LANES)),
     )
     found = fly_blocks(BLOCK_WORLD, cases, decided=decided, planning_budget=0.05)
@@ -389,7 +389,7 @@ def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, ca
         ),
         (
             lambda: BlockFly(perception=True, planner="library:some.lib"),
-            "planner must be one that plans for the very ball, got 'library:some.lib'",
+            "planner must be one other than 'library' with perception, got 'library:some.lib'",
         ),
         (lambda: BlockFly(encoders="no"), "encoders must be one of none, fine, coarse, got 'no'"),
         (lambda: BlockFly(regime="R4"), "regime must be one of R1, R2, R3, got 'R4'"),

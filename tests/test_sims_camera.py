@@ -90,7 +90,7 @@ def test_no_opengl_is_one_line(monkeypatch):
         raise ImportError("no library\nmore of it")
 
     monkeypatch.setattr(scene_camera, "_context_class", lambda: none)
-    with pytest.raises(RenderError, match="images need an OpenGL .*: no library$") as caught:
+    with pytest.raises(RenderError, match="images need OpenGL .*: no library$") as caught:
         SceneCamera(CAMERA, paper_scene())
     assert "\n" not in str(caught.value)
 

@@ -344,7 +344,7 @@ def test_a_lost_look_shows_nothing():
         (lambda: Loop(CATCH_WORLD, replan=-1.0), "replan must be >= 0, got -1"),
         (
             lambda: Loop(CATCH_WORLD, replan=30.0),
-            "replan must be a divisor of the looks' 100 Hz, got 30",
+            "replan must be a divisor of the observations' 100 Hz, got 30",
         ),
         (
             lambda: Loop(CATCH_WORLD, Sensing(rate=300.0)),
@@ -352,7 +352,7 @@ def test_a_lost_look_shows_nothing():
         ),
         (
             lambda: Loop(CATCH_WORLD, Sensing(latency=0.015)),
-            "latency must be a multiple of the looks' 0.01 s, got 0.015",
+            "latency must be a multiple of the observations' 0.01 s, got 0.015",
         ),
         (lambda: dataclasses.replace(CATCH_WORLD, num_balls=-1), "num_balls must be >= 0, got -1"),
         (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0"),

@@ -41,7 +41,10 @@ from tests.recordings import recording
         ),
         (lambda: CatchFly(noise="loud"), "noise must be one of none, lab, harsh, got 'loud'"),
         (lambda: CatchFly(num=0), "num must be >= 1, got 0"),
-        (lambda: CatchFly(replan=30.0), "replan must be a divisor of the looks' 100 Hz, got 30"),
+        (
+            lambda: CatchFly(replan=30.0),
+            "replan must be a divisor of the observations' 100 Hz, got 30",
+        ),
         (
             lambda: CatchFly(balls=2, replan=100.0 / 3.0),
             "replan must be such that its period divides 0.8 s, got 33.3333",

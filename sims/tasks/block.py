@@ -1,4 +1,4 @@
-"""Runs of blocks in closed loop, as `planner-jax fly block` makes them; see `block_flights`."""
+"""Runs of blocks in closed loop, as in `planner-jax fly block`; `block_flights` flies them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -44,12 +44,12 @@ from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS
 
-_BOUNCE = 0.5  # restitution of a blocked ball, in pictures alone: an assumption
-_KEPT = 5  # frames from one that is recorded to the next
+_BOUNCE = 0.5  # restitution of a blocked ball, in pictures only: an assumption
+_KEPT = 5  # simulated frames per recorded sample
 
 
 class BlockFlight(FlightTask):
-    """Blocks as a run of flights knows them; the settings are `BlockFly`."""
+    """Blocks as a task of a run of flights; the settings are `BlockFly`."""
 
     settings: BlockFly
 
@@ -65,27 +65,27 @@ class BlockFlight(FlightTask):
         *leaves_of(
             "verdict",
             ("planned", "", "whether there was a plan", BOOL),
-            ("blocked", "", "on the shield's face before it was in the inner box", BOOL),
-            ("contact_time", "s", "of the ball with the shield; NaN without", NUMBER, "contact"),
-            ("miss", "m", "of the ball from the shield's middle in its plane; NaN if too late"),
-            ("struck", "", "whether the ball touched base or links 1 to 3 before", BOOL),
+            ("blocked", "", "whether the shield's face met the ball before the inner box", BOOL),
+            ("contact_time", "s", "of ball and shield; NaN without contact", NUMBER, "contact"),
+            ("miss", "m", "of the ball from the shield's centre, in its plane; NaN if too late"),
+            ("struck", "", "whether the ball hit base or links 1 to 3 before the contact", BOOL),
             ("clearance", "m", "least up to the contact; negative inside"),
-            ("nearest", "", "what came so near, and to what", TEXT),
-            ("clearance_after", "m", "least from then on, while the arm brakes"),
+            ("nearest", "", "link and obstacle at the least clearance", TEXT),
+            ("clearance_after", "m", "least after the contact, while the arm brakes"),
             (
                 "error_rms",
                 "rad",
-                "of the six joints from what they were told",
+                "of the six joints from their commanded course",
                 LIST,
                 "flown.error_rms",
             ),
-            ("error_worst", "rad", "the same at worst", LIST, "flown.error_worst"),
+            ("error_worst", "rad", "greatest error of the six joints", LIST, "flown.error_worst"),
             ("torque_rms", "N m", "of the six drives", LIST, "flown.torque_rms"),
             ("torque_worst", "N m", "of the six drives", LIST, "flown.torque_worst"),
             ("saturated", "1", "share of the time at the torque limit", LIST, "flown.saturation"),
-            ("motions", "", "that the arm began", NUMBER),
-            ("fit_error", "m", "of the flight as first seen; NaN if it is known", NUMBER),
-            ("last_fit_error", "m", "of the flight as last seen; NaN if it is known", NUMBER),
+            ("motions", "", "number of motions that the arm started", NUMBER),
+            ("fit_error", "m", "of the first fit of the ball's flight; NaN if known", NUMBER),
+            ("last_fit_error", "m", "of the last fit of the ball's flight; NaN if known", NUMBER),
         ),
         *(
             Column(f"time_{name}", "s", BUDGET[name], NUMBER, lambda b, n=name: _part(b, n))
@@ -94,13 +94,13 @@ class BlockFlight(FlightTask):
     )
 
     def world(self) -> World:
-        """Return the arm, and what stands around it."""
+        """Return the world with the arm and its surroundings."""
         return dataclasses.replace(
             BLOCK_WORLD, scenery=scenery(BLOCK_ARM.arm, SUITES[self.suite].has_pole)
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return drives, encoders and control."""
+        """Return the parameters of drives, encoders and control."""
         robot = BLOCK_ARM
         return {
             "drives": dataclasses.asdict(self.settings.drives),
@@ -122,7 +122,7 @@ class BlockFlight(FlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
-        """Return blocks of some balls; they are recorded in any case."""
+        """Fly blocks of some balls, and return the result; it always includes a record."""
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
@@ -177,7 +177,7 @@ class BlockFlight(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Times, drives and encoders."""
+        """Times for sensing and planning, drives and encoders, as the beginning of a sentence."""
         settings = self.settings
         meeting = "wide" if settings.wide else "strict"
         return (
@@ -185,26 +185,26 @@ class BlockFlight(FlightTask):
             f"and {1e3 * settings.until_set:g} ms for planning; torques "
             f"{100 * settings.torque:g} % with a lag of {1e3 * settings.lag:g} ms, plans "
             f"{1e3 * settings.latency:g} ms late, "
-            f"encoders {settings.encoders}, masses believed {100 * settings.mass_error:g} % wrong"
+            f"encoders {settings.encoders}, {100 * settings.mass_error:g} % error of the masses"
         )
 
     @property
     def simulated(self) -> str:
-        """The arm; the ball falls."""
+        """Arm and balls, for the report of a run."""
         settings = self.settings
         if not settings.perception:
-            return f"{BLOCK_ARM.WORDS}; balls fall freely, as if they had been seen exactly"
+            return f"{BLOCK_ARM.WORDS}; balls fall freely and are known exactly"
         noise = (
             f"{100 * settings.noise:g} cm of noise" if settings.noise else "a stereo camera's noise"
         )
-        again = f"anew at {settings.rate:g} Hz" if settings.rate else "once"
+        again = f"planned at {settings.rate:g} Hz" if settings.rate else "planned once"
         return (
-            f"{BLOCK_ARM.WORDS}; balls fall freely, seen at {settings.frame_rate:g} Hz with "
-            f"{noise}, and decided on {again}, as if planning never took longer than it may"
+            f"{BLOCK_ARM.WORDS}; balls fall freely and are observed at {settings.frame_rate:g} Hz "
+            f"with {noise}; motions are {again}, as if planning never exceeded its time limit"
         )
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return plans, contacts, misses, torques and times."""
+        """Return numbers of plans and contacts, misses, torques and times."""
         planned, miss = np.asarray(rows["planned"]), np.asarray(rows["miss"])
         blocked = np.asarray(rows["blocked"])
         late = np.asarray(rows["time_plan"]) > self.settings.until_set
@@ -234,7 +234,7 @@ class BlockFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return plans and blocks; contacts; torques."""
+        """Return sentences about plans and blocks, contacts, and torques."""
         number = summary["num"]
         planned, blocked, touched, after, late = (
             percent(summary[name], number)
@@ -253,24 +253,24 @@ class BlockFlight(FlightTask):
         if summary["fit_error_median"] is not None:
             first, last = (100 * summary[f"{name}fit_error_median"] for name in ("", "last_"))
             lines.append(
-                f"The flight as it was first seen was {first:.1f} cm off midway between the boxes "
-                f"in the median, as it was last seen {last:.1f} cm; arms began "
+                f"Midway between the boxes, the first fit of the flight was {first:.1f} cm off in "
+                f"the median, the last fit {last:.1f} cm; arms started "
                 f"{summary['motions'] / number:.1f} motions each."
             )
         worst, share = summary["torque_worst"], summary["saturated"]
         lines.append(
-            f"Joints 1 to 3 took up to {worst[0]:.0f}, {worst[1]:.0f} and {worst[2]:.0f} N m, and "
+            f"Joints 1 to 3 used up to {worst[0]:.0f}, {worst[1]:.0f} and {worst[2]:.0f} N m, and "
             f"were at their limit {100 * share[0]:.1f}, {100 * share[1]:.1f} and "
             f"{100 * share[2]:.1f} % of the time."
         )
         return lines
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return where the time of flight goes, and what the joints did."""
+        """Return the table of the time budget, and the table of the joints."""
         return [budget_table(rows), joint_table(rows)]
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Return the time budget of the first balls."""
+        """Draw the time budget of the first balls, and return the file name."""
         draw(folder / "budget.png", budget_figure, (8.0, 5.0), rows)
         return ["budget.png"]
 
@@ -280,7 +280,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Return places (F, S, 3) [m] of balls as they are drawn: on their way, and off the shield."""
+    """Return positions (F, S, 3) [m] of balls for drawing, in flight and after the shield."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

@@ -1,11 +1,11 @@
 """Blocks in closed loop: an arm with a shield executes plans against thrown balls [Natarajan2024].
 
-The ball's flight is known once it has been seen for a while; then a plan is made, by a clock on the
-wall, and the arm sets out when the time that plans are allowed is over, or later if its plan is
-not there by then. Its torques are limited, and nothing else but them moves it. What is counted is
-what the simulated arm does, in float64 and by the referee's geometry: balls fall along their
-parabola, so that they need no simulation. Times count from the moment at which the ball is first
-seen; places are in the robot's base frame, those of recordings in the world, the floor at height 0.
+The ball's flight is known after a time of observation. Then a plan is made, and its wall time is
+measured. The arm starts when the planning budget is over, or later if its plan is not ready by
+then. The torques are limited, and nothing else moves the arm. The score depends on the motion of
+the simulated arm, in float64 and with the referee's geometry. Balls follow their parabola and need
+no simulation. Times count from the moment at which the ball is first seen. Positions are in the
+robot's base frame; recordings are in the world frame, with the floor at height 0.
 """
 
 import dataclasses
@@ -39,10 +39,10 @@ from planner_jax.task.block.suites import draw as draw_throws
 
 BLOCK_ARM = ShieldArm(base_height=-FLOOR)
 BLOCK_WORLD = World(BLOCK_ARM, GRAVITY, num_balls=0, timestep=TIMESTEP)
-TOUCH = 1e-3  # [m] inside of something that is a contact, as the referee has it
-_AFTER = 0.3  # [s], that an arm is simulated after its contact: in it, joints brake
-_LANES = 64  # whose clearances are worked out at once
-FALL = np.array([0.0, 0.0, 1.0])
+TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
+_AFTER = 0.3  # [s], simulated time after the contact, in which the joints brake
+_LANES = 64  # batch size of the computation of clearances
+FALL = np.array([0.0, 0.0, 1.0])  # direction of the vertical
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,52 +54,55 @@ class Throws(FlightCases):
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Where the time until the contact goes, (B,) [s] each: eq. (1) of [Natarajan2024].
+    """Parts of the time until a ball enters the inner box, (B,) [s] [Natarajan2024, eq. 1].
 
-    The ball is blocked if the time of its flight is at least that of the others; what is planned
-    after the time that it is allowed makes the arm late.
+    The ball is blocked if its time of flight is at least the sum of the other times. A plan that
+    takes longer than the planning budget makes the arm late.
     """
 
     sense: np.ndarray  # until the ball's flight is known
-    plan: np.ndarray  # by the clock
-    wait: np.ndarray  # after the plan, until the arm starts
-    move: np.ndarray  # of the plan's motion
-    stand: np.ndarray  # after the motion, up to the planned contact; negative if it is too late
-    rest: np.ndarray  # from the planned contact until the ball gets into the inner box
+    plan: np.ndarray  # wall time of planning
+    wait: np.ndarray  # from the end of planning until the arm starts
+    move: np.ndarray  # duration of the plan's motion
+    # From the end of the motion to the planned contact; negative if the arm is late
+    stand: np.ndarray
+    rest: np.ndarray  # from the planned contact until the ball enters the inner box
 
     @property
     def flight(self) -> np.ndarray:
-        """Until the ball gets into the inner box, (B,) [s]."""
+        """The time until the ball enters the inner box, (B,) [s]."""
         return np.sum([getattr(self, field.name) for field in dataclasses.fields(self)], axis=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockFlights(Flights):
-    """What came of a batch of blocks; leaves with a leading axis B."""
+    """The result of a batch of blocks; leaves with a leading axis B."""
 
     flown: Executed
     budget: Budget
-    blocked: np.ndarray  # (B,) bool: on the face of the shield before it was in the inner box
-    contact: np.ndarray  # (B,) [s], of the ball with the shield; NaN without one
-    contact_pos: np.ndarray  # (B, 3) [m], of the ball's centre then; NaN likewise
-    miss: np.ndarray  # (B,) [m], of the ball from the shield's middle where it is in its plane
-    struck: np.ndarray  # (B,) bool, whether the ball touched base or links 1 to 3 before
+    blocked: np.ndarray  # (B,) bool: the shield's face met the ball before the inner box
+    contact: np.ndarray  # (B,) [s], of the ball with the shield; NaN without contact
+    contact_pos: np.ndarray  # (B, 3) [m], of the ball's centre then; NaN without contact
+    # (B,) [m], of the ball from the shield's centre, when it crosses the shield's plane
+    miss: np.ndarray
+    # (B,) bool, whether the ball touched base or links 1 to 3 before the contact
+    struck: np.ndarray
     clearance: np.ndarray  # (B,) [m], least up to the contact; negative inside
-    nearest: np.ndarray  # (B,) str, what came so near
-    clearance_after: np.ndarray  # (B,) [m], least from then on, while the arm brakes
+    nearest: np.ndarray  # (B,) str, link and obstacle at the least clearance
+    clearance_after: np.ndarray  # (B,) [m], least after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
-    motions: np.ndarray  # (B,) int, that were begun
-    fit_error: np.ndarray  # (B,) [m], across the flight as first seen; NaN if it is known
-    last_fit_error: np.ndarray  # (B,) [m], the same as last seen
+    motions: np.ndarray  # (B,) int, number of motions that the arm started
+    fit_error: np.ndarray  # (B,) [m], of the first fit, across the flight; NaN if it is known
+    last_fit_error: np.ndarray  # (B,) [m], of the last fit
 
     @property
     def touched(self) -> np.ndarray:
-        """Which arms ran into something before the contact, (B,) bool."""
+        """Whether each arm touched an obstacle before the contact, (B,) bool."""
         return self.clearance < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Which balls were blocked by an arm that touched nothing, (B,) bool."""
+        """Whether each ball was blocked by an arm that touched nothing, (B,) bool."""
         return self.blocked & ~self.touched
 
 
@@ -118,9 +121,9 @@ def throws(
 
 
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
-    """Return the courses of arms: their plans from the delay on; without a plan, a standstill.
+    """Return the courses of arms: their plans, which start after the delay, or a standstill.
 
-    Joints brake as hard as plans may speed them up.
+    Arms without a plan stand still. Joints brake with the acceleration limit of the plans.
     """
     coeffs = np.asarray(plans.motion.coeffs)
     solved = np.asarray(is_solved(plans.status))
@@ -146,23 +149,24 @@ def fly_blocks(
     seconds: np.ndarray | None = None,
     decided: Decided | None = None,
 ) -> BlockFlights:
-    """Plan and carry out a batch of blocks.
+    """Plan and execute a batch of blocks.
 
     Args:
         world: with an arm.
-        cases: what is thrown.
+        cases: the thrown balls.
         seed: of the noise of encoders, >= 0.
         drives: of the arm.
         planner: of all plans, by default `online`.
-        planning_budget: [s], the end of the delay, that plans may take; a plan that takes longer is
-            carried out as much later. None: planning takes no time.
-        plan: of each case, instead of one made here.
-        seconds: (B,) [s], that these took.
-        decided: what arms do that only see their balls, instead of plans; with the same delays.
+        planning_budget: [s], time for planning at the end of the delay; a plan that takes longer
+            starts later by the excess. None: planning takes no time.
+        plan: of each case, instead of plans that are made here.
+        seconds: (B,) [s], wall times of these plans.
+        decided: motions of arms that plan from observations of their balls, instead of plans; with
+            the same delays.
 
     Raises:
-        ValueError: the arm of the cases is not the one that is simulated, or plans are allowed
-            more than the delay.
+        ValueError: the arm of the cases is not the simulated one, or the planning budget exceeds
+            the delay.
     """
     case = cases.cases
     require_arm(world, case)
@@ -211,14 +215,14 @@ def fly_blocks(
 
 
 def require_arm(world: World, cases: BlockCase) -> None:
-    """Raise `ValueError` unless the simulated arm is the one that is planned for."""
+    """Raise `ValueError` unless the simulated arm is the one for which plans are made."""
     if not isinstance(world.robot, ShieldArm):
         raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     own = jax.tree.leaves_with_path(world.robot.arm)
     for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
         name = path[-1].name
         same = np.shape(planned)[1:] == np.shape(value)
-        # Each case says itself where its arm begins.
+        # Each case has its own start angles, so that the home position may differ.
         if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
             raise ArgumentError(name, "the same in plan and simulated arm", shown="")
 
@@ -229,31 +233,31 @@ def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
-    """Return when balls get into the inner box, (B,) [s]; infinite if never."""
-    with np.errstate(invalid="ignore"):  # of balls that never rise so high
+    """Return when balls enter the inner box, (B,) [s]; infinite if never."""
+    with np.errstate(invalid="ignore"):  # NaN for balls that never rise as high as the box
         begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return places (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
+    """Return positions (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
     pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
     fall = np.multiply.outer(FALL, case["gravity"])[..., None]
     return pos + vel * times - 0.5 * fall * times**2
 
 
 def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
-    """Compare flown motions with the balls and all obstacles, in float64.
+    """Compare simulated motions with the balls and all obstacles, in float64.
 
     A ball is blocked when it comes down on the face of the shield, from in front and with its
-    centre over the face, before its centre is in the inner box and before it touches the arm. Miss
-    is how far from the middle it is there, or where it passes the shield's plane otherwise; it is
-    NaN where it does not come to it in time.
+    centre over the face, before its centre is in the inner box and before it touches the arm. The
+    miss is its distance from the shield's centre then. Otherwise the miss is this distance where
+    the ball crosses the shield's plane; it is NaN if the ball does not cross the plane in time.
 
     Args:
         cases: leaves (B, ...).
-        plans: of them.
-        flown: the motions.
+        plans: of the cases.
+        flown: the simulated motions.
         budget: the times.
     """
     case, times = referee_leaves(cases), flown.times
@@ -309,9 +313,10 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
 def _strikes(
     case: dict[str, np.ndarray], links: Sequence[int], turns: list, places: list, ball: np.ndarray
 ) -> np.ndarray:
-    """Return which balls touch the base or links 1 to 3 at which frame, (B, S) bool.
+    """Return whether each ball touches the base or links 1 to 3 in each frame, (B, S) bool.
 
-    The capsules of the wrist behind the shield bulge out of its face, where the links do not.
+    The wrist is left out: its capsules protrude through the shield's face, but the real links do
+    not.
     """
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
@@ -326,20 +331,20 @@ def _strikes(
 
 
 def _least(
-    case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, looked: np.ndarray
+    case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least clearance (B,) [m] of arms at frames, and the nearest obstacle.
+    """Return the least clearance (B,) [m] over the included frames, and the nearest obstacle.
 
-    It is infinite where no frame is looked at.
+    The clearance is infinite where no frame is included.
     """
     least, names = [], []
-    for begin in range(0, len(looked), _LANES):
+    for begin in range(0, len(included), _LANES):
         some = slice(begin, begin + _LANES)
         own = {name: leaf[some] for name, leaf in case.items()}
-        found = clearances(own, links, angles[:, some], looked[some])
+        found = clearances(own, links, angles[:, some], included[some])
         distances = np.stack([distance for distance, _, _ in found.values()])
         which, lanes = distances.argmin(axis=0), np.arange(distances.shape[1])
         parts = np.stack([np.char.add(part, f", {kind}") for kind, (_, _, part) in found.items()])
         least.append(distances[which, lanes])
         names.append(parts[which, lanes])
-    return np.where(looked.any(axis=1), np.concatenate(least), np.inf), np.concatenate(names)
+    return np.where(included.any(axis=1), np.concatenate(least), np.inf), np.concatenate(names)

@@ -1,4 +1,4 @@
-"""How blocks are shown: the scene around the arm, the time budget, what the joints did."""
+"""Presentation of blocks: the scene around the arm, the time budget, and tables of the joints."""
 
 from typing import Any
 
@@ -10,34 +10,34 @@ from planner_jax.runs.table import RateTable
 from planner_jax.sims.scenery import Part
 from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
-_POLE = 3.0  # [m], of the pole as it is drawn
-_BARS = 32  # balls at most, in the picture of the time budget
-# What becomes of the time of flight, the parts of `Budget`.
+_POLE = 3.0  # [m], height of the drawn pole
+_BARS = 32  # greatest number of balls in the picture of the time budget
+# Descriptions of the parts of `Budget`, which add up to the time of flight.
 BUDGET = {
     "sense": "until the ball's flight is known",
-    "plan": "making the plan, by the clock",
-    "wait": "of what planning is allowed, left over",
+    "plan": "wall time of planning",
+    "wait": "unused part of the planning budget",
     "move": "the plan's motion",
-    "stand": "at its end, until the planned contact",
-    "rest": "from there until the ball is in the inner box",
+    "stand": "from its end until the planned contact",
+    "rest": "from the planned contact until the ball is in the inner box",
 }
 
 
 def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
-    """Return a box of the scene as it is drawn, in the world."""
+    """Return a box of the scene as a part for drawing, in the world frame."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
     return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)
 
 
 def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    """Return corners (2, 3) [m] of the box around a beam along an axis, of two ends (2, 3)."""
+    """Return corners (2, 3) [m] of the box around an axis-aligned beam with two ends (2, 3)."""
     across = radius * (ends[0] == ends[1])
     return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return both boxes, the beams, what the arm stands on and the pole, as they are drawn."""
+    """Return parts for drawing: both boxes, the beams, the arm's pedestal and the pole."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
@@ -55,7 +55,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Return where the time of flight goes: eq. (1) of [Natarajan2024], from the rows of a run."""
+    """Return the table of the time budget [Natarajan2024, eq. 1] from the rows of a run."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -64,12 +64,12 @@ def budget_table(rows: Any) -> RateTable:
         figures = [values.mean(), *np.quantile(values, (0.1, 0.5, 0.9))] if values.size else []
         words = f"{name}: {BUDGET[name]}" if name in BUDGET else name
         cells.append([words, *(f"{figure:.1f}" for figure in figures)])
-    title = "Time until the ball gets into the inner box, of balls with a plan [ms]"
+    title = "Time until the ball enters the inner box, of balls with a plan [ms]"
     return RateTable(title, ["part", "mean", "10 %", "median", "90 %"], cells)
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Return errors and torques of the joints of arms with a plan."""
+    """Return the table of joint errors and torques of arms with a plan."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:
@@ -97,7 +97,7 @@ def joint_table(rows: Any) -> RateTable:
 
 
 def budget_figure(figure: Any, rows: Any) -> None:
-    """Return a bar a ball, from when it is first seen until it gets into the inner box."""
+    """Draw one bar per ball, from the first sight of the ball until it enters the inner box."""
     axes = figure.add_subplot()
     number = min(len(rows), _BARS)
     flights = np.arange(number)
@@ -105,7 +105,7 @@ def budget_figure(figure: Any, rows: Any) -> None:
     for name, colour in zip(BUDGET, (PURPLE, RED, PALE, BLUE, GREEN, SKY), strict=True):
         width = 1e3 * np.asarray(rows[f"time_{name}"])[:number]
         axes.barh(flights, np.maximum(width, 0.0), 0.8, left, color=colour, label=name)
-        left += width  # negative where an arm moves beyond the planned contact
+        left += width  # negative where an arm still moves at the planned contact
     contact = 1e3 * np.asarray(rows["contact_time"])[:number]
     axes.plot(contact, flights, "|", color=INK, ms=9, label="blocked")
     axes.set_yticks([])

@@ -1,9 +1,9 @@
-"""Catches in flight: one to three balls, thrown a service interval apart [Yu2023catch].
+"""Catches in closed loop: one or more balls, thrown at equal intervals [Yu2023catch].
 
-When a ball comes into sight the one before it is about to be caught, and the state in which that
-leaves the quadrotor decides whether the next catch is possible. So every plan has one more catch
-than there are balls: the next one is awaited as the shortest throw that the machine makes, which
-leaves the least time, and is planned anew once it is seen.
+When a ball comes into sight, the previous one is about to be caught. The state of the quadrotor
+after that catch decides whether the next catch is possible. So every plan includes one more catch
+than there are visible balls. The next ball is assumed to be the shortest throw of the machine,
+which leaves the least time, and is planned again once it is seen.
 """
 
 import dataclasses
@@ -49,17 +49,17 @@ from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
-from planner_jax.task.hit.spec import DRAG  # of the published serves; [Yu2023catch] gives none
+from planner_jax.task.hit.spec import DRAG  # of the published serves; [Yu2023catch] has no value
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-SEEN = 0.3  # [s], a throw's flight before it is planned for: 2 m and more [Yu2023catch, VII-A]
-_AFTER = 0.05  # [s] flown after the last ball has come down to where it may be caught
+SEEN = 0.3  # [s], flight of a throw before its first plan: 2 m and more [Yu2023catch, VII-A]
+_AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 
 
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """The planner with guesses for flights, where it is `exact` behind a decision."""
+    """Return the planner with higher initial thrusts if it is `exact` behind a decision."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -68,12 +68,15 @@ def _steadier(
 
 @dataclasses.dataclass(frozen=True)
 class Throws(FlightCases):
-    """B flights of N balls each, NumPy leaves. A ball's own time begins when it is planned for."""
+    """B flights of N balls each, NumPy leaves.
+
+    A ball's own time 0 is the start of the plan for it.
+    """
 
     balls: BallState  # leaves (B, N, 3), each at its own time 0
-    horizon: np.ndarray  # (B, N) [s], until when each may be caught, its own time
+    horizon: np.ndarray  # (B, N) [s], last time at which each ball may be caught, in its own time
     drag: np.ndarray  # (B, N) K_D [1/m], the true one
-    believed: np.ndarray  # (B, N) K_D [1/m]
+    believed: np.ndarray  # (B, N) K_D [1/m], initial estimate
     gravity: np.ndarray  # (B,) [m/s^2], magnitude
     net_height: np.ndarray  # (B,) [m], of the hoop above the propeller plane
     net_radius: np.ndarray  # (B,) [m]
@@ -88,14 +91,14 @@ def throws(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_CATCHER,
 ) -> Throws:
-    """Balls of the suite `throws`, which from there on fly with quadratic drag.
+    """Return balls of the suite `throws`, which fly with quadratic drag.
 
     Args:
         num: B >= 1.
         num_balls: N, 1 to 3 in the paper.
         seed: >= 0, of the throws and of the signs of the drag's errors.
         drag: K_D [1/m], the true one.
-        drag_error: relative error of what is believed of it, either way.
+        drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: with a net.
     """
     if num_balls < 1:
@@ -120,16 +123,16 @@ def throws(
 
 
 class CatchFlights(Flights):
-    """What came of a batch of throws; leaves with a leading axis B."""
+    """The result of a batch of throws; leaves with a leading axis B."""
 
     @property
     def caught(self) -> np.ndarray:
-        """Which balls fell into the net, (B, N) bool."""
+        """Whether each ball fell into the net, (B, N) bool."""
         return np.asarray(self.flown.contact.met)
 
     @property
     def success(self) -> np.ndarray:
-        """Which flights caught all balls, (B,) bool."""
+        """Whether each flight caught all balls, (B,) bool."""
         return np.all(self.caught, axis=1)
 
 
@@ -144,20 +147,20 @@ def fly_catches(
 ) -> CatchFlights:
     """Plan and fly a batch of throws.
 
-    Whenever a ball comes into sight, its catch and that of the one awaited next are planned from
-    scratch (`plan_ahead`), from where the last of those seen before will have been made; all
-    that are left are then re-planned inside the loop.
+    Whenever a ball comes into sight, its catch and the next, awaited catch are planned from scratch
+    (`plan_ahead`). The plan starts where the last catch of an earlier ball will be made. Inside the
+    loop, all remaining catches are then replanned.
 
     Args:
         loop: world, sensing, rates and gains.
         cases: the balls.
         seed: of the noise, >= 0.
-        planner: of the plans from scratch, by default `exact` that decides greedily.
-        pilot: of the plans in between.
-        plan: first plan of each flight, of the first ball, instead of one made here.
+        planner: of the plans from scratch, by default `exact` with greedy decisions.
+        pilot: of the replanning in between.
+        plan: first plan of each flight, for the first ball, instead of a plan that is made here.
 
     Raises:
-        ValueError: a world, plan or number does not fit.
+        ValueError: the world, the plan or the number of balls does not fit.
     """
     num_balls = cases.horizon.shape[1]
     sizes = {name: getattr(cases, name) for name in ("gravity", "net_height", "net_radius")}
@@ -197,7 +200,7 @@ def fly_catches(
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
             limits = [bounds(loop, each) for each in LIMITS]
-            if ball == 0 and not last and in_parts(flight):  # some lanes will need all attempts
+            if ball == 0 and not last and in_parts(flight):  # some lanes need all attempts
                 compile_attempts(planner, known)
             known, found = plan_ahead(planner, known, ball, limits)
             planning += time.perf_counter() - began
@@ -218,7 +221,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """Catches as a run of flights knows them; the settings are `CatchFly`."""
+    """Catches as a task of a run of flights; the settings are `CatchFly`."""
 
     settings: CatchFly
 
@@ -228,17 +231,17 @@ class CatchFlight(BallFlightTask):
     COLUMNS = (Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),)
 
     def world(self) -> World:
-        """The simulated world, with as many balls as are thrown."""
+        """Return the simulated world, with the number of balls of the settings."""
         robot = Quadrotor(self.robot)
         return dataclasses.replace(CATCH_WORLD, robot=robot, num_balls=self.settings.balls)
 
     @property
     def robot(self) -> QuadrotorModel:
-        """Which quadrotor flies."""
+        """The model of the quadrotor."""
         return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:
-        """All throws of the run."""
+        """Return all throws of the run."""
         settings = self.settings
         return throws(
             settings.num,
@@ -249,7 +252,7 @@ class CatchFlight(BallFlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
-        """Flights of some throws."""
+        """Fly some throws, and return the result."""
         settings = self.settings
         return fly_catches(
             self.loop(record),
@@ -260,15 +263,15 @@ class CatchFlight(BallFlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Those of the closed loop, and the rate of deciding anew."""
+        """Return the parameters of the closed loop, and the rate of new decisions."""
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """The throws; no ball comes back."""
+        """Return the throws; no ball comes back."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 
     @property
     def suite(self) -> str:
-        """How many balls are thrown."""
+        """The number of balls per flight."""
         return "1 ball" if self.settings.balls == 1 else f"{self.settings.balls} balls"

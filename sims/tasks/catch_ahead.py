@@ -1,4 +1,4 @@
-"""Catches planned ahead: of a ball that comes into sight and of the next one."""
+"""Plans from scratch for a ball that comes into sight and for the next ball."""
 
 import dataclasses
 import functools
@@ -26,29 +26,30 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.plan import CatchPlan
 
-_AIM = 0.4  # share of the net's radius that plans are made for; the rest is left for errors
-# How far plans stay from the robot's least thrust, of the way from there to hover, and their share
-# of its body rate. A weak thrust and a fast turn leave control little; the first catch stays away
-# from them, so that the next can begin within bounds. Plans of later catches begin with the second
-# limits. Where no plan keeps them, the next ones count; the last are as wide as the robot's own.
+_AIM = 0.4  # share of the net's radius that plans use; the remainder is a margin for errors
+# Limits of plans, from tight to the robot's own. Each pair has the margin above the robot's least
+# thrust, as a share of the range from there to hover, and a share of the robot's body rate limit.
+# Weak thrusts and fast rotations leave little control authority. Plans of the first catch start
+# with the first pair, so that the next plan can start within its limits; plans of later catches
+# start with the second pair. Where no plan satisfies a pair, the next pair is used.
 LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
-    """What is believed of a ball that has come into sight and of the next one, to be planned.
+    """Return the predicted cases of a ball that has come into sight and of the next ball.
 
-    The plans begin where and when the last catch of a ball seen before will have been made, or
-    now where no such catch is left; times count from there.
+    A plan starts at the last catch of an earlier ball, or now if no such catch is left. Times of
+    the case count from there.
 
     Args:
         loop: of the flights.
         flights: leaves (B, ...).
         new: (N,) bool, the balls that are to be planned.
-        horizon: (B, N) [s] from now, until when each may be caught.
+        horizon: (B, N) [s] from now, last time at which each ball may be caught.
     """
     robot = loop.world.carrier
-    # Their targets are those that are seen, filled in below.
+    # The predicted targets are filled in below.
     zeros = jnp.zeros((*horizon.shape, 3), horizon.dtype)
     nowhere = BallPath(BallState(zeros, zeros), drag=zeros, gravity=zeros[..., 0])
     empty = catch_case(
@@ -81,20 +82,23 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
 
 
 def until_last_catch(flight: FlightState, new: Array) -> Array:
-    """Time () [s] to the last catch that is planned of balls not `new` (N,); 0 if none is left."""
+    """Return the time () [s] to the last planned catch of balls that are not `new` (N,).
+
+    It is 0 if none is left.
+    """
     planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
     return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)
 
 
 @jax.jit
 def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
-    """Flights (B, ...) whose plans go on with new catches after those of the balls seen before.
+    """Return flights (B, ...) whose plans continue with catches of new balls.
 
-    Where a ball seen before is still to be caught, the new plan is appended to the one that is
-    flown, after its last such catch. Elsewhere the new plan is flown alone, from now on.
+    Where an earlier ball is still to be caught, the new plan is appended to the current plan, after
+    the last such catch. Elsewhere the new plan is flown alone, from now on.
 
     Args:
-        flights: the ones for which `predict_case` was called.
+        flights: the same that were passed to `predict_case`.
         found: plans (B, ...) of the cases that it returned.
         new: (B, N) bool, the balls that `found` catches.
     """
@@ -107,14 +111,14 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
         used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # How many catches of the old plan are kept, those already made included. The catch that
-        # was only awaited comes last in the old plan; the found plan replaces it.
+        # The number of catches of the old plan that stay, past ones included. The awaited catch
+        # comes last in the old plan; the found plan replaces it.
         num_kept = jnp.sum(used & ~new[old.order])
         place = jnp.arange(number)
         kept = place < num_kept
 
         def behind(old: Array, found: Array) -> Array:
-            """Rows (N, ...), one a catch: those kept of the old plan, then the found plan's."""
+            """Return rows (N, ...), one per catch: first of the old plan, then of the new one."""
             rows = jnp.where(kept, 0, place - num_kept)
             shape = (number, *(1,) * (old.ndim - 1))
             return jnp.where(kept.reshape(shape), old, found[rows])
@@ -144,9 +148,11 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """The driver that makes all attempts of a planner at the same time, needed or not."""
+    """A driver that makes all attempts of a planner concurrently, needed or not."""
 
-    watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))  # no more is started
+    watch: Watch = dataclasses.field(
+        default_factory=lambda: Watch(0.0)
+    )  # starts no further attempts
 
     def __call__(
         self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
@@ -162,10 +168,10 @@ class _EveryAttempt(Driver):
 
 
 def compile_attempts(planner: Planner, cases: Any) -> None:
-    """Compile all that plans of a batch may need, with a thread for each attempt.
+    """Compile all programs that plans of a batch may need, with one thread for each attempt.
 
-    `plan` compiles an attempt as soon as the one before has left something unsolved. Some throws
-    need all attempts, and to compile one after another would take several times as long.
+    `plan` compiles an attempt only when the previous one has left cases unsolved. Some throws need
+    all attempts, and compiling one after another would take several times as long.
     """
     _EveryAttempt()(planner, cases)
 
@@ -176,22 +182,22 @@ def plan_ahead(
     ball: int,
     limits: Sequence[dict[str, Any]],
 ) -> tuple[CatchCase, CatchPlan]:
-    """Plans from scratch that catch a ball and, where that is possible too, the next one.
+    """Plan from scratch to catch a ball and, where possible, also the next one.
 
-    Where no plan of both is found within the limits, both are planned for within wider ones:
-    what catches the ball alone leaves the quadrotor where the next may be out of reach. Where that
-    breaks a limit by more than is flown in the loop, the ball is planned for alone, and if nothing
-    is solved, the plan of it that breaks its limits least is left.
+    Where no plan of both satisfies the limits, both are planned with wider limits: a plan for the
+    ball alone may leave the quadrotor where it cannot reach the next one. Where even that plan
+    breaks a limit by more than the loop would fly, the ball is planned alone. If nothing is solved,
+    the plan for the ball with the least violation is returned.
 
     Args:
-        planner: of catches, which also decides about their order.
+        planner: of catches, which also decides their order.
         known: of both balls, or of the last one, a batch with NumPy leaves.
-        ball: its place among the targets.
-        limits: ever wider ones, as `bounds` has them, of which the first are those of `known` for
-            the first ball and the second those for the others.
+        ball: its index among the targets.
+        limits: increasingly wide limits, as returned by `bounds`. `known` has the first ones for
+            the first ball, and the second ones for the others.
 
     Returns:
-        The cases and their plans; `present` says which catches each has.
+        The cases and their plans; `present` marks the balls that each plan catches.
     """
     alone = np.arange(known.num_targets) == ball
     both = np.ones_like(alone)
@@ -225,7 +231,7 @@ def plan_ahead(
 
 
 def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Cases with NumPy leaves with other limits, as `bounds` has them."""
+    """Return cases with NumPy leaves and other limits, as returned by `bounds`."""
     if limits is None:
         return cases
     leaves = {
@@ -235,7 +241,7 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Least thrust [m/s^2] and greatest body rate [rad/s] of plans, as `LIMITS` has them."""
+    """Return least thrust [m/s^2] and greatest body rate [rad/s] for a pair of `LIMITS`."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance

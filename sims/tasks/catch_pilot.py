@@ -1,4 +1,4 @@
-"""Catches planned anew during a flight."""
+"""Replanning of catches during a flight."""
 
 import dataclasses
 import functools
@@ -23,48 +23,47 @@ from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 
 _TABLE_NODES = 36
-BORNE = 0.1  # share of a limit by which a plan may break it and is still flown
-_KEPT = 0.01  # relative excess up to which limits count as kept by a plan of the loop
-_CHEAPER = 0.95  # share of the cost below which a plan from scratch replaces one that keeps them
-_INSTANT = 1e-3  # [s], shorter than any look
-LIFT = 0.1  # of guesses in flight, at every catch: a little more thrust than the weight
+BORNE = 0.1  # greatest relative violation of a limit by a plan that is flown
+_KEPT = 0.01  # relative violation up to which a plan of the loop counts as feasible
+_CHEAPER = 0.95  # cost ratio below which a plan from scratch replaces a feasible warm-started one
+_INSTANT = 1e-3  # [s], shorter than any observation period
+LIFT = 0.1  # thrust at every catch in guesses of plans: 0 is hover, 1 the greatest thrust
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """Plans catches anew from the plan that is flown, and from order and times decided anew."""
+    """Replans catches from the current plan, and from new decisions of order and times."""
 
-    # Later than 0.2 s before a catch a new plan shakes more than the news of the ball is worth.
+    # In the last 0.2 s before a catch, changing the plan costs more accuracy than new observations
+    # of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # By which share of a limit a new plan may break it and is still flown; one that breaks it by
-    # more is flown only if the old plan breaks its limits by as much. The first share holds for
-    # the last catch, the second while several are left: then most of the excess lies on the
-    # way to catches that will be planned from scratch later, and keeping the old plan would miss
-    # the ball that comes first.
+    # Greatest relative violation of a limit by a new plan that is flown. A new plan with a greater
+    # violation is flown only if the old plan violates its limits at least as much. The first value
+    # holds for the last catch, the second while several are left. In the second case most of the
+    # violation lies in later catches, which will be planned again from scratch. Rejecting the new
+    # plan would miss the ball that comes first.
     excess: tuple[float, float] = (BORNE, 1.0)
-    # The name of a decision about catches, or "policy:FILE"; "given" keeps order and times of the
-    # plan that is flown, and only its way is searched for from scratch.
+    # The name of a method of deciding, or "policy:FILE". With "given", order and times of the
+    # current plan stay, and only the trajectory is planned from scratch.
     decide: str = "greedy"
-    redecide: float = (
-        100.0  # [Hz], of deciding anew, a divisor of the rate of planning; 0 for never
-    )
-    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # of what is decided anew
+    redecide: float = 100.0  # [Hz], of new decisions, a divisor of the replanning rate; 0 for never
+    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # after a new decision
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
-        """When each ball is to be caught (N,) [s], in the balls' order."""
+        """Return planned catch times (N,) [s], in the balls' order."""
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
 
     def plan_shapes(self, cases: CatchCase) -> CatchPlan:
-        """Those of the planner behind the re-planner."""
+        """Return the shapes of the plans of the planner behind the re-planner."""
         return self.planner.planner.plan_shapes(cases)
 
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """What is still to be caught, while a plan is flown."""
+        """Return the problem of the remaining catches, while a plan is flown."""
         made = plan.times <= outlook.elapsed
-        first = jnp.argsort(made, stable=True)  # what is still to be caught
+        first = jnp.argsort(made, stable=True)  # remaining catches come first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
         horizon = case.horizon - outlook.time
         left = dataclasses.replace(
@@ -80,9 +79,9 @@ class CatchPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
-        """From the plan that is flown, and from scratch as is decided for this moment.
+        """A short round of the re-planner from the current plan, and a search from scratch.
 
-        The first is a short round of the re-planner.
+        The search from scratch uses a new decision of order and times.
         """
         from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
         return (from_last, self._decide_again) if self.redecide > 0.0 else (from_last,)
@@ -93,15 +92,17 @@ class CatchPilot:
         outlook: Outlook,
         found: tuple[CatchPlan, ...],
     ) -> tuple[CatchPlan, Array]:
-        """The better of the plans, and whether it is good enough.
+        """Return the better of the plans, and whether it is good enough to be flown.
 
-        One from scratch is taken where it breaks the limits less, or keeps them at a cost that is
-        clearly lower.
+        A plan from scratch is selected if it violates the limits less, or if it is feasible at a
+        clearly lower cost.
         """
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)  # the last time was due
+            since = jnp.mod(
+                outlook.time + _INSTANT, 1.0 / self.redecide
+            )  # [s], since a decision was due
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)
             plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)
@@ -110,7 +111,7 @@ class CatchPilot:
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
     def _decide_again(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
-        """A plan from scratch of what is left, with the decision's first choice."""
+        """Plan the remaining catches from scratch, with the first choice of a new decision."""
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
@@ -118,12 +119,12 @@ class CatchPilot:
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Whether () bool a plan from scratch is to be preferred to one from the plan that is flown."""
+    """Return whether () bool a plan from scratch is preferred to a warm-started one."""
     return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
-    """Predicted paths with quadratic drag of balls (N, ...) up to a horizon (N,) [s]."""
+    """Return predicted paths with quadratic drag of balls (N, ...) up to a horizon (N,) [s]."""
     predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
     horizon = jnp.maximum(horizon, 0.1)
     return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)

@@ -1,4 +1,4 @@
-"""Hits in flight: one served ball, volleyed to a target with a racket [Yu2023bat]."""
+"""Hits in closed loop: one served ball, volleyed to a target with a racket [Yu2023bat]."""
 
 import dataclasses
 import functools
@@ -40,19 +40,19 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-SEEN = 0.25  # [s], a serve's flight before it is planned for: 2 m and more [Yu2023catch, VII-A]
-_AFTER = 0.1  # [s] flown after the last impact planned
+SEEN = 0.25  # [s], flight of a serve before its first plan: 2 m and more [Yu2023catch, VII-A]
+_AFTER = 0.1  # [s], simulated time after the last planned impact
 _LONGEST = 1.9  # [s], the longest flight
-_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two rates of [Yu2023bat]
+_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two success radii of [Yu2023bat]
 
 _LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
 _LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
 
 
 def court_parts() -> list[Part]:
-    """The court of [Yu2023bat] as flat boxes: the dead zone, and the lines of both ends over it."""
+    """Return the court of [Yu2023bat] as flat boxes: dead zone, and lines of both halves."""
     length, width = court.HALF_LENGTH, court.HALF_WIDTH
-    lines = [((0.0, -width), (0.0, width))]  # first that at the net
+    lines = [((0.0, -width), (0.0, width))]  # the first line is at the net
     for side in (-1.0, 1.0):
         lines.append(((-length, side * width), (length, side * width)))
         lines.append(((side * length, -width), (side * length, width)))
@@ -75,17 +75,17 @@ HIT_WORLD = World(
     Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
-    # Serves come from anywhere in a region: the middle of the far one.
+    # Serves come from anywhere in a region; the machine is drawn in the middle of the far region.
     mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
 )
 
 
 def smooth_planner() -> ExactHit:
-    """`ExactHit` with a first search of 60 iterations, of drag after the impact.
+    """Return `ExactHit` with a first search of 60 iterations, and drag after the impact.
 
-    What the first few iterations find meets the limits, which know no angular acceleration: one
-    plan in 150 asks more of the rotors than they have, and the ball lands up to 30 cm beside.
-    The smoother plan at the end of a longer search does not.
+    The limits of a plan do not include angular acceleration. After few iterations one plan in 150
+    satisfies them but needs more torque than the rotors have, and the ball lands up to 30 cm off.
+    The smoother plan at the end of a longer search avoids this.
     """
     planner = ExactHit(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
@@ -94,27 +94,27 @@ def smooth_planner() -> ExactHit:
 
 @dataclasses.dataclass(frozen=True)
 class HitPilot:
-    """Plans a hit anew from the plan that is flown."""
+    """Replans a hit from the current plan."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # Least time [s] to an impact that is planned anew: the racket must settle.
+    # Least time [s] to an impact that is replanned: the racket must settle.
     shortest: float = 0.3
-    # A new plan may break a limit by this share of the limit and is still flown.
+    # Greatest relative violation of a limit by a new plan that is flown.
     excess: float = 0.1
     passage = staticmethod(passage)
 
     def times(self, plan: HitPlan) -> Array:
-        """When the ball is to be hit (1,) [s]."""
+        """Return the planned time of the hit (1,) [s]."""
         return plan.stroke.time[None]
 
     def plan_shapes(self, cases: HitCase) -> HitPlan:
-        """Those of the planner behind the re-planner."""
+        """Return the shapes of the plans of the planner behind the re-planner."""
         return self.planner.planner.plan_shapes(cases)
 
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """What is to be planned anew, while a plan is flown."""
+        """Return the replanning problem, while a plan is flown."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
@@ -123,13 +123,13 @@ class HitPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
-        """One short round of the re-planner."""
+        """A short round of the re-planner."""
         return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
 
     def choose(
         self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]
     ) -> tuple[HitPlan, Array]:
-        """The plan that was found, and whether it is good enough."""
+        """Return the plan that was found, and whether it is good enough to be flown."""
         (plan,) = found
         left = asked.previous.stroke.time - outlook.elapsed
         good = outlook.present[0] & (left >= self.shortest)
@@ -137,17 +137,17 @@ class HitPilot:
 
 
 def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
-    """One case for what its ball (leaves (1, 3)) seems to do, drag (1,)."""
+    """Return one case with the estimated ball (leaves (1, 3)), its drag (1,) and a robot state."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 
 
 @dataclasses.dataclass(frozen=True)
 class Volleys(FlightCases):
-    """B serves, as they are when they are planned for."""
+    """B serves at the start of the plans for them."""
 
     cases: HitCase  # leaves (B, ...), with the true ball and drag
-    believed: np.ndarray  # (B,) K_D [1/m]
+    believed: np.ndarray  # (B,) K_D [1/m], initial estimate
 
 
 def volleys(
@@ -158,13 +158,13 @@ def volleys(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_HITTER,
 ) -> Volleys:
-    """Drawn serves, seen for `SEEN` seconds.
+    """Return drawn serves at the start of their plans, `SEEN` seconds after the serve.
 
     Args:
         num: B >= 1.
         names: out of `court.SCENARIOS`; all of them by default.
         seed: >= 0, of the serves and of the signs of the drag's errors.
-        drag_error: relative error of what is believed of K_D, either way.
+        drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: with a racket.
     """
     if not 0.0 <= drag_error < 1.0:
@@ -178,26 +178,26 @@ def volleys(
 
 @dataclasses.dataclass(frozen=True)
 class HitFlights(Flights):
-    """What came of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
+    """The result of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
 
     landing: np.ndarray  # (B, 3) [m], of the returned ball; NaN where it was missed
     miss: np.ndarray  # (B,) [m], from the target; inf where the ball was missed
 
     @property
     def success(self) -> np.ndarray:
-        """Which balls landed near the target, (B,) bool."""
+        """Whether each ball landed near the target, (B,) bool."""
         return self.miss <= _NEAR
 
 
 def reflect_ball(contact: Contact, restitution: Array) -> BallState:
-    """One ball just after the racket's impact, by the library's map [Yu2023bat, eq. 3]."""
+    """Return one ball just after the racket's impact, by the library's map [Yu2023bat, eq. 3]."""
     vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
     return BallState(pos=contact.ball_pos, vel=vel)
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
-    """What is to be hit, as it is believed."""
+    """Return the cases with the estimated balls."""
 
     def one(flight: FlightState, case: HitCase) -> HitCase:
         balls = predict_balls(loop, flight.earlier, loop.period)
@@ -207,7 +207,7 @@ def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
 
 
 def _reflect_balls(contact: Contact, truth: HitCase) -> BallState:
-    """Balls just after their impacts, leaves (B, 3) in NumPy, NaN where they were missed."""
+    """Return balls just after their impacts, leaves (B, 3) in NumPy, NaN where they were missed."""
     one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
     balls = jax.device_get(jax.vmap(reflect_ball)(one, truth.restitution))
     return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
@@ -229,8 +229,8 @@ def fly_hits(
         cases: the serves.
         seed: of the noise, >= 0.
         planner: of the first plan, by default `smooth_planner()`.
-        pilot: of the plans after it.
-        plan: first plan of each flight, instead of one made here.
+        pilot: of the replanning.
+        plan: first plan of each flight, instead of a plan that is made here.
 
     Raises:
         ValueError: a world or plan does not fit.
@@ -253,8 +253,8 @@ def fly_hits(
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
     require_plan(first, HitPlan, known.head_state)
-    # By way of the host: bound to a device, what the first period gets would be of another kind
-    # than what the others get, and its programs would be compiled twice.
+    # The plan is copied through the host. Otherwise the first period would get arrays committed to
+    # a device, the later ones uncommitted arrays, and the programs would be compiled twice.
     begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
@@ -267,13 +267,13 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """Hits as a run of flights knows them; the settings are `HitFly`."""
+    """Hits as a task of a run of flights; the settings are `HitFly`."""
 
     settings: HitFly
 
     CONTACT = "hit"
     SUCCESS = f"landed within {_NEAR:g} m of the target"
-    # [Yu2023bat] shows its rates as a figure.
+    # [Yu2023bat] shows its rates in a figure without numbers.
     PUBLISHED = "Bat, 600 real serves: within 0.5 m and 1 m, in a figure without numbers"
     COLUMNS = (
         Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),
@@ -282,16 +282,16 @@ class HitFlight(BallFlightTask):
     )
 
     def world(self) -> World:
-        """The simulated world with the court."""
+        """Return the simulated world with the court."""
         return dataclasses.replace(HIT_WORLD, robot=Quadrotor(self.robot))
 
     @property
     def robot(self) -> QuadrotorModel:
-        """Which quadrotor flies."""
+        """The model of the quadrotor."""
         return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:
-        """All serves of the run."""
+        """Return all serves of the run."""
         settings = self.settings
         regions = REAL_SCENARIOS.get(settings.suite)
         return volleys(
@@ -303,13 +303,13 @@ class HitFlight(BallFlightTask):
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
-        """Flights of some serves."""
+        """Fly some serves, and return the result."""
         name = self.settings.planner
         planner = None if name == "exact" else hit_planner(name)
         return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
 
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
-        """The serves, and the balls that come back from the racket."""
+        """Return the serves, and the balls that the racket returns."""
         truth = cases.cases
         back = _reflect_balls(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
@@ -322,11 +322,11 @@ class HitFlight(BallFlightTask):
         return self.settings.suite
 
     def counts(self, rows: Any) -> dict[str, int]:
-        """Balls that the racket met, and those that landed within the wider circle."""
+        """Return the numbers of balls that were hit, and that landed within the wider circle."""
         miss, met = np.asarray(rows["miss"]), np.asarray(rows["met"])
         return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """The wider circle, and the racket's part."""
+        """Return a sentence about the wider circle and the racket."""
         within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
         return [f"{within} % within 1 m; the racket met the ball in {met} %."]

@@ -1,9 +1,10 @@
 """Interceptions in closed loop: a car meets a moving target among obstacles [Qu2022].
 
-Before it sets out the car has seen its target 15 times, a second apart; on the way it looks on. At
-every planning it predicts where the target will be from what it has been shown until then, and
-plans from where it believes to be. Walls are known; movers are too, unless they are to be seen
-like the target. World frame in the plane, SI units; times count from the first plan.
+The car has observed its target 15 times, once a second, before it starts; it continues to observe
+during the drive. Every plan uses a prediction of the target from the observations that have arrived
+until then, and starts at the car's estimated pose. Walls are known. Moving obstacles are known too,
+unless they are predicted from observations like the target. World frame in the plane, SI units;
+times count from the start of the first plan.
 """
 
 import dataclasses
@@ -47,21 +48,21 @@ from planner_jax.task.intercept.plan import InterceptPlan
 
 CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
 SUCCESS = 0.3  # [m], greatest miss of a success
-TOUCH = 1e-3  # [m] inside of an obstacle that is a contact, as the referee has it
-_SHORTEST = 0.3  # [s] before the meeting, up to when plans are made anew
-_LEAST_STD = 1e-3  # [m], that the prediction believes of looks without noise
-_CAUTION = 2.0  # standard deviations by which movers that are seen are grown
-_POINTS = 9  # of the path that is expected, in a recording
+TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
+_SHORTEST = 0.3  # [s], least time to the meeting at which the car replans
+_LEAST_STD = 1e-3  # [m], that the prediction assumes of observations without noise
+_CAUTION = 2.0  # standard deviations by which predicted movers are enlarged
+_POINTS = 9  # points of a predicted path in a recording
 
 
 @dataclasses.dataclass(frozen=True)
 class Meetings(FlightCases):
-    """B interceptions and what is seen of them, NumPy leaves."""
+    """B interceptions and their observations, NumPy leaves."""
 
-    cases: InterceptCase  # as they truly are
-    times: np.ndarray  # (B, L) [s], of the looks
-    target: np.ndarray  # (B, L, 2) [m], the target as it looks
-    movers: np.ndarray  # (B, L, N, 2) [m], the movers' centres as they look
+    cases: InterceptCase  # the true ones
+    times: np.ndarray  # (B, L) [s], of the observations
+    target: np.ndarray  # (B, L, 2) [m], observed positions of the target
+    movers: np.ndarray  # (B, L, N, 2) [m], observed centres of the movers
 
 
 jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fields(Meetings)], [])
@@ -70,13 +71,13 @@ jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fi
 def meetings(
     suite: str, num: int, seed: int = 0, *, noise: float = 0.1, observation_rate: float = 1.0
 ) -> Meetings:
-    """Interceptions of a suite, with looks before the start and on the way.
+    """Return interceptions of a suite, with observations before the start and during the drive.
 
     Args:
         suite: of `pj.intercept.draw`.
         num: B >= 1.
         seed: >= 0, of cases and noise.
-        noise: [m], standard deviation of a coordinate that is seen.
+        noise: [m], standard deviation of an observed coordinate.
         observation_rate: [Hz], during the drive; 0 for none.
     """
     cases = jax.tree.map(np.asarray, draw(num, suite, seed))
@@ -112,23 +113,23 @@ def meetings(
 def predict_scene(
     loop: DriveLoop, meetings: Meetings, now: Array, *, known_target: bool, predict_movers: bool
 ) -> tuple[TurningPath, Obstacles]:
-    """Where targets and movers are believed to go; both count from now.
+    """Return the predicted targets and movers; times of both count from now.
 
-    Movers that are seen are grown by what their place is uncertain by, `_CAUTION` times.
+    Predicted movers are enlarged by `_CAUTION` standard deviations of their position.
 
     Args:
         loop: with the sensing.
         meetings: leaves (B, ...).
         now: () [s].
-        known_target: whether the targets' ways are known (static).
-        predict_movers: whether the movers' are not (static).
+        known_target: whether the targets' paths are known (static).
+        predict_movers: whether movers are predicted from observations (static).
     """
     sensing = loop.sensing
     noise = max(sensing.target_std, _LEAST_STD)
 
     def one(meeting: Meetings) -> tuple[TurningPath, Obstacles]:
         case = meeting.cases
-        # The car sets out once it has been shown what it has seen up to then.
+        # Observations from before the start have all arrived; later ones arrive one latency late.
         shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
         times, weights = meeting.times - now, shown.astype(now.dtype)
         if known_target:
@@ -143,7 +144,7 @@ def predict_scene(
             return target, dataclasses.replace(movers, centre=centre)
         fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
         state = jax.vmap(fit, in_axes=1)(meeting.movers)
-        # Variance of a line's value at time 0, in terms of that of one look.
+        # Standard deviation of a fitted line's value at time 0, from the noise of an observation.
         number = jnp.sum(weights)
         middle = jnp.sum(weights * times) / number
         spread = jnp.sum(weights * (times - middle) ** 2)
@@ -167,13 +168,13 @@ def remaining(
     speed: Array,
     curvature: Array,
 ) -> InterceptCase:
-    """What is left of cases, leaves (B, ...), `elapsed` (B,) [s] after their begin.
+    """Return the remaining cases (B, ...), `elapsed` (B,) [s] after their start.
 
     Args:
-        cases: whose times count from their begin.
+        cases: whose times count from their start.
         elapsed: (B,) [s].
-        target: expected paths, which count from now.
-        movers: expected ones, at their places of now.
+        target: predicted paths, with times that count from now.
+        movers: predicted ones, at their current positions.
         pose: (B, 3) [m, m, rad], of the rear axle.
         speed: (B,) [m/s].
         curvature: (B,) [1/m].
@@ -192,36 +193,36 @@ def remaining(
 
 @dataclasses.dataclass(frozen=True)
 class Driven:
-    """What came of a batch of drives, on the host; leaves with a leading axis B."""
+    """The result of a batch of drives, on the host; leaves with a leading axis B."""
 
     times: np.ndarray  # (S,) [s], of the frames, the first 0
-    poses: np.ndarray  # (B, S, 3) of the rear axle's middle [m], and heading [rad]
-    wanted: np.ndarray  # (B, S, 2) [m], where the plans have it
-    meeting: np.ndarray  # (B,) [s], when the last plan ends
+    poses: np.ndarray  # (B, S, 3) of the rear axle's centre [m], and heading [rad]
+    wanted: np.ndarray  # (B, S, 2) [m], planned positions
+    meeting: np.ndarray  # (B,) [s], end of the last plan
     tracking: np.ndarray  # (B, 2) [m], of the rear axle from its plans: rms and worst
     saturation: np.ndarray  # (B, 2), share of the time with drive and steering saturated
-    plans: np.ndarray  # (B,) int, how many plans were driven
-    ways: np.ndarray  # (B, S, M, 2) [m], where the target was expected from then on
+    plans: np.ndarray  # (B,) int, number of executed plans
+    ways: np.ndarray  # (B, S, M, 2) [m], predicted path of the target from each frame on
 
 
 @dataclasses.dataclass(frozen=True)
 class InterceptFlights(Flights):
-    """What came of a batch of interceptions; leaves with a leading axis B."""
+    """The result of a batch of interceptions; leaves with a leading axis B."""
 
     flown: Driven
-    miss: np.ndarray  # (B,) [m], from the body's middle to the true target when the plan ends
-    target: np.ndarray  # (B, 2) [m], where the target truly is then
+    miss: np.ndarray  # (B,) [m], from the body's centre to the true target at the end of the plan
+    target: np.ndarray  # (B, 2) [m], true position of the target then
     wall_clearance: np.ndarray  # (B,) [m], least; negative inside
     mover_clearance: np.ndarray  # (B,) [m]
 
     @property
     def touched(self) -> np.ndarray:
-        """Which cars ran into something, (B,) bool."""
+        """Whether each car touched an obstacle, (B,) bool."""
         return np.minimum(self.wall_clearance, self.mover_clearance) < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Which cars met their target and touched nothing, (B,) bool."""
+        """Whether each car met its target and touched nothing, (B,) bool."""
         return (self.miss <= SUCCESS) & ~self.touched
 
 
@@ -238,22 +239,22 @@ def fly_intercepts(
 ) -> InterceptFlights:
     """Plan and drive a batch of interceptions.
 
-    A plan made anew begins where the car believes to be, and is driven if it keeps every limit;
-    otherwise the old one goes on.
+    A new plan starts at the car's estimated pose. It replaces the old one if it satisfies every
+    limit.
 
     Args:
         loop: world and sensing.
-        cases: what is to be met, and what is seen.
+        cases: targets, obstacles and observations.
         seed: of the noise on the car's pose, >= 0.
-        replan: [Hz]; 0 drives the first plan.
+        replan: [Hz]; 0 drives the first plan to its end.
         planner: of all plans, by default `spacetime`.
-        plan: first plan of each drive, instead of one made here.
-        known_target: whether the targets' ways are known instead of predicted.
-        predict_movers: whether movers are predicted from looks instead of known.
+        plan: first plan of each drive, instead of a plan that is made here.
+        known_target: whether the targets' paths are known instead of predicted.
+        predict_movers: whether movers are predicted from observations instead of known.
 
     Raises:
-        ValueError: `replan` does not divide the rate of the frames, or the cases' car is not
-            the one that is simulated.
+        ValueError: `replan` does not divide the rate of the frames, or the cases' car is not the
+            simulated one.
     """
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
@@ -294,18 +295,18 @@ def plan_again(
     target: TurningPath,
     movers: Obstacles,
 ) -> tuple[DriveState, InterceptCase, Array]:
-    """Plans from where cars believe to be, driven where they keep every limit.
+    """Replan from the cars' estimated poses, and use the new plans that satisfy every limit.
 
     Args:
         loop: of the drives.
-        planner: of what is left.
+        planner: of the remaining cases.
         drive: leaves (B, ...).
-        begun: the cases that the plans driven until now are of, from when these began.
-        target: expected from now on.
-        movers: likewise.
+        begun: the cases of the current plans, at the start of those plans.
+        target: predicted from now on.
+        movers: predicted from now on.
 
     Returns:
-        The drives, the cases that their plans are of, and (B,) bool, which plans are new.
+        The drives, the cases of their plans, and (B,) bool, which plans are new.
     """
     pose, speed, curvature = jax.vmap(functools.partial(estimate_state, loop))(drive)
     elapsed = drive.time - drive.began
@@ -328,7 +329,7 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Drives, and what their plans are of, with new plans where those are good (B,)."""
+    """Return drives and the cases of their plans, with the new plans where those are good (B,)."""
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -339,7 +340,7 @@ def _replace_plans(
 
 @jax.jit
 def _sample_paths(path: TurningPath, span: Array) -> Array:
-    """Points (B, M, 2) [m] on paths up to spans (B,) [s]."""
+    """Return points (B, M, 2) [m] on paths up to times (B,) [s]."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
@@ -352,7 +353,7 @@ def _collect_drives(
     seen: list[tuple[Array, int]],
     number: np.ndarray,
 ) -> Driven:
-    """Drives at their end, on the host."""
+    """Return the result of drives at their end, on the host."""
     drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]
@@ -373,13 +374,13 @@ def _collect_drives(
 def score(
     cases: InterceptCase, first: InterceptPlan, flown: Driven, planning_seconds: float = 0.0
 ) -> InterceptFlights:
-    """Drives held against what truly was: miss and contacts, in float64.
+    """Compare drives with the true targets and obstacles in float64: misses and contacts.
 
     Args:
-        cases: as they truly are, leaves (B, ...).
+        cases: the true ones, leaves (B, ...).
         first: the first plans.
         flown: the drives.
-        planning_seconds: of the host's clock.
+        planning_seconds: wall time of planning.
     """
     meeting = flown.meeting
     times = np.minimum(flown.times, meeting[:, None])  # (B, S)
@@ -414,7 +415,7 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Obstacles as the referee's clearance takes them; what is absent is zero."""
+    """Return obstacles in the form of the referee's clearances; absent ones are zero."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)
@@ -426,7 +427,7 @@ def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
 
 
 def require_car(vehicle: Vehicle, cases: InterceptCase) -> None:
-    """Raise `ValueError` unless the simulated car is the one that is planned for."""
+    """Raise `ValueError` unless the simulated car is the one for which plans are made."""
     for name in ("length", "width", "wheelbase", "rear_overhang"):
         own, planned = getattr(vehicle, name), np.asarray(getattr(cases.body, name))
         if not np.allclose(planned, own, rtol=1e-5):

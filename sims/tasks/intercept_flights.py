@@ -1,4 +1,4 @@
-"""Flights of interceptions: their settings, columns, recordings and findings."""
+"""Runs of interceptions: settings, columns, recordings and findings."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,14 +33,14 @@ from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.searches import SEARCHES, search_reach
 
-NEAR, FAR = 0.05, 0.5  # [m], of the miss: two more distances that are counted
-_KEPT = 2  # frames from one that is recorded to the next
+NEAR, FAR = 0.05, 0.5  # [m], further radii of the miss for which successes are counted
+_KEPT = 2  # simulated frames per recorded sample
 _WALL, _MOVER = "#8C959F", "#D9A441"  # colours
-_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], as they are drawn
+_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], for drawing
 
 
 class InterceptFlight(FlightTask):
-    """Interceptions as a run of flights knows them; the settings are `InterceptFly`."""
+    """Interceptions as a task of a run of flights; the settings are `InterceptFly`."""
 
     settings: InterceptFly
 
@@ -55,7 +55,7 @@ class InterceptFlight(FlightTask):
     COLUMNS = (
         *leaves_of(
             "verdict",
-            ("miss", "m", "from the body's middle to the true target"),
+            ("miss", "m", "from the body's centre to the true target"),
             ("wall_clearance", "m", "least; negative inside"),
             ("mover_clearance", "m", "least; negative inside"),
         ),
@@ -70,20 +70,20 @@ class InterceptFlight(FlightTask):
     )
 
     def world(self) -> World:
-        """The ground with the car; what stands around differs from drive to drive."""
+        """Return the ground with the car; obstacles differ from drive to drive."""
         tyres = Tyres() if self.settings.slip else None
         return dataclasses.replace(CAR_WORLD, robot=Car(Vehicle(tyres=tyres)))
 
     def loop(self) -> DriveLoop:
-        """The closed loop of the drives."""
+        """Return the closed loop of the drives."""
         return DriveLoop(self.world(), self.settings.sensing)
 
     def parameters(self) -> dict[str, Any]:
-        """Those of the closed loop."""
+        """Return the parameters of the closed loop."""
         return dataclasses.asdict(self.loop())
 
     def cases(self) -> Meetings:
-        """All interceptions of the run."""
+        """Return all interceptions of the run."""
         settings = self.settings
         sensing = settings.sensing
         return meetings(
@@ -95,7 +95,7 @@ class InterceptFlight(FlightTask):
         )
 
     def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
-        """Drives of some interceptions; they are recorded in any case."""
+        """Drive some interceptions, and return the result; it always includes a record."""
         settings = self.settings
         return fly_intercepts(
             self.loop(),
@@ -110,7 +110,7 @@ class InterceptFlight(FlightTask):
     def recording(
         self, cases: Meetings, flights: InterceptFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """The recording of some of the drives; see `FlightTask`."""
+        """Return the recording of some of the drives; see `FlightTask`."""
         some, flown = cases[np.asarray(lanes)], flights.flown
         kept = np.arange(0, flown.times.size, _KEPT)
         times = np.tile(flown.times[kept], (len(some), 1))
@@ -137,14 +137,14 @@ class InterceptFlight(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Noise, latency, prediction and tyres."""
+        """Noise, latency, prediction and tyres, as the beginning of a sentence."""
         settings = self.settings
         of = (
             "known"
             if settings.known_target
             else f"predicted from observations at {settings.observation_rate:g} Hz"
         )
-        movers = "seen" if settings.predict_movers else "known"
+        movers = "predicted" if settings.predict_movers else "known"
         tyres = "slipping tyres" if settings.slip else "tyres without slip"
         return (
             f"Noise {settings.noise}, latency {1e3 * settings.latency:g} ms, the target {of}, "
@@ -153,11 +153,11 @@ class InterceptFlight(FlightTask):
 
     @property
     def simulated(self) -> str:
-        """The car, and what it sees."""
-        return f"{self.world().robot.WORDS}; poses and looks with noise and latency"
+        """The car and its sensing, for the report of a run."""
+        return f"{self.world().robot.WORDS}; poses and observations with noise and latency"
 
     def surroundings(self, index: int) -> Sequence[Prism]:
-        """Walls and movers of one drive."""
+        """Return walls and movers of one drive."""
         case = self._case(index)
         found = []
         for group, height, colour in (
@@ -172,7 +172,7 @@ class InterceptFlight(FlightTask):
         return found
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Cells of the planner's reach set, layer by layer."""
+        """Return the cells of the planner's reachable set, layer by layer."""
         return reach_layers(jax.tree.map(jnp.asarray, self._case(index)))
 
     def _case(self, index: int) -> InterceptCase:
@@ -181,7 +181,7 @@ class InterceptFlight(FlightTask):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Nearer and farther meetings, contacts, and how often an actuator was at its limit."""
+        """Return numbers of meetings and contacts, and the saturation of the actuators."""
         miss = np.asarray(rows["miss"])
         wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
         return {
@@ -196,7 +196,7 @@ class InterceptFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Misses and contacts; saturation."""
+        """Return sentences about misses, contacts and saturation."""
         number = summary["num"]
         near, success, far = (
             percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)
@@ -216,7 +216,7 @@ def _get_drives(batch: Any) -> Driven:
 
 
 def _add_height(points: np.ndarray, height: float) -> np.ndarray:
-    """Points of the plane (..., 2) at a height, (..., 3) [m]."""
+    """Return points of the plane (..., 2) at a height, (..., 3) [m]."""
     high = np.where(np.isfinite(points[..., :1]), height, np.nan)
     return np.concatenate([points, high], axis=-1)
 

@@ -11,7 +11,7 @@ def inverse_dynamics(
 ) -> Array:
     """Return the joint torques (6,) [N m] of a motion, without friction and rotor inertia.
 
-    The recursions are those of [Luh1980], in the base frame. The forward recursion adds each
+    The recursions follow [Luh1980], in the base frame. The forward recursion adds each
     joint's contribution to the motion of its link. The backward recursion adds up the forces and
     moments of the links beyond a joint; moments are about the origin of the base frame.
 

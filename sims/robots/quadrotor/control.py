@@ -1,6 +1,6 @@
 """Cascaded SE(3) control by differential flatness and the Hopf fibration.
 
-The cascade is that of [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Position and
+The cascade follows [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Position and
 velocity feedback, with the plan's acceleration and jerk as feedforward, gives the desired thrust
 and, at zero heading, attitude and body rate [Watterson2020]. The attitude error corrects the body
 rate. The error of the body rate gives a torque. Feedforward commands lead by the rotors' lag.
