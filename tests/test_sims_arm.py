@@ -1,4 +1,4 @@
-"""The simulated arm: what it holds and follows, what counts as a block, and a run of flights."""
+"""The simulated arm: standstill, tracking, scores of blocks, and a run of flights."""
 
 import dataclasses
 import json
@@ -45,12 +45,14 @@ from planner_jax.task.block.motion import polynomial, profiles
 from planner_jax.task.block.plan import BlockPlan
 
 HOME, LANES = np.asarray(irb1600().home), 4  # all batches are of one size: one program
-TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion that touches nothing
-MOVING = 0.5  # [s]
+TURN = np.array([-0.4, -0.5, 0.4, 0.6, -0.5, 0.8])  # [rad], of a motion without collisions
+MOVING = 0.5  # [s], duration of a motion
 
 
 def motion(turn, duration=MOVING, ends_at_rest=True):
-    """From home by so much (6,) [rad], in the shape of the quickest straight motion."""
+    """Return a motion from home by an angle (6,) [rad], with the profile of the quickest straight
+    motion.
+    """
     shape = profiles(10, ends_at_rest)[-1]
     steps = jnp.asarray(shape[:, None] * turn, jnp.float32)
     return polynomial(jnp.asarray(HOME), jnp.zeros(6), steps, jnp.float32(duration))
@@ -61,7 +63,7 @@ def batch(*trees):
 
 
 def plans(*motions, contact, status=None):
-    """Plans of motions."""
+    """Return plans of motions with one contact time."""
     num = len(motions)
     none: Any = np.zeros(num, np.float32)
     states: Any = np.zeros(num, np.int32) if status is None else np.array(status, np.int32)
@@ -77,12 +79,12 @@ def plans(*motions, contact, status=None):
 
 
 STILL = motion(0.0 * TURN)
-# None, one that comes to rest, one the other way, one that does not come to rest.
+# Standstill, a motion to rest, a motion to rest in the other direction, and a motion without rest.
 MOTIONS = (STILL, motion(TURN), motion(-0.3 * TURN), motion(0.6 * TURN, ends_at_rest=False))
 
 
-def carried_out(drives=IDEAL, **options):
-    """The arm along MOTIONS, which begin after 0.05 s."""
+def execute_motions(drives=IDEAL, **options):
+    """Return the courses of MOTIONS, which start after 0.05 s, and their execution."""
     begin: Any = np.full(LANES, 0.05, np.float32)
     braking: Any = np.full((LANES, 6), 30.0, np.float32)
     courses = Course(motion=batch(*MOTIONS), begin=begin, braking=braking)
@@ -93,14 +95,14 @@ def carried_out(drives=IDEAL, **options):
 
 @pytest.fixture(scope="module")
 def ideal():
-    return carried_out()
+    return execute_motions()
 
 
 @pytest.mark.slow
 def test_the_arm_holds_its_home_against_gravity_without_drift(ideal):
     _, flown = ideal
     assert np.abs(flown.angles[0] - HOME).max() < 1e-5
-    assert flown.torque_rms[0, 1] > 100.0  # [N m], that joint 2 bears there
+    assert flown.torque_rms[0, 1] > 100.0  # [N m], load of joint 2 at home
     assert flown.tracking[0].max() < 1e-5
 
 
@@ -130,23 +132,23 @@ def test_a_reference_is_smooth_where_a_plan_begins_and_its_rates_are_slopes():
     reference = jax.jit(jax.vmap(lambda time: reference_at(course, time)))(times)
     step = float(times[1])
     slopes = np.gradient(np.asarray(reference.angles, float), step, axis=0)
-    assert np.abs(slopes - reference.rates)[1:-1].max() < 0.03  # a jump in acceleration, halved
+    assert np.abs(slopes - reference.rates)[1:-1].max() < 0.03  # at a jump in acceleration
     rises = np.diff(np.asarray(reference.rates, float), axis=0) / step
     assert np.median(np.abs(rises - reference.accelerations[:-1])) < 0.02
 
 
-def test_torque_limits_bite_and_are_kept():
+def test_torque_limits_are_active_and_not_exceeded():
     small = tuple(0.2 * torque for torque in TORQUES)
-    _, flown = carried_out(Drives(torques=small))
+    _, flown = execute_motions(Drives(torques=small))
     assert (flown.torque_worst <= np.array(small) * (1.0 + 1e-6)).all()
     assert flown.saturation[1, :2].max() > 0.05
     assert flown.error_worst[1].max() > 1e-2
-    assert flown.error_worst[0].max() < 1e-4  # what holds the arm is enough
+    assert flown.error_worst[0].max() < 1e-4  # the limits suffice for a standstill
 
 
-def test_a_late_plan_is_followed_as_exactly_but_later(ideal):
+def test_a_late_plan_is_tracked_as_exactly_as_a_plan_in_time(ideal):
     late = 0.02
-    _, flown = carried_out(Drives(latency=0.5 * late), late=0.5 * late)
+    _, flown = execute_motions(Drives(latency=0.5 * late), late=0.5 * late)
     frames = round(late / FRAME)
     apart = flown.angles[:, frames:] - ideal[1].angles[:, :-frames]
     assert np.abs(apart).max() < 1e-3
@@ -154,19 +156,20 @@ def test_a_late_plan_is_followed_as_exactly_but_later(ideal):
     assert flown.tracking[1, 1] > 0.01
 
 
-def test_noise_lag_and_wrong_masses_cost_little_and_a_seed_gives_the_same_bits():
+def test_noise_lag_and_mass_errors_hardly_matter_and_a_seed_gives_the_same_bits():
     drives = Drives(lag=0.005, angle_std=1e-4, rate_std=0.01, mass_error=0.05)
-    _, flown = carried_out(drives)
-    _, again = carried_out(drives)
+    _, flown = execute_motions(drives)
+    _, again = execute_motions(drives)
     np.testing.assert_array_equal(flown.angles, again.angles)
     assert 1e-4 < flown.error_worst.max() < 1e-2
     assert flown.tracking[:, 1].max() < 2e-3
 
 
-def thrown(places, speed=8.0):
-    """Balls that fly straight at the shield of an arm at home, past its middle by places (B, 2).
+def throw_at_shield(places, speed=8.0):
+    """Return balls that fly straight at the shield of an arm at home.
 
-    They are in the plane of its face after 0.5 s.
+    They pass the shield's centre at offsets `places` (B, 2), and are in the plane of its face after
+    0.5 s.
     """
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(HOME)))
     goal = middle + np.asarray(places) @ turn[:, 1:].T
@@ -174,8 +177,8 @@ def thrown(places, speed=8.0):
     return pj.block.case(goal - 0.5 * vel, vel, gravity=1e-6)
 
 
-def as_planned(cases, angles, end=0.8):
-    """What is said of arms that are at angles (6,) all the time."""
+def score_standstill(cases, angles, end=0.8):
+    """Return the score of arms that stand still at angles (6,)."""
     times = FRAME * np.arange(round(end / FRAME) + 1)
     num = len(cases.gravity)
     held = np.broadcast_to(angles, (num, times.size, 6)).astype(float)
@@ -187,23 +190,23 @@ def as_planned(cases, angles, end=0.8):
 
 def test_a_ball_on_the_shield_is_blocked_and_one_beside_it_is_not():
     places = [(0.0, 0.0), (0.1, -0.14), (0.16, 0.0), (0.0, -0.5)]
-    found = as_planned(thrown(places), HOME)
+    found = score_standstill(throw_at_shield(places), HOME)
     assert found.blocked.tolist() == [True, True, False, False]
     assert found.success.tolist() == found.blocked.tolist()
     np.testing.assert_allclose(found.miss, np.linalg.norm(places, axis=1), atol=1e-4)
-    # The ball touches the face its radius before its centre is there.
+    # The ball touches the face when its centre is one radius away.
     np.testing.assert_allclose(found.contact[:2], 0.5 - 0.05 / 8.0, atol=1e-4)
     assert np.isnan(found.contact[2:]).all() and np.isnan(found.contact_pos[2:]).all()
 
 
 def test_a_ball_that_comes_from_behind_or_too_late_is_not_blocked():
-    from_behind = thrown([(0.0, 0.0)], speed=-8.0)
-    assert not as_planned(from_behind, HOME).blocked.any()
-    cases = thrown([(0.0, 0.0)])
+    from_behind = throw_at_shield([(0.0, 0.0)], speed=-8.0)
+    assert not score_standstill(from_behind, HOME).blocked.any()
+    cases = throw_at_shield([(0.0, 0.0)])
     lower, upper = np.full((1, 3), -50.0), np.full((1, 3), 50.0)
     everywhere = dataclasses.replace(cases.scene.inner, lower=lower, upper=upper)
     inside = dataclasses.replace(cases, scene=dataclasses.replace(cases.scene, inner=everywhere))
-    found = as_planned(inside, HOME)
+    found = score_standstill(inside, HOME)
     assert not found.blocked.any() and np.isnan(found.miss).all()
 
 
@@ -211,12 +214,12 @@ def test_an_arm_that_runs_into_the_pole_does_not_succeed():
     ahead = np.array([0.0, 1.0, -0.6, 0.0, 0.0, 0.0])
     turn, middle = map(np.asarray, shield_pose(irb1600(), jnp.asarray(ahead)))
     vel = -8.0 * turn[:, 0]
-    found = as_planned(pj.block.case([middle - 0.5 * vel], [vel], gravity=1e-6), ahead)
+    found = score_standstill(pj.block.case([middle - 0.5 * vel], [vel], gravity=1e-6), ahead)
     assert found.blocked.all() and found.touched.all() and not found.success.any()
     assert found.nearest[0].endswith(", pole") and found.clearance[0] < -0.01
 
 
-def test_clearances_of_an_exact_execution_are_those_of_the_referee():
+def test_clearances_of_an_exact_execution_equal_the_clearances_of_the_referee():
     cases = throws("pole", LANES, 3).cases
     plan = plans(*MOTIONS, contact=MOVING)
     verdict = pj.block.judge(cases, plan)
@@ -232,7 +235,7 @@ def test_clearances_of_an_exact_execution_are_those_of_the_referee():
     assert found.clearance.min() < found.clearance.max()
 
 
-def test_the_parts_of_the_time_budget_add_up_and_a_plan_that_is_late_begins_late():
+def test_the_parts_of_the_time_budget_add_up_and_a_late_plan_starts_late():
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     seconds = np.array([0.01, 0.05, 0.07, 0.02])
     plan = plans(*MOTIONS, contact=0.15 + MOVING, status=[0, 0, 0, 2])
@@ -255,7 +258,7 @@ def test_the_parts_of_the_time_budget_add_up_and_a_plan_that_is_late_begins_late
     assert within.tolist() == [[False, True]] * LANES
 
 
-def test_arms_that_only_see_their_balls_do_what_they_decided_on():
+def test_arms_that_observe_their_balls_execute_the_motions_they_decided():
     cases = throws("open", LANES, 1, regime="R1", delay=0.15)
     plan = plans(*MOTIONS, contact=0.15 + MOVING)
     sights = [see(cases.cases, eye(std=std), 0.1) for std in (0.02, 1e-5)]
@@ -277,7 +280,7 @@ def test_arms_that_only_see_their_balls_do_what_they_decided_on():
     np.testing.assert_allclose(found.budget.plan + found.budget.wait, 0.05, atol=1e-6)
 
 
-def test_solids_of_capsules_and_boxes_are_closed_and_seen_from_outside():
+def test_solids_of_capsules_and_boxes_are_closed_with_outward_normals():
     first, second = np.array([0.1, 0.2, 0.3]), np.array([0.1, 0.5, 0.3])
     for solid, volume in (
         (capsule_solid(first, second, 0.1), np.pi * 0.1**2 * (0.3 + 4.0 / 3.0 * 0.1)),
@@ -289,7 +292,7 @@ def test_solids_of_capsules_and_boxes_are_closed_and_seen_from_outside():
         assert 0.85 * volume < own <= volume * (1.0 + 1e-9)
 
 
-def test_shapes_stand_where_the_links_are():
+def test_shapes_are_placed_at_the_links():
     robot = ShieldArm(base_height=0.4)
     places = robot.places(HOME)
     assert len(places) == len(robot.shapes()) == 8
@@ -304,10 +307,10 @@ def test_shapes_stand_where_the_links_are():
 
 @pytest.fixture(scope="module")
 def recorded():
-    """Task and recording of four arms, one of which blocks its ball."""
+    """Return task, flights and recording of four arms; one arm blocks its ball."""
     task = BlockFly(num=LANES).flight()
     places = [(0.05, 0.0)] + [(0.0, 0.3)] * (LANES - 1)
-    cases = Throws(np.arange(LANES), jax.tree.map(np.asarray, thrown(places)))
+    cases = Throws(np.arange(LANES), jax.tree.map(np.asarray, throw_at_shield(places)))
     plan = plans(*[STILL] * LANES, contact=0.5)
     flights = fly_blocks(BLOCK_WORLD, cases, plan=plan)
     return task, flights, task.recording(cases, flights, np.arange(LANES))
@@ -317,11 +320,11 @@ def test_a_recording_shows_the_ball_until_and_after_its_block(recorded):
     _, flights, kept = recorded
     assert flights.blocked.tolist() == [True, False, False, False]
     path, met = kept.balls[0, :, 0], kept.met[0, 0]
-    there = np.isfinite(path[:, 0])  # it comes from below the floor, and falls back there
+    there = np.isfinite(path[:, 0])  # the path starts and ends at the floor
     steps = np.diff(path[there & (kept.time[0] < met)], axis=0)
     np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.08, rtol=1e-3)
     after = np.diff(path[there & (kept.time[0] > met)], axis=0)
-    # Back the way it came, half as fast, from where it met the shield.
+    # The ball rebounds from the contact along its path at half the speed.
     assert len(steps) > 5 and len(after) > 5
     np.testing.assert_allclose(after, np.tile(-0.5 * steps[0], (len(after), 1)), atol=1e-3)
     at = np.searchsorted(kept.time[0], met)
@@ -364,7 +367,7 @@ def test_four_balls_are_blocked_from_the_command_line(tmp_path, capsys):
 
 
 @pytest.mark.slow
-def test_balls_that_are_only_seen_are_blocked_from_the_command_line(tmp_path, capsys):
+def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     out = tmp_path / "run"
     command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open", "--wide"]
     assert main([*command, "--perception", "--replan", "10", "--out", str(out)]) == 0

@@ -1,4 +1,4 @@
-"""Rendered images of the arm's scene, and what is made of them. They skip where there is no OpenGL.
+"""Rendered images of the arm's scene, and measurements from them. Skipped without OpenGL.
 
 A small image, so that rendering without a graphics card takes some milliseconds.
 """
@@ -36,7 +36,7 @@ def scene():
 
 
 @pytest.mark.parametrize("place", [(1.2, 0.4, 1.2), (2.5, -1.8, 1.0), (3.0, 3.0, 2.2)])
-def test_a_rendered_ball_is_seen_where_it_is(scene, place):
+def test_a_rendered_ball_is_measured_at_its_true_position(scene, place):
     image, depth = scene.take(np.array(place))
     found = see(image, depth, np.ones_like(depth), CAMERA, ball_look())
     pixel, distance = project(CAMERA, jnp.array(place))
@@ -44,8 +44,8 @@ def test_a_rendered_ball_is_seen_where_it_is(scene, place):
     assert found.depth == pytest.approx(float(distance), abs=0.01)
 
 
-def test_depths_are_those_of_the_scene(scene):
-    """Of the pole, and of the floor at the bottom of the image."""
+def test_rendered_depths_match_the_scene(scene):
+    """Compare depths of the pole, and of the floor at the bottom of the image."""
     image, depth = scene.take(None)
     column, row = np.round(project(CAMERA, jnp.array([0.806, 0.0, 1.5]))[0]).astype(int)
     pole = np.array([0.806, 0.0]) - CAMERA.position[:2]
@@ -69,7 +69,7 @@ def test_a_ball_behind_the_pole_or_out_of_view_is_not_seen(scene):
 
 
 @pytest.mark.slow
-def test_a_flight_through_images_is_found_as_well_as_it_is_believed(scene):
+def test_the_error_of_a_flight_fitted_to_images_matches_its_estimated_error(scene):
     cases = pj.block.draw(1, "short", seed=1)
     ball = jax.tree.map(lambda leaf: leaf[0], cases.ball)
     noise = stereo_noise()
@@ -85,7 +85,7 @@ def test_a_flight_through_images_is_found_as_well_as_it_is_believed(scene):
     assert 0.4 < fit.misfit < 1.8
 
 
-def test_no_opengl_is_one_line(monkeypatch):
+def test_missing_opengl_is_reported_in_one_line(monkeypatch):
     def none(*_):
         raise ImportError("no library\nmore of it")
 
@@ -95,7 +95,7 @@ def test_no_opengl_is_one_line(monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_the_arm_shows_a_board_from_which_the_camera_is_found():
+def test_the_camera_is_calibrated_from_a_board_on_the_arm():
     arm, noise = irb1600(), stereo_noise()
     found, calibration = calibrate_camera(arm, CAMERA, noise, 12)
     np.testing.assert_allclose(found.position, CAMERA.position, atol=0.002)

@@ -1,4 +1,4 @@
-"""The simulated car: tyres, tracking, what it sees, scores, and a run from the command line."""
+"""The simulated car: tyres, tracking, sensing, scores, and a run from the command line."""
 
 import dataclasses
 import functools
@@ -39,7 +39,7 @@ from planner_jax.task.intercept.plan import InterceptPlan
 from tests.recordings import recording
 
 CAR = Vehicle()
-CURVATURE = 1.3  # [1/m]
+CURVATURE = 1.3  # [1/m], of the circle in open loop
 END, PIECES = 4.0, 20
 SHARE = np.linspace(0.0, 1.0, PIECES + 1)
 WAYS = {  # speed and curvature at the knots
@@ -51,7 +51,7 @@ EXACT, NOISY = PlaneSensing(), PlaneSensing(pose_stds=(0.01, 0.01))
 
 
 def plans(speed, curvature):
-    """Plans from the origin along the x axis, leaves (B, ...)."""
+    """Return plans from the origin along the x axis, leaves (B, ...)."""
     num = len(speed)
     zero, none = jnp.zeros(num), jnp.zeros(num, jnp.int32)
     knots = {"speed": speed, "curvature": curvature}
@@ -67,27 +67,27 @@ def plans(speed, curvature):
     )
 
 
-def driven(sensing):
-    """The ways of WAYS, driven: the drives at their end and all frames."""
+def drive_paths(sensing):
+    """Return drives along all paths of WAYS at their end, and all frames."""
     loop = DriveLoop(CAR_WORLD, sensing)
     keys = jax.random.split(jax.random.key(3), len(WAYS))
     drives = start_drives(loop, plans(*zip(*WAYS.values(), strict=True)), keys)
-    until = np.full(len(WAYS), END, np.float32)  # one program with that of flights
+    until = np.full(len(WAYS), END, np.float32)  # shares its program with the flights
     for _ in range(2):
         drives, frames = drive_on(CAR_WORLD, drives, until, num_frames=100)
     return jax.device_get((drives.replace(key=None), frames))
 
 
 @pytest.fixture(scope="module")
-def exactly():
-    return driven(EXACT)
+def noiseless():
+    return drive_paths(EXACT)
 
 
 @pytest.fixture(scope="module")
 def open_loop():
-    """Physics at the end of every step of two cars that are told a steering angle and no drive.
+    """Return the physics at the end of every step of two cars with steering commands but no drive.
 
-    The first one drives along a circle, the second is steered from side to side.
+    The first car drives along a circle, the second is steered from side to side.
     """
 
     @jax.jit
@@ -108,13 +108,13 @@ def open_loop():
     return jax.device_get(jax.vmap(drive)(physics, commands))
 
 
-def rough(stiffness):
-    """Tyres that never slide."""
+def tyres_without_sliding(stiffness):
+    """Return tyres with unlimited friction."""
     return Tyres(stiffness, friction=1e6)
 
 
 def forces(tyres, speed, steering=0.3, sway=0.02):
-    """Of the tyres on a car that drives along the x axis and sways."""
+    """Return the tyre forces of a car that drives along the x axis with a lateral velocity."""
     vel, vehicle = np.float32([speed, sway, 0.5 * speed]), dataclasses.replace(CAR, tyres=tyres)
     return np.asarray(forces_of(vehicle, vel, np.float32(steering)))
 
@@ -125,22 +125,22 @@ def forces_of(vehicle, vel, steering):
 
 
 @pytest.mark.slow
-def test_a_straight_plan_without_noise_is_tracked_within_a_centimetre(exactly):
-    drives, _ = exactly
+def test_a_straight_plan_without_noise_is_tracked_within_a_centimetre(noiseless):
+    drives, _ = noiseless
     assert drives.worst_tracking[0] < 0.01
     assert not drives.saturated.any()
 
 
-def test_a_slalom_without_noise_is_tracked_within_a_centimetre(exactly):
-    drives, frames = exactly
+def test_a_slalom_without_noise_is_tracked_within_a_centimetre(noiseless):
+    drives, frames = noiseless
     assert drives.worst_tracking[2] < 0.01
     apart = np.linalg.norm(frames.pose[..., :2] - frames.wanted, axis=2)
     assert apart.max() <= drives.worst_tracking.max() + 1e-5
 
 
 def test_noise_on_the_pose_is_filtered_and_the_same_seed_gives_the_same_bits():
-    first, frames = driven(NOISY)
-    again, _ = driven(NOISY)
+    first, frames = drive_paths(NOISY)
+    again, _ = drive_paths(NOISY)
     np.testing.assert_array_equal(first.physics.qpos, again.physics.qpos)
     assert 0.0 < first.worst_tracking.max() < 0.02
     assert np.isfinite(frames.pose).all()
@@ -163,31 +163,33 @@ def test_the_steering_angle_changes_no_faster_than_its_limit(open_loop):
     assert np.abs(angles).max() <= CAR.steering * (1.0 + 1e-6)
 
 
-def test_stiff_tyres_act_as_tyres_that_do_not_slip():
-    np.testing.assert_allclose(forces(rough(1e6), 1.0), forces(None, 1.0), rtol=1e-3, atol=1e-3)
-    soft = forces(rough(5.0), 1.0)
+def test_stiff_tyres_act_like_tyres_without_slip():
+    np.testing.assert_allclose(
+        forces(tyres_without_sliding(1e6), 1.0), forces(None, 1.0), rtol=1e-3, atol=1e-3
+    )
+    soft = forces(tyres_without_sliding(5.0), 1.0)
     assert np.abs(soft - forces(None, 1.0)).max() > 1.0
 
 
 def test_the_slower_the_car_the_less_its_tyres_slip():
-    def apart(speed):
-        """Of the forces from those without slip, relative."""
+    def relative_slip(speed):
+        """Return the relative difference between forces with and without slip."""
         held = forces(None, speed, sway=0.02 * speed)
-        slipping = forces(rough(5.0), speed, sway=0.02 * speed)
+        slipping = forces(tyres_without_sliding(5.0), speed, sway=0.02 * speed)
         return np.linalg.norm(slipping - held) / np.linalg.norm(held)
 
-    shares = [apart(speed) for speed in (0.1, 0.4, 1.5)]
+    shares = [relative_slip(speed) for speed in (0.1, 0.4, 1.5)]
     assert shares == sorted(shares) and shares[0] < 0.3 < shares[2]
 
 
-def test_friction_bounds_what_a_tyre_bears():
+def test_friction_bounds_the_lateral_force_of_a_tyre():
     most = Tyres().friction * sum(CAR.loads)
     pushed = forces(Tyres(), 1.5, steering=0.5, sway=1.0)
     assert np.hypot(*pushed[:2]) <= most * (1.0 + 1e-5)
     assert np.hypot(*forces(None, 1.5, steering=0.5, sway=1.0)[:2]) > most
 
 
-def test_contacts_of_planned_poses_are_those_that_the_referee_finds():
+def test_contacts_of_planned_poses_equal_those_of_the_referee():
     cases = intercept.draw(6, "hard", 1)
     speed, curvature = np.full((6, PIECES + 1), 0.6), np.tile(0.6 * np.sin(6.0 * SHARE), (6, 1))
     plan = plans(speed, curvature).replace(start=cases.start, time=cases.time)
@@ -210,7 +212,7 @@ def test_contacts_of_planned_poses_are_those_that_the_referee_finds():
     assert not found.success.any()
 
 
-def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
+def test_predictions_use_only_observations_that_have_arrived():
     loop = DriveLoop(CAR_WORLD, dataclasses.replace(EXACT, target_std=0.1, latency=0.05))
     seen = meetings("easy", 2, seed=4, observation_rate=1.0)
     of = jax.jit(functools.partial(predict_scene, loop, known_target=False, predict_movers=True))
@@ -228,7 +230,9 @@ def test_what_is_expected_of_a_target_rests_on_what_was_shown_until_then():
 
 @dataclasses.dataclass
 class StraightOn(pj.Planner):
-    """Plans with one even acceleration along the heading; unsolved once it has made `solved`."""
+    """A planner with constant acceleration along the heading; only the first `solved` plans are
+    solved.
+    """
 
     case_type = intercept.InterceptCase
     attempts = (pj.Attempt(),)
@@ -257,7 +261,7 @@ class StraightOn(pj.Planner):
 
 
 @pytest.mark.parametrize("solved", [1, 2])
-def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(solved):
+def test_a_new_plan_starts_at_the_estimated_pose_and_is_driven_if_it_is_solved(solved):
     start = np.array([[0.8, 2.0, 0.0], [0.8, 4.0, 0.0], [0.8, 6.0, 0.0]], np.float32)
     goal = start[:, :2] + np.float32([[2.0, 0.0], [2.5, 0.0], [3.0, 0.0]])
     still = TurningPath(pos=goal, vel=0.0 * goal, turn_rate=np.zeros(3, np.float32))
@@ -274,7 +278,7 @@ def test_a_plan_made_anew_begins_where_the_car_is_and_is_driven_if_it_is_good(so
     first, again = planner.starts
     np.testing.assert_allclose(first, start)
     there = flights.flown.poses[:, 100]
-    assert 1e-5 < np.abs(again - there).max() < 0.02  # where it believes to be
+    assert 1e-5 < np.abs(again - there).max() < 0.02  # estimated pose
     assert flights.flown.meeting == pytest.approx(END, rel=1e-5)
 
 
@@ -312,7 +316,7 @@ def test_another_robot_or_car_is_refused_in_one_line():
         require_car(dataclasses.replace(CAR, wheelbase=0.25), cases)
 
 
-def test_a_prism_moves_evenly_and_its_mesh_has_its_sides_and_top():
+def test_a_prism_moves_at_constant_velocity_and_its_mesh_has_sides_and_top():
     square = np.array([(0.0, 0.0), (2.0, 0.0), (2.0, 1.0), (0.0, 1.0)])
     prism = Prism(square, 0.5, "#FFFFFF", (0.3, -0.1))
     base, top, *sides = prism.outlines(10.0)
@@ -324,7 +328,7 @@ def test_a_prism_moves_evenly_and_its_mesh_has_its_sides_and_top():
     np.testing.assert_allclose(area, 2.0 + 6.0 * 0.5)
 
 
-def test_a_picture_shows_walls_movers_and_what_is_expected(tmp_path):
+def test_a_picture_shows_walls_movers_and_the_predicted_path(tmp_path):
     kept = recording()
     way = np.zeros((1, kept.time.shape[1], 9, 3))
     way[..., 0] = np.linspace(2.0, 3.0, 9)
@@ -336,7 +340,7 @@ def test_a_picture_shows_walls_movers_and_what_is_expected(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_can_be_reached_begins_at_the_start_and_keeps_off_walls():
+def test_the_reachable_set_begins_at_the_start_and_avoids_walls():
     task = InterceptFly(suite="hard", seed=2).flight()
     layers, cases = task.reachable(1), intercept.draw(1, "hard", 2, first=1)
     times = [time for time, _ in layers]

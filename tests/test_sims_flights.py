@@ -1,4 +1,4 @@
-"""Whole flights in closed loop: what is planned is flown, and noise is borne."""
+"""Whole flights in closed loop: plans are executed, and noise is tolerated."""
 
 import dataclasses
 from pathlib import Path
@@ -37,15 +37,15 @@ from planner_jax.trajectory.polynomial import evaluate
 TRACES = []
 
 
-def planned_places(flown):
-    """Where the last plans are at the times of the first ball's contact, (B, 3) [m]."""
+def evaluate_contact_positions(flown):
+    """Return positions (B, 3) [m] of the last plans at the contact times of the first ball."""
     times = flown.contact.planned_time[:, 0] - flown.began
     return np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, times))
 
 
 def contact_errors(flown):
-    """Distance [m] and time [s] between planned and flown contacts of the first ball."""
-    places = flown.contact.robot_pos[:, 0] - planned_places(flown)
+    """Return distance [m] and time [s] between planned and simulated contacts of the first ball."""
+    places = flown.contact.robot_pos[:, 0] - evaluate_contact_positions(flown)
     times = flown.contact.time - flown.contact.planned_time
     return np.linalg.norm(places, axis=1), np.abs(times[:, 0])
 
@@ -72,7 +72,7 @@ def test_without_noise_every_ball_is_caught_where_and_when_it_was_planned(catche
 def test_without_noise_every_ball_is_hit_where_and_when_it_was_planned(hits):
     places, times = contact_errors(hits.flown)
     assert places.max() < 0.02 and times.max() < 0.002
-    assert hits.miss.max() < 0.05  # from the target, after a second and a half of flight
+    assert hits.miss.max() < 0.05  # from the target, after 1.5 s of flight
 
 
 @pytest.mark.slow
@@ -86,13 +86,13 @@ def test_a_plan_of_the_other_task_is_refused(catches, hits):
 
 
 @pytest.mark.slow
-def test_a_plan_that_is_given_is_the_one_that_is_flown(catches):
+def test_a_passed_plan_is_flown(catches):
     again = fly_catches(Loop(CATCH_WORLD), throws(3, seed=1), plan=catches.first_plan)
     np.testing.assert_allclose(again.flown.contact.time, catches.flown.contact.time, atol=1e-5)
 
 
 def with_tool(world, **changes):
-    """The world, its robot's tool changed."""
+    """Return the world with a changed tool of its robot."""
     tool = dataclasses.replace(world.robot.tool, **changes)
     model = dataclasses.replace(world.robot.model, tool=tool)
     return dataclasses.replace(world, robot=dataclasses.replace(world.robot, model=model))
@@ -140,10 +140,10 @@ WIDER = [bounds(Loop(CATCH_WORLD), distance) for distance in LIMITS]
 
 
 @pytest.mark.slow
-def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible():
+def test_a_ball_is_planned_alone_where_no_plan_can_include_the_next_ball():
     suite = jax.tree.map(np.asarray, catch.draw(2, "throws", seed=4, num_targets=2))
     both = dataclasses.replace(suite, present=np.ones((2, 2), bool))
-    # The second lane's next ball is to be caught at once.
+    # The next ball of the second case must be caught immediately.
     both = dataclasses.replace(both, horizon=both.horizon * np.array([[1.0, 2.0], [1.0, 0.02]]))
     known, plans = plan_ahead(catch.planner(decide="greedy"), both, 0, WIDER)
     assert not known.present[1, 1] and known.present[1, 0]
@@ -152,7 +152,7 @@ def test_a_ball_is_planned_for_alone_where_no_plan_of_the_next_one_is_possible()
 
 @struct.dataclass
 class Outcome:
-    """What `plan_ahead` looks at in a plan."""
+    """The fields of a plan that `plan_ahead` reads."""
 
     status: np.ndarray
     violation: np.ndarray
@@ -161,7 +161,8 @@ class Outcome:
 @pytest.mark.parametrize(
     ("pair", "alone", "chosen"),
     [
-        # Violations within each limits on the body rate, and what is flown: both, within which.
+        # Violations for each limit of the body rate, and the result: whether both balls are
+        # planned, and the limit.
         ({3.0: 0.02, 4.5: -0.1}, {3.0: -0.1}, (True, 4.5)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.05}, {3.0: -0.1}, (True, 5.0)),
         ({3.0: 0.3, 4.5: 0.2, 5.0: 0.15}, {3.0: -0.1}, (False, 3.0)),
@@ -172,15 +173,19 @@ class Outcome:
 def test_the_next_ball_is_given_up_only_where_no_limits_admit_both(
     monkeypatch, pair, alone, chosen
 ):
-    """A first catch that forgets the next ball leaves it out of reach, and control is lost."""
+    """Check that both balls are planned with wider limits before the first one is planned alone.
 
-    def planned(_, cases):
+    A plan for the first ball alone may leave the next one out of reach, or control too little
+    thrust.
+    """
+
+    def fake_plan_all(_, cases):
         rate = round(float(cases.limits.body_rate[0]), 3)
         violation = (pair if cases.present.all() else alone)[rate]
         status = Status.CONVERGED if violation <= 0.0 else Status.INFEASIBLE
         return Outcome(np.array([status]), np.array([violation]))
 
-    monkeypatch.setattr(catch_ahead, "plan_all", planned)
+    monkeypatch.setattr(catch_ahead, "plan_all", fake_plan_all)
     both = jax.tree.map(np.asarray, catch.draw(1, "parabola2", seed=4))
     known, plans = plan_ahead(catch.planner(), within(both, WIDER[0]), 0, WIDER)
     assert (known.present.all(), known.limits.body_rate[0]) == chosen
@@ -198,7 +203,7 @@ def test_a_batch_is_flown_like_its_flights_one_by_one():
 
 
 @pytest.mark.slow
-def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_planning_anew():
+def test_with_noise_latency_and_wrong_drag_balls_are_caught_by_replanning():
     flights = fly_catches(
         Loop(CATCH_WORLD, NOISES["lab"], replan=100.0), throws(8, drag_error=0.15)
     )
@@ -213,8 +218,8 @@ def test_a_second_ball_is_caught_after_the_first():
 
 
 @pytest.mark.slow
-def test_balls_that_would_be_missed_are_caught_by_deciding_anew():
-    """Plans that only go on from the one that is flown miss a ball in each of these flights."""
+def test_balls_that_would_be_missed_are_caught_by_new_decisions():
+    """Check flights in which replanning from the current plan alone would miss a ball."""
     world = dataclasses.replace(CATCH_WORLD, num_balls=3)
     missed = throws(200, 3, seed=102, drag_error=0.15)[[58, 62, 71, 73, 92, 131, 143, 188]]
     flights = fly_catches(Loop(world, NOISES["lab"], replan=100.0), missed, seed=102)
@@ -224,27 +229,25 @@ def test_balls_that_would_be_missed_are_caught_by_deciding_anew():
 @pytest.mark.parametrize(
     ("fresh", "warm", "preferred"),
     [
-        ((0.3, 1.0), (0.0, 9.0), False),  # one that keeps the limits is not given up
+        ((0.3, 1.0), (0.0, 9.0), False),  # a feasible plan is not replaced
         ((0.0, 9.0), (0.3, 1.0), True),
         ((0.3, 1.0), (0.4, 1.0), True),
         ((0.4, 1.0), (0.3, 1.0), False),
         ((0.0, 1.0), (0.0, 2.0), True),
-        ((0.0, 0.99), (0.0, 1.0), False),  # too little to change the way for
+        ((0.0, 0.99), (0.0, 1.0), False),  # the gain is too small
         ((np.nan, 1.0), (0.9, 1.0), False),
         ((0.9, 1.0), (np.nan, 1.0), True),
     ],
 )
-def test_a_plan_from_scratch_is_flown_where_it_keeps_limits_better_or_costs_less(
-    fresh, warm, preferred
-):
-    """Pairs of the greatest relative excess over a limit and of the cost."""
+def test_a_plan_from_scratch_is_flown_if_it_violates_less_or_costs_less(fresh, warm, preferred):
+    """Check pairs of greatest relative violation and cost."""
     plan: Any = SimpleNamespace
     first, second = (plan(violation=v, cost=c) for v, c in (fresh, warm))
     assert bool(is_worth_flying(first, second)) == preferred
 
 
 @pytest.mark.slow
-def test_a_hit_that_is_planned_anew_lands_on_the_target():
+def test_a_replanned_hit_lands_on_the_target():
     exact = fly_hits(Loop(HIT_WORLD, replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
     assert exact.miss.max() < 0.05
     noisy = fly_hits(Loop(HIT_WORLD, NOISES["lab"], replan=50.0), volleys(4, REAL_SCENARIOS["S.4"]))
@@ -252,7 +255,7 @@ def test_a_hit_that_is_planned_anew_lands_on_the_target():
 
 
 @pytest.mark.slow
-def test_a_robot_of_its_own_is_hit_with_where_it_was_planned():
+def test_a_user_robot_hits_the_ball_as_planned():
     robot = pj.read_robot(Path(__file__).parent / "data" / "my_quadrotor.yaml")
     world = dataclasses.replace(HIT_WORLD, robot=Quadrotor(robot))
     served = volleys(4, REAL_SCENARIOS["S.1"], seed=1, robot=robot)
@@ -280,7 +283,7 @@ class TracedPlanner(WellPlanner):
         return case
 
 
-def test_what_was_compiled_ahead_is_not_traced_again():
+def test_attempts_compiled_ahead_are_not_traced_again():
     first, second = WellPlanner().rounds
     own = dataclasses.replace(first, solver=LbfgsConfig(max_steps=41, step_cap=0.2))
     planner, easy = TracedPlanner(rounds=(own, second, own)), Well(GOALS[:1].repeat(3))
@@ -292,7 +295,7 @@ def test_what_was_compiled_ahead_is_not_traced_again():
     assert len(TRACES) == before
 
 
-def test_a_planner_on_the_host_may_be_asked_to_compile_ahead_too():
+def test_compiling_ahead_also_accepts_a_planner_on_the_host():
     tried = []
 
     class OnHost(Planner):

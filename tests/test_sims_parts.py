@@ -1,4 +1,4 @@
-"""The simulated world's parts: allocation, control, sensing, scoring, and MJX beside MuJoCo."""
+"""Parts of the simulated world: allocation, control, sensing, scoring, and MJX against MuJoCo."""
 
 import dataclasses
 import functools
@@ -85,8 +85,11 @@ def test_saturated_rotors_keep_roll_and_pitch_and_let_yaw_go_first(rotors):
     assert weak.min() > rotors.min_thrust - 1e-6
 
 
-def test_every_mode_of_the_cascade_is_damped_by_half_in_spite_of_the_lag_of_the_rotors():
-    """Sideways from hover: the lag, the rate, attitude, velocity and position, in that order."""
+def test_every_mode_of_the_cascade_has_a_damping_ratio_of_half_despite_rotor_lag():
+    """Check the linearised lateral motion at hover.
+
+    Its states are rotor lag, rate, attitude, velocity and position, in that order.
+    """
     gains, lag = Gains(), ROTORS.lag
     turn, pull = gains.attitude * gains.velocity, gains.attitude * gains.position
     inner = [gains.attitude, gains.position + turn, pull]
@@ -94,7 +97,7 @@ def test_every_mode_of_the_cascade_is_damped_by_half_in_spite_of_the_lag_of_the_
     assert (-modes.real / np.abs(modes)).min() > 0.5
 
 
-def test_a_torque_raises_a_weak_thrust_no_further_than_is_spared_for_it():
+def test_a_torque_raises_a_weak_thrust_by_at_most_the_spare_thrust():
     found = thrusts(ROTORS, 1.0, [2.0, 0.0, 0.0])
     thrust, roll = (ROTORS.allocation @ found)[:2]
     assert 0.0 < roll < 2.0
@@ -126,23 +129,23 @@ def test_plans_in_flight_stay_within_the_limits_of_the_robot(distance, thrust, r
     np.testing.assert_allclose(own["body_rate"], 8.0 * rate / 5.0)
 
 
-def test_the_flat_body_rate_is_that_of_the_flat_attitude():
+def test_the_flat_body_rate_is_the_rate_of_the_flat_attitude():
     acc = lambda t: jnp.array([4.0 * jnp.sin(3.0 * t), 3.0 * t, 2.0 * t**2])  # noqa: E731
 
     @jax.jit
-    def turned(t, step):
-        """The turn in a step, and what the body rates at its ends make of it."""
+    def compare_rates(t, step):
+        """Return the rotation per time in a step, and the mean of the body rates at its ends."""
         now, then = (
             flat_attitude(acc(t), jax.jacfwd(acc)(t), jnp.asarray(9.81)) for t in (t, t + step)
         )
         return rotation_error(now[0], then[0]) / step, 0.5 * (now[1] + then[1])
 
     with jax.enable_x64(True):
-        np.testing.assert_allclose(*turned(0.3, 1e-3), atol=1e-3)
+        np.testing.assert_allclose(*compare_rates(0.3, 1e-3), atol=1e-3)
 
 
 def wiggle():
-    """A trajectory of one piece that accelerates to and fro."""
+    """Return a trajectory of one piece that accelerates back and forth."""
     coeffs = np.zeros((1, 8, 3), np.float32)
     coeffs[0, :, 0] = [0.0, 0.0, 0.0, 0.0, 3.0, -2.0, 0.0, 0.0]
     coeffs[0, :, 2] = [1.0, 0.0, 0.0, 0.0, 1.0, -0.7, 0.0, 0.0]
@@ -168,7 +171,7 @@ def test_a_trajectory_comes_to_rest_smoothly_after_its_end():
 
 @pytest.fixture(scope="module")
 def tracked():
-    """A few quadrotors tracking the same trajectory from different attitudes, 0.8 s."""
+    """Return a few quadrotors that track one trajectory for 0.8 s from different attitudes."""
     world, robot = CATCH_WORLD, CATCH_WORLD.robot
     plan, path = SimpleNamespace(trajectory=wiggle()), jax.jit(with_rest)(wiggle())
 
@@ -199,7 +202,7 @@ def test_a_tilt_of_one_radian_is_recovered_from(tracked):
     assert tracked[0][1].max() < 1.0 and tracked[0][1][-1] < 0.1
 
 
-def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
+def test_hover_is_an_equilibrium_and_mjx_agrees_with_mujoco():
     world = CATCH_WORLD
     balls = BallState(jnp.array([[0.5, 0.0, 2.0]]), jnp.array([[1.0, -2.0, 3.0]]))
     drag = jnp.array([0.06])
@@ -225,7 +228,7 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
         data.qfrc_applied[6:] = -BALL_MASS * 0.06 * np.linalg.norm(vel) * vel
         mujoco.mj_step(model, data)
         reference.append(data.qpos.copy())
-    assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # it did turn
+    assert np.ptp(np.array(reference)[:, 3:7], axis=0).max() > 0.01  # the quadrotor rotates
     np.testing.assert_allclose(path, reference, atol=1e-4)
     flown = jax.jit(functools.partial(fly, num_steps=100))
     truth = flown(jax.tree.map(lambda x: x[0], balls), 0.8, drag[0], GRAVITY)[0]
@@ -233,13 +236,13 @@ def test_hover_is_an_equilibrium_and_mjx_flies_as_mujoco_does():
 
 
 @pytest.mark.parametrize("world", [CATCH_WORLD, HIT_WORLD])
-def test_court_and_machine_stand_there_and_touch_nothing(world):
+def test_court_and_machine_are_visible_and_touch_nothing(world):
     model = mujoco_model(world)
     standing = np.flatnonzero(model.geom_bodyid == 0)
     assert len(standing) >= 6
     assert not model.geom_contype.any() and not model.geom_conaffinity.any()
     assert model.npair == 0
-    assert np.ptp(model.geom_pos[standing], axis=0)[0] > 3.0  # as far as the machine
+    assert np.ptp(model.geom_pos[standing], axis=0)[0] > 3.0  # the farthest is the machine
     for part in machine_parts((1.0, 2.0, 0.8), 0.5) + court_parts():
         lines = np.concatenate(outlines(part))
         np.testing.assert_allclose(0.5 * (lines.min(0) + lines.max(0)), part.centre, atol=1e-9)
@@ -247,7 +250,7 @@ def test_court_and_machine_stand_there_and_touch_nothing(world):
 
 
 def moments(gap_before, gap_after, aside):
-    """A level tool at rest at the origin, and one ball over it before and after a step."""
+    """Return a level tool at rest at the origin, and one ball over it before and after a step."""
     at = lambda gap: Moment(  # noqa: E731
         robot_pos=jnp.zeros(3),
         robot_vel=jnp.zeros(3),
@@ -278,7 +281,7 @@ def test_a_ball_is_caught_from_above_inside_the_radius_at_the_interpolated_time(
         np.testing.assert_allclose(contact.offset, aside, rtol=1e-5)
 
 
-def test_the_drag_is_found_from_the_energy_that_is_lost():
+def test_the_drag_is_estimated_from_the_lost_energy():
     sensing, true = Sensing(position_std=0.002), jnp.float32(0.0616)
     ball = BallState(jnp.array([4.0, 0.0, 0.8]), jnp.array([-4.0, 0.5, 7.0]))
     flown = jax.jit(functools.partial(fly, num_steps=130))(ball, 1.3, true, GRAVITY)
@@ -295,22 +298,22 @@ def test_the_drag_is_found_from_the_energy_that_is_lost():
     first = first_estimate(path[0], 1.15 * true)
 
     @jax.jit
-    def followed(first):
+    def estimate_drag(first):
         last = jax.lax.scan(advance, first, (jnp.arange(120), seen))[0]
         return last.drag, predict(last, 0.1, GRAVITY).pos
 
-    drag, later = followed(first)
+    drag, later = estimate_drag(first)
     assert abs(drag / true - 1.0) < 0.06
     np.testing.assert_allclose(later, ahead, atol=0.02)
 
 
-def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
+def test_the_estimate_of_an_awaited_ball_predicts_the_guessed_throw():
     loop = Loop(dataclasses.replace(CATCH_WORLD, num_balls=2), NOISES["lab"], replan=100.0)
     coming = BallState(jnp.array([2.9, 0.1, 2.4]), jnp.array([-3.0, 0.5, 4.0]))
 
     @jax.jit
-    def believed(coming):
-        """The balls then, of both estimates, and the drag."""
+    def predict_both(coming):
+        """Return the balls that both estimates predict, and the drag."""
         flights = ready(loop, jnp.zeros((3, 3)), jax.random.split(jax.random.key(0), 3))
         drag = jnp.full((3, 2), 0.06)
         flights = await_ball(loop, flights, coming, drag, ball=1, ahead=0.8)
@@ -323,14 +326,14 @@ def test_an_awaited_ball_is_believed_to_come_as_it_is_guessed():
         ]
         return then, flights.estimates.drag
 
-    both, drag = jax.device_get(believed(coming))
+    both, drag = jax.device_get(predict_both(coming))
     for then in both:
         np.testing.assert_allclose(then.pos[:, 1], np.tile(coming.pos, (3, 1)), atol=2e-3)
         np.testing.assert_allclose(then.vel[:, 1], np.tile(coming.vel, (3, 1)), atol=5e-3)
     np.testing.assert_allclose(drag[:, 1], 0.06)
 
 
-def test_a_lost_look_shows_nothing():
+def test_a_missing_observation_is_nan():
     sensing = Sensing(dropout=0.25)
     seen = jax.jit(lambda key: observe(key, jnp.zeros((2000, 3)), sensing))(jax.random.key(1))
     assert abs(np.isnan(seen[:, 0]).mean() - 0.25) < 0.04
@@ -358,7 +361,7 @@ def test_a_lost_look_shows_nothing():
         (lambda: dataclasses.replace(CATCH_WORLD, timestep=0.0), "timestep must be > 0, got 0"),
     ],
 )
-def test_what_cannot_be_flown_is_refused_in_one_line(build, message):
+def test_invalid_settings_of_a_flight_are_refused_in_one_line(build, message):
     with pytest.raises(ValueError) as error:
         build()
     assert str(error.value) == message

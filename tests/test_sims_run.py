@@ -60,11 +60,11 @@ from tests.recordings import recording
         ),
         (
             lambda: CatchFly(redecide=40.0),
-            "redecide must be 0 or a divisor of the 100 Hz at which plans are made anew, got 40",
+            "redecide must be 0 or a divisor of the 100 Hz of replanning, got 40",
         ),
         (
             lambda: CatchFly(planner="mpp", redecide=100.0),
-            "redecide must be 0 or a divisor of the 0 Hz at which plans are made anew, got 100",
+            "redecide must be 0 or a divisor of the 0 Hz of replanning, got 100",
         ),
         (
             lambda: HitFly(planner="juggle", replan=50.0),
@@ -83,14 +83,14 @@ def test_settings_that_break_a_rule_are_refused_in_one_line(build, message):
     assert str(error.value) == message
 
 
-def test_order_and_times_are_decided_anew_with_every_plan_unless_asked_otherwise():
+def test_order_and_times_are_decided_with_every_plan_by_default():
     assert CatchFly().redecide_rate == CatchFly().rate == 100.0
     assert CatchFly(replan=50.0).redecide_rate == 50.0
     assert CatchFly(redecide=0.0).redecide_rate == 0.0
-    assert CatchFly(planner="mpp").redecide_rate == 0.0  # whose plans are not made anew
+    assert CatchFly(planner="mpp").redecide_rate == 0.0  # "mpp" does not replan
 
 
-def test_the_command_says_what_is_wrong_and_writes_nothing(tmp_path, capsys):
+def test_the_command_names_the_error_and_writes_nothing(tmp_path, capsys):
     out = tmp_path / "run"
     assert main(["fly", "catch", "--noise", "loud", "--out", str(out)]) == 2
     assert main(["fly", "hit", "--video", "film.avi", "--out", str(out)]) == 2
@@ -133,7 +133,7 @@ def test_mp4_without_ffmpeg_is_refused(tmp_path, monkeypatch):
         require_film(tmp_path / "flights.mp4")
 
 
-def test_a_run_says_what_it_flies_in_words_of_its_own():
+def test_a_run_describes_its_robot_and_conditions():
     exact, noisy = (CatchFly(noise=noise).flight().simulated for noise in ("none", "lab"))
     assert "motion capture without errors or latency" in exact
     assert "motion capture with noise, dropout and latency" in noisy
@@ -142,7 +142,7 @@ def test_a_run_says_what_it_flies_in_words_of_its_own():
 
 
 @pytest.mark.slow
-def test_a_run_of_flights_is_written_whole(tmp_path, capsys):
+def test_a_run_of_flights_writes_all_its_files(tmp_path, capsys):
     out = tmp_path / "run"
     command = ["fly", "catch", "--num", "3", "--batch", "2", "--noise", "none", "--replan", "0"]
     assert main([*command, "--video", "--out", str(out)]) == 0
@@ -190,7 +190,7 @@ DROP = Task(
 
 @dataclasses.dataclass(frozen=True)
 class DropFly(BallFly):
-    """A third task: a quadrotor hovers, and a ball falls into its net."""
+    """The settings of a user's task: a quadrotor hovers, and a ball falls into its net."""
 
     TASK, FLIGHT, RATE = DROP, "tests.test_sims_run:DropFlight", 0.0
 
@@ -212,7 +212,7 @@ class DropPilot:
 
 @dataclasses.dataclass(frozen=True)
 class RisingPilot(DropPilot):
-    """Has two plans made anew: the last one, and one that is a millimetre higher."""
+    """A pilot with two searches: one returns the last plan, the other raises it by a millimetre."""
 
     num: int = 2
 
@@ -281,7 +281,7 @@ def test_a_task_without_flights_is_refused_in_one_line(monkeypatch):
 
 
 @pytest.mark.slow
-def test_the_parts_of_a_period_fly_as_one_program_does(monkeypatch):
+def test_the_parts_of_a_period_give_the_same_flights_as_one_program(monkeypatch):
     flight = DropFly(num=2, noise="none").flight()
     loop = dataclasses.replace(flight.loop(True), replan=50.0)
     flights = []
@@ -302,19 +302,19 @@ def test_a_leg_compiled_ahead_is_not_compiled_again(monkeypatch, caplog):
     loop = dataclasses.replace(flight.loop(False), replan=50.0)
     pilot, drag = RisingPilot(3), jnp.zeros((3, 1))
     start = ready(loop, jnp.zeros((3, 3)), flight_keys(0, flight.cases().index))
-    jax.config.update("jax_log_compiles", True)  # of every thread
+    jax.config.update("jax_log_compiles", True)  # in every thread
     try:
         begin_compiling(loop, pilot, start, None, drag)()
-        ahead = compiled_parts(caplog)
+        ahead = list_compiled_parts(caplog)
         plan = jax.tree.map(lambda leaf: jnp.ones(leaf.shape, leaf.dtype), pilot.plan_shapes(None))
         fly_leg(loop, pilot, start.replace(plan=plan), None, drag, num_periods=3)
     finally:
         jax.config.update("jax_log_compiles", False)
     assert ahead == ["_pose_problems", "_fly", "_search_plans", "_search_plans", "_with_plans"]
-    assert compiled_parts(caplog) == ahead
+    assert list_compiled_parts(caplog) == ahead
 
 
-def compiled_parts(caplog):
+def list_compiled_parts(caplog):
     found = re.findall(r"Finished XLA compilation of jit\((_\w+)\)", caplog.text)
     return sorted(name for name in found if hasattr(sims_loop, name))
 

@@ -46,12 +46,12 @@ needs_viser = pytest.mark.skipif(
 
 
 def drag_free(pos, vel, times):
-    """Places (K, 3) of a ball without drag."""
+    """Return positions (K, 3) of a ball without drag."""
     return pos + np.outer(times, vel) - np.outer(0.5 * GRAVITY * times**2, [0.0, 0.0, 1.0])
 
 
 def flight_with_return():
-    """A quadrotor at rest for 0.5 s, and a ball that is met after 0.2 s and goes straight up."""
+    """Return a quadrotor at rest for 0.5 s, and a ball that is hit straight up after 0.2 s."""
     times = 0.01 * np.arange(1, 51)
     pos, vel = np.array([2.0, 0.0, 2.0]), np.array([-3.0, 0.0, 4.0])
     balls = drag_free(pos, vel, times)
@@ -70,17 +70,17 @@ def flight_with_return():
     return flown, launched, back
 
 
-def kept(flown, balls, begins, **more):
-    """The recording of one flight without drag."""
+def record_flight(flown, balls, begins, **more):
+    """Return the recording of one flight without drag."""
     drag = np.zeros((1, len(begins)))
     launches = Launches(balls, drag, np.array(begins), seen=0.3, **more)
     one = {"index": np.array([0]), "success": np.array([True])}
     return make_recording(CATCH_WORLD, flown, launches, **one)
 
 
-def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():
+def test_a_recording_contains_the_ball_from_the_machine_to_the_ground():
     flown, launched, back = flight_with_return()
-    whole = kept(flown, launched, [0.0], returned=back, target=np.zeros((1, 3)))
+    whole = record_flight(flown, launched, [0.0], returned=back, target=np.zeros((1, 3)))
     path, times = whole.balls[0, :, 0], whole.time[0]
     np.testing.assert_allclose(times[0], -0.3, atol=1e-9)
     before = times < 0.205
@@ -93,11 +93,11 @@ def test_a_recording_holds_the_ball_from_the_machine_to_the_ground():
     assert down <= times[-1] < down + 0.02
     np.testing.assert_allclose(path[-1], [*back.pos[0, :2], 0.0], atol=1e-4)
     assert np.isfinite(path).all()
-    assert np.isnan(whole.robot[0, times > 0.505]).all()  # it was simulated no further
+    assert np.isnan(whole.robot[0, times > 0.505]).all()  # the simulation has ended
     assert whole.num_looks(0) == len(times)
 
 
-def test_a_second_ball_is_there_from_its_own_launch():
+def test_a_second_ball_is_recorded_from_its_own_launch():
     flown, launched, _ = flight_with_return()
     physics, begin = flown.record.physics, 0.4
     waiting = np.full((1, 50, 3), 100.0)
@@ -111,13 +111,13 @@ def test_a_second_ball_is_there_from_its_own_launch():
         ),
     )
     balls = jax.tree.map(lambda leaf: np.repeat(leaf, 2, axis=1), launched)
-    whole = kept(flown, balls, [0.0, begin])
+    whole = record_flight(flown, balls, [0.0, begin])
     times, second = whole.time[0], whole.balls[0, :, 1]
     assert np.isnan(second[times < begin - 0.305]).all()
     early = (times > begin - 0.305) & (times < begin + 0.005)
     expected = drag_free(launched.pos[0, 0], launched.vel[0, 0], times[early] - begin)
     np.testing.assert_allclose(second[early], expected, atol=1e-6)
-    assert np.isnan(second[times > begin + 0.005]).all()  # it is far away in this record
+    assert np.isnan(second[times > begin + 0.005]).all()  # the record has it far away
     assert np.isnan(whole.met).all() and np.isnan(whole.contact).all()
     assert whole.num_looks(0) == len(times) == 81
 
@@ -132,7 +132,7 @@ def test_a_recording_is_read_as_it_was_written(tmp_path):
         np.testing.assert_allclose(after, before, atol=1e-6)
 
 
-def test_a_frame_shows_where_everything_is_at_a_look():
+def test_a_frame_holds_all_positions_at_a_sample():
     now = frame(recording(), NET, 0, 2)
     assert now.time == 0.02
     np.testing.assert_allclose(now.robot[:3], [0.0, 0.0, 1.02])
@@ -156,18 +156,18 @@ def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net()
         (0, -1, "look must be >= 0 and < 6, got -1"),
     ],
 )
-def test_a_frame_that_is_not_there_is_refused(flight, look, message):
+def test_a_missing_frame_is_refused(flight, look, message):
     with pytest.raises(ValueError) as error:
         frame(recording(), NET, flight, look)
     assert str(error.value) == message
 
 
-def test_a_path_is_drawn_between_points_that_are_there():
+def test_a_path_is_drawn_between_finite_points():
     path = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [np.nan] * 3, [3.0, 0.0, 0.0]])
     np.testing.assert_allclose(segments(path), [[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]])
 
 
-def test_what_cannot_be_served_is_said_in_one_line():
+def test_an_address_that_cannot_be_served_is_refused_in_one_line():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(ArgumentError, match=f"^port must be free, got {port}"):
@@ -181,7 +181,7 @@ def test_what_cannot_be_served_is_said_in_one_line():
 
 @pytest.fixture
 def run_folder(tmp_path):
-    """A folder like that of a run of flights."""
+    """Return a folder in the form of a run of flights."""
     folder = RunFolder(tmp_path / "run")
     settings = dataclasses.asdict(CatchFly())
     manifest = {
@@ -199,32 +199,43 @@ def run_folder(tmp_path):
     return folder
 
 
-def said(capsys, *arguments):
-    """What the command says when it refuses something."""
+def read_error(capsys, *arguments):
+    """Return the error message of a rejected command."""
     assert main(["view", *map(str, arguments)]) == 2
     return capsys.readouterr().err.removeprefix("planner-jax: error: ")
 
 
 def test_a_folder_without_flights_is_refused_in_one_line(run_folder, tmp_path, capsys):
-    assert said(capsys, tmp_path / "no").startswith("RUN must be the folder of a run, with its m")
+    assert read_error(capsys, tmp_path / "no").startswith(
+        "RUN must be the folder of a run, with its m"
+    )
     manifest = run_folder.read_manifest()
     run_folder.write_manifest({**manifest, "kind": "bench hit_rows"})
-    assert said(capsys, run_folder.path) == "RUN must be a run of flights, got a bench hit_rows\n"
+    assert (
+        read_error(capsys, run_folder.path)
+        == "RUN must be a run of flights, got a bench hit_rows\n"
+    )
     run_folder.write_manifest({**manifest, "state": "running"})
-    assert said(capsys, run_folder.path).startswith("RUN must be finished, with its flights, got")
+    assert read_error(capsys, run_folder.path).startswith(
+        "RUN must be finished, with its flights, got"
+    )
     run_folder.write_manifest(manifest)
     settings = {**manifest["parameters"], "task": "catch"}
     run_folder.write_manifest({**manifest, "parameters": settings})
-    assert said(capsys, run_folder.path).startswith("RUN must be a run with settings of this ver")
+    assert read_error(capsys, run_folder.path).startswith(
+        "RUN must be a run with settings of this ver"
+    )
     run_folder.write_manifest(manifest)
     Dataset(run_folder.path / FLIGHTS).files()[0].write_bytes(b"half of it")
-    assert said(capsys, run_folder.path).startswith("RUN must be a run whose flights/part-000000-")
+    assert read_error(capsys, run_folder.path).startswith(
+        "RUN must be a run whose flights/part-000000-"
+    )
 
 
 def test_a_missing_viser_is_named_with_its_remedy(run_folder, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "viser", None)
     expected = f"the viewer needs the package viser: {install_line('view')}\n"
-    assert said(capsys, run_folder.path) == expected
+    assert read_error(capsys, run_folder.path) == expected
 
 
 @needs_viser
@@ -249,7 +260,7 @@ def test_a_flight_is_served_scrubbed_and_played():
         assert viewer.look == 3
         viewer.playing.value = True
         viewer.advance(0.03)
-        assert viewer.look == 0  # again from the start
+        assert viewer.look == 0  # back at the start
     finally:
         viewer.close()
 
