@@ -12,13 +12,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from planner_jax.ball.estimation import (
-    EkfModel,
-    EkfState,
-    ekf_init,
-    ekf_predict,
-    ekf_update,
-)
+from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.sims.noise import Sensing
 

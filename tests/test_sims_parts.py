@@ -319,10 +319,7 @@ def test_the_estimate_of_an_awaited_ball_predicts_the_guessed_throw():
         flights = await_ball(loop, flights, coming, drag, ball=1, ahead=0.8)
         then = [
             jax.vmap(lambda known, ahead=ahead: predict_balls(loop, known, ahead))(estimates)
-            for estimates, ahead in (
-                (flights.estimates, 0.8),
-                (flights.earlier, 0.8 + loop.period),
-            )
+            for estimates, ahead in ((flights.estimates, 0.8), (flights.earlier, 0.8 + loop.period))
         ]
         return then, flights.estimates.drag
 
