@@ -416,13 +416,13 @@ SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
         ({"drag": -0.1}, CaseError, "drag must be >= 0, got -0.1"),
         ({"restitution": 1.2}, CaseError, "restitution must be in [0, 1], got 1.2"),
         ({"min_apex": 7.0}, CaseError, "min_apex must be < max_apex, got 7"),
-        ({"serve_pos": np.ones(2)}, ValueError, "serve_pos must have a shape that ends with (3,)"),
-        ({"serve_vel": np.ones(2)}, ValueError, "serve_vel must have the shape (3,), got (2,)"),
+        ({"ball_pos": np.ones(2)}, ValueError, "ball_pos must have a shape that ends with (3,)"),
+        ({"ball_vel": np.ones(2)}, ValueError, "ball_vel must have the shape (3,), got (2,)"),
         ({"drag": np.ones(4)}, ValueError, "drag must have the shape (), got (4,)"),
         (
-            {"serve_pos": [2.0, 0.0, -1.0]},
+            {"ball_pos": [2.0, 0.0, -1.0]},
             CaseError,
-            "serve_pos must be at a height >= 0 m, got -1",
+            "ball_pos must be at a height >= 0 m, got -1",
         ),
         ({"dtype": np.float64}, TypeError, "dtype must be float32 unless jax_enable_x64 is set"),
         ({"extras": pj.KeepOut(0.0, 1.0)}, TypeError, "extras must be a sequence of limits and"),
@@ -430,7 +430,7 @@ SERVE = ([2.0, 0.0, 2.0], [-4.0, 0.0, 7.0], [4.0, 0.0, 0.0])
     ],
 )
 def test_a_malformed_argument_is_named_in_one_line(change, error, says):
-    given = dict(zip(("serve_pos", "serve_vel", "target"), SERVE, strict=True))
+    given = dict(zip(("ball_pos", "ball_vel", "target"), SERVE, strict=True))
     with pytest.raises(error) as caught:
         pj.hit.case(**given | change)
     line = str(caught.value)
@@ -447,8 +447,8 @@ def test_the_first_bad_lane_is_named_and_the_others_counted():
     with pytest.raises(CaseError, match=message):
         check_cases(pj.hit.case(*batch))
     batch[0][1, 1] = np.nan
-    with pytest.raises(CaseError, match="^serve_pos must be finite, got nan in lane 1$"):
+    with pytest.raises(CaseError, match="^ball_pos must be finite, got nan in lane 1$"):
         check_cases(pj.hit.case(*batch))
     batch[0][1] = [2.0, 0.0, -1.0]
-    with pytest.raises(CaseError, match="^serve_pos must be at a height >= 0 m, got -1 in lane 1$"):
+    with pytest.raises(CaseError, match="^ball_pos must be at a height >= 0 m, got -1 in lane 1$"):
         check_cases(pj.hit.case(*batch))

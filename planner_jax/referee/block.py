@@ -98,7 +98,7 @@ class BlockVerdict(Verdict):
     height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face
     tilt: np.ndarray  # (B,) [rad], shield's normal to minus the ball's velocity
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.contact_time)[k]
         return f"the ball is {miss:.2g} m from the shield's middle at {time:.3g} s"

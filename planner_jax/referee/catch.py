@@ -77,7 +77,7 @@ class CatchVerdict(FlightVerdict):
     caught: np.ndarray  # (B, N) bool, the tests of order, catch time, net and angle pass
     num_caught: np.ndarray  # (B,) int
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         if not (number := int(np.asarray(self.num_caught)[k])):
             return "there is no target to catch"

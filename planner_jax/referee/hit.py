@@ -74,7 +74,7 @@ class HitVerdict(FlightVerdict):
     landing_error: np.ndarray  # (B,) [m], horizontal; infinite where it does not come down
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         return f"the ball lands {np.asarray(self.landing_error)[k]:.2g} m from the target"
 

@@ -78,7 +78,7 @@ class InterceptVerdict(Verdict):
     miss: np.ndarray  # (B,) [m], from the body's middle to the target when the plan ends
     meeting_time: np.ndarray  # (B,) [s], when the plan ends
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.meeting_time)[k]
         return f"the body's middle is {miss:.2g} m from the target after {time:.3g} s"

@@ -37,7 +37,7 @@ class GroupVerdict(InterceptVerdict):
     leg: np.ndarray  # (B,) int, index of the leg that the other fields describe
     num_met: np.ndarray  # (B,) int, number of targets that are met up to this leg
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         num, time = np.asarray(self.num_met)[k], np.asarray(self.meeting_time)[k]
         return f"{num} targets are met, the last after {time:.3g} s"

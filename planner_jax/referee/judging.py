@@ -42,14 +42,14 @@ class Verdict:
         at = () if k is None else k
         name = str(np.asarray(self.failed_limit)[at])
         if not name:
-            return f"success: {self.praise(at)}"
+            return f"success: {self.success_message(at)}"
         time, excess = np.asarray(self.failed_time)[at], np.asarray(self.failed_excess)[at]
         text = self.UNBOUNDED.get(name) if np.isinf(excess) else None
         found = {field: np.asarray(value)[at] for field, value in vars(self).items()}
         text = (text or self.SENTENCES[name]).format(time=time, excess=excess, **found)
         return f"{name}: {text}"
 
-    def praise(self, k: int | tuple) -> str:
+    def success_message(self, k: int | tuple) -> str:
         """Describe the success of plan `k`."""
         return "every limit holds"
 

@@ -21,7 +21,7 @@ GRADIENT = "pj.gradient(exact, hits, **{**dict(of='cost', by='target'), **dict(@
 
 # Calls with "@" for `argument=value`, their arguments, and malformed values.
 ARGUMENTS = (
-    (HIT, ("serve_pos", "serve_vel", "target"), NOT_VECTORS),
+    (HIT, ("ball_pos", "ball_vel", "target"), NOT_VECTORS),
     (HIT, ("speed", "acceleration", "body_rate", "min_height"), ("-1", "nan", "inf", "'x'", "1j")),
     (HIT, ("gravity", "min_apex", "max_apex"), ("nan", *NOT_NUMBERS)),
     (CATCH, ("gravity",), NOT_POSITIVE),
@@ -71,7 +71,7 @@ pj.hit.case(**{**HIT, **dict(extras=(5,))}) | extras must have a method excess o
 pj.hit.case(**{**HIT, **dict(extras=(pj.KeepOut((0, 0), 1.0),))}) | extras.0 must be for one case, got
 pj.hit.case(**{**HIT, **dict(extras=(pj.KeepOut((0, 0, 1), -1.0),))}) | extras.0.radius must be > 0
 pj.hit.case(**{**HIT, **dict(dtype=np.float64)}) | dtype must be float32 unless
-pj.hit.case(**{**HITS, **dict(serve_vel=np.zeros((3, 3)))}) | serve_vel must have the shape
+pj.hit.case(**{**HITS, **dict(ball_vel=np.zeros((3, 3)))}) | ball_vel must have the shape
 pj.catch.case(**{**CATCH, **dict(horizon=(1, -1))}) | horizon must be > 0 of a target that is present
 pj.catch.case(**{**CATCH, **dict(targets=turning(2))}) | targets must
 pj.catch.case(**{**CATCH, **dict(present=(0.5, 1.0))}) | present must be True or False of each target

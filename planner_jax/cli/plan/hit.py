@@ -12,7 +12,7 @@ class SingleHit(Single[SingleHitSettings]):
 
     NAMES = {
         **Single.NAMES,
-        **{f"{of}{x}": x for of in ("ball.", "serve_") for x in ("pos", "vel")},
+        **{f"{of}{x}": x for of in ("ball.", "ball_") for x in ("pos", "vel")},
     }
 
     def case(self) -> PyTree:

@@ -55,7 +55,7 @@ RULES: Table = (
 GRAVITY = 9.8  # [m/s^2]
 _ARGUMENTS = {
     **ARGUMENTS,
-    **{f"ball.{name}": f"serve_{name}" for name in ("pos", "vel")},
+    **{f"ball.{name}": f"ball_{name}" for name in ("pos", "vel")},
     **{f"hit_limits.{name}": name for name in ("hitting_speed", "min_apex", "max_apex")},
 }
 
@@ -97,8 +97,8 @@ class HitCase:
 
 
 def case(
-    serve_pos,
-    serve_vel,
+    ball_pos,
+    ball_vel,
     target,
     *,
     robot: QuadrotorModel = PAPER_HITTER,
@@ -123,8 +123,8 @@ def case(
     """Make a hit, or a batch of hits, by default with the numbers of [Yu2023bat, Section VI-A].
 
     Args:
-        serve_pos: (..., 3) [m], of the ball at time 0, above the ground at z = 0.
-        serve_vel: (..., 3) [m/s], of the ball at time 0.
+        ball_pos: (..., 3) [m], of the ball at time 0, above the ground at z = 0.
+        ball_vel: (..., 3) [m/s], of the ball at time 0.
         target: (..., 3) [m], required landing point of the returned ball.
         robot: quadrotor with a racket. Arguments that are None take the robot's numbers.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
@@ -147,21 +147,21 @@ def case(
         dtype: type of every floating leaf.
 
     Returns:
-        Case whose leaves have the batch shape of `serve_pos`.
+        Case whose leaves have the batch shape of `ball_pos`.
 
     Raises:
         CaseError: a number breaks a rule, such as a limit that is not positive.
         ValueError: an argument has a wrong shape.
         TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
-    dtype, batch = floating(dtype), batch_of("serve_pos", serve_pos, 3)
+    dtype, batch = floating(dtype), batch_of("ball_pos", ball_pos, 3)
     tool = require_tool(robot, RACKET)
 
     def leaf(name: str, value: object, *shape: int) -> Array:
         return array_of(name, value, batch, shape, dtype)
 
     cases = HitCase(
-        ball=BallState(pos=leaf("serve_pos", serve_pos, 3), vel=leaf("serve_vel", serve_vel, 3)),
+        ball=BallState(pos=leaf("ball_pos", ball_pos, 3), vel=leaf("ball_vel", ball_vel, 3)),
         head_state=hover_at(start, batch, dtype),
         target=leaf("target", target, 3),
         drag=leaf("drag", drag),
@@ -193,5 +193,5 @@ def case(
     require_sound(cases, _ARGUMENTS)
     require_start(cases)
     height = np.asarray(cases.ball.pos)[..., 2]
-    require_rule("serve_pos", height, height >= 0.0, "at a height >= 0 m", batch)
+    require_rule("ball_pos", height, height >= 0.0, "at a height >= 0 m", batch)
     return cases
