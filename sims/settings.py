@@ -13,7 +13,8 @@ from planner_jax.core.registry import Task, all_tasks, split_name
 from planner_jax.runs.settings import option, require_count
 from planner_jax.sims.noise import NOISES, PLANE_NOISES, PlaneSensing, Sensing, require_whole
 from planner_jax.sims.robots.arm.drives import ENCODERS, TORQUES, Drives
-from planner_jax.sweep.block.settings import REGIMES, require_frame_rate, require_moderate
+from planner_jax.studies.block.settings import require_frame_rate, require_moderate
+from planner_jax.sweep.block.settings import REGIMES
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.block.spec import TASK as BLOCK
 from planner_jax.task.catch.spec import DECISIONS, TRAINED

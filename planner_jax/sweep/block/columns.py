@@ -1,10 +1,7 @@
 """Columns of a block run: ball, plan and verdict."""
 
-import numpy as np
-
 from planner_jax.runs import columns as known
-from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of
-from planner_jax.studies.block.flight_fit import Sight
+from planner_jax.runs.columns import LIST, VECTOR, leaves_of
 
 FRAME = "base of the robot, z up; times from the first observation of the ball"
 
@@ -57,22 +54,3 @@ COLUMNS = [
     ),
     *known.OUTCOME,
 ]
-
-# Columns of runs with --perception, and of runs with --planning-budget.
-SEEN_COLUMNS = [
-    Column("sight", "", "outcome of the observation", known.TEXT, lambda batch: _sights(batch)),
-    *leaves_of(
-        "plans",
-        ("sightings", "", "frames with the ball until the first fit", known.COUNT),
-        ("fit_error", "m", "of the first fit, across the flight midway between the boxes"),
-        ("fit_std", "m", "estimated standard deviation of this error"),
-        ("last_fit_error", "m", "of the last fit"),
-        ("motions", "", "number of started motions", known.COUNT),
-    ),
-]
-TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
-
-
-def _sights(batch: RefereedBatch) -> np.ndarray:
-    names = np.array([Sight(code).name for code in range(len(Sight))])
-    return names[np.asarray(batch.plans.sight)]

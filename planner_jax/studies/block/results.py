@@ -1,0 +1,79 @@
+"""Columns, counts and findings of runs with a camera or a clock."""
+
+import numpy as np
+import pyarrow as pa
+
+from planner_jax.runs import columns as known
+from planner_jax.runs.columns import Column, RefereedBatch, leaves_of
+from planner_jax.runs.manifest import Entries
+from planner_jax.studies.block.clock import TimedPlan
+from planner_jax.studies.block.flight_fit import Sight
+from planner_jax.studies.block.seeing import SeenPlan
+
+_ROOM = 0.1  # [m], tolerance of a contact beside the shield's middle
+
+
+def _sights(batch: RefereedBatch) -> np.ndarray:
+    names = np.array([Sight(code).name for code in range(len(Sight))])
+    return names[np.asarray(batch.plans.sight)]
+
+
+_SEEN_COLUMNS = [
+    Column("sight", "", "outcome of the observation", known.TEXT, _sights),
+    *leaves_of(
+        "plans",
+        ("sightings", "", "frames with the ball until the first fit", known.COUNT),
+        ("fit_error", "m", "of the first fit, across the flight midway between the boxes"),
+        ("fit_std", "m", "estimated standard deviation of this error"),
+        ("last_fit_error", "m", "of the last fit"),
+        ("motions", "", "number of started motions", known.COUNT),
+    ),
+]
+_TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
+
+
+def columns_of(plans: object) -> list[Column]:
+    """Return the columns of plans that a camera or a clock adds, by the class of the plans."""
+    return {SeenPlan: _SEEN_COLUMNS, TimedPlan: _TIMED_COLUMNS}.get(type(plans), [])
+
+
+class StudyCounts:
+    """Errors of fits and planning times of a run; empty without a camera or a clock."""
+
+    READS = ("fit_error", "planning_time")
+
+    def __init__(self) -> None:
+        self._errors, self._seconds = [], []
+
+    def add(self, rows: pa.Table) -> None:
+        """Count some rows of the run."""
+        for name, values in zip(self.READS, (self._errors, self._seconds), strict=True):
+            if name in rows.column_names:
+                values.append(rows[name].to_numpy())
+
+    def summary(self) -> Entries:
+        """Return the median error [m], the share of small errors, and quantiles of times [s]."""
+        found = {}
+        if self._errors:
+            errors = np.concatenate(self._errors)
+            seen = errors[np.isfinite(errors)]
+            found["fit_error_median"] = float(np.median(seen)) if seen.size else None
+            found["fit_within_room"] = float(np.mean(errors <= _ROOM))
+        if self._seconds:
+            quick, slow = np.quantile(np.concatenate(self._seconds), (0.5, 0.99))
+            found |= {"planning_p50": float(quick), "planning_p99": float(slow)}
+        return found
+
+
+def describe_study(summary: Entries) -> list[str]:
+    """Return sentences on fits of the flight and on planning time, if a run has them."""
+    found = []
+    if (error := summary.get("fit_error_median")) is not None:
+        found.append(
+            f"The first fit is {error:.3f} m off across the flight (median), and within "
+            f"{_ROOM:g} m for {100.0 * summary['fit_within_room']:.1f} % of the balls."
+        )
+    if "planning_p50" in summary:
+        quick, slow = (1e3 * summary[name] for name in ("planning_p50", "planning_p99"))
+        found.append(f"Planning one at a time takes {quick:.1f} ms (p50), {slow:.1f} ms (p99).")
+    return found

@@ -1,0 +1,74 @@
+"""Settings of runs with a camera or a clock; nothing here imports JAX."""
+
+import dataclasses
+import math
+
+from planner_jax.core.choices import require
+from planner_jax.runs.settings import SweepSettings, option
+
+_LONGEST = 60.0  # [s], or [m] of noise; greatest value
+_FASTEST = 1000.0  # [Hz], greatest rate
+
+
+def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:
+    """Raise `ArgumentError` unless a value is None, or from 0 to `most`."""
+    if value is not None:
+        require(0.0 <= value < math.inf, name, "finite and >= 0", value)
+        require(value <= most, name, f"<= {most:g}", value)
+
+
+def require_frame_rate(value: float) -> None:
+    """Raise `ArgumentError` unless the argument `frame_rate` is possible for a camera."""
+    require(0.0 < value < math.inf, "frame_rate", "finite and > 0", value)
+    require(1.0 <= value <= _FASTEST, "frame_rate", f"from 1 to {_FASTEST:g}", value)
+
+
+@dataclasses.dataclass(frozen=True)
+class StudySettings(SweepSettings):
+    """Settings of blocks that are planned by the clock, or by observations of a camera."""
+
+    planning_budget: float | None = option(
+        None,
+        "S",
+        "seconds after the delay at which motions start; planning runs by the clock, one case "
+        "after another, and a motion starts later by what planning took beyond the budget",
+    )
+    perception: bool = option(
+        False, "", "plan with a camera's observations of the ball; the referee uses the true ball"
+    )
+    observe: float = option(0.25, "S", "with --perception: seconds until the flight is fitted")
+    overhead: float = option(
+        0.05, "S", "with --perception: seconds from a fit until its motion may start"
+    )
+    replan: float = option(0.0, "HZ", "with --perception: rate of planning again; 0 plans once")
+    observe_longer: float = option(
+        0.0,
+        "S",
+        "with --perception: seconds beyond --observe in which an arm may continue to observe, "
+        "frame by frame while it could still meet the ball",
+    )
+    noise: float = option(
+        0.02,
+        "M",
+        "with --perception: standard deviation of each coordinate; 0 simulates a stereo camera",
+    )
+    frame_rate: float = option(60.0, "HZ", "with --perception: frame rate of the camera")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("planning_budget", "observe", "overhead", "observe_longer", "noise"):
+            require_moderate(name, vars(self)[name])
+        require_moderate("replan", self.replan, _FASTEST)
+        require_frame_rate(self.frame_rate)
+        if self.perception:
+            once = self.replan == 0.0 or self.observe_longer == 0.0
+            require(once, "observe_longer", "0 with replan", self.observe_longer)
+            rule, budget = "left out with perception", self.planning_budget
+            require(budget is None, "planning_budget", rule, budget)
+
+    @property
+    def first_motion(self) -> float:
+        """Time [s] from which an arm may start until its first motion starts."""
+        if self.perception:
+            return self.observe + self.overhead
+        return self.planning_budget or 0.0
