@@ -18,7 +18,7 @@ from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.host.files import new_file_problem
 from planner_jax.live.settings import ServeSettings
 from planner_jax.runs.environment import require_backend
-from planner_jax.runs.settings import recovery_options, require_recovery
+from planner_jax.runs.settings import recovery_options
 
 if TYPE_CHECKING:
     from planner_jax.cli.plan.answer import Answer
@@ -106,7 +106,7 @@ def _export(given: Options) -> None:
 
     source, row = given.pop("plans"), given.pop("row", None)
     out, udp = pop_out(given, "file"), given.pop("udp", None)
-    require_recovery(name := given.pop("recovery", "brake"))
+    name = given.pop("recovery", "brake")
     recovery = recovery_options(name).get("recovery")
     if out is not None and udp is not None:
         raise ArgumentError("udp", "given with --out", udp, verb="not be")

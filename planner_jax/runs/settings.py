@@ -48,7 +48,8 @@ def recovery_option(usual: str = NONE) -> str:
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return the options of a planner for the setting `recovery`."""
+    """Return the options of a planner for the setting `recovery`; raise unless it is known."""
+    require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
 
@@ -56,11 +57,6 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
     """Raise unless a value is a whole number >= `least`; None is accepted if `none` is set."""
     if value is not None or not none:
         require_size(name, value, least)  # type: ignore[arg-type]
-
-
-def require_recovery(value: str) -> None:
-    """Raise `ArgumentError` unless the setting `recovery` is one of the known names."""
-    require_one_of(CHOICES, "recovery", value)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,16 +8,10 @@ import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from planner_jax.core.choices import EFFORTS, require, require_one_of, require_scale
+from planner_jax.core.choices import CHOICES, EFFORTS, require, require_one_of, require_scale
 from planner_jax.core.errors import ArgumentError
 from planner_jax.runs.manifest import Entries, Row
-from planner_jax.runs.settings import (
-    SweepSettings,
-    option,
-    recovery_option,
-    recovery_options,
-    require_recovery,
-)
+from planner_jax.runs.settings import SweepSettings, option, recovery_option, recovery_options
 
 if TYPE_CHECKING:
     from planner_jax.robot.quadrotor_model import QuadrotorModel
@@ -83,7 +77,7 @@ class QuadrotorSettings(SweepSettings):
         rule = f"left out for the planner {self.WITHOUT_EFFORT}, which minimises nothing"
         has_effort = self.effort == EFFORTS[0] or self.planner != self.WITHOUT_EFFORT
         require(has_effort, "effort", rule, self.effort)
-        require_recovery(self.recovery)
+        require_one_of(CHOICES, "recovery", self.recovery)
 
     def planner_options(self) -> Entries:
         """Return the options of the planner that these settings decide."""

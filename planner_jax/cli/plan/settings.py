@@ -4,10 +4,10 @@ import dataclasses
 import math
 from typing import ClassVar
 
-from planner_jax.core.choices import require
+from planner_jax.core.choices import CHOICES, require, require_one_of
 from planner_jax.core.registry import Task, split_name
 from planner_jax.runs.manifest import Entries
-from planner_jax.runs.settings import option, recovery_option, recovery_options, require_recovery
+from planner_jax.runs.settings import option, recovery_option, recovery_options
 from planner_jax.sweep.quadrotor_settings import resolve_robot, robot_option
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
@@ -44,7 +44,7 @@ class SingleSettings:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "robot", resolve_robot(self.robot, self.TOOL))
-        require_recovery(self.recovery)
+        require_one_of(CHOICES, "recovery", self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
             if isinstance(value, list):  # the parser returns lists
