@@ -1,7 +1,7 @@
 """Figures of an intercept run: cases from above, and one plan along its time."""
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +12,10 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PolyCollection
-from matplotlib.colors import ListedColormap, Normalize, to_rgba
+from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from matplotlib.typing import ColorType
 
 from planner_jax.robot.car import knots_at, pose_at
 from planner_jax.runs import style
@@ -218,13 +217,13 @@ def draw_map(axes: Axes, setting: Entries, walls: list[np.ndarray]) -> None:
 def draw_polygons(
     axes: Axes,
     polygons: list[np.ndarray],
-    colour: ColorType | np.ndarray,
+    colour: Sequence[float] | np.ndarray,
     *,
     alpha: float = 0.25,
     zorder: float = 2,
 ) -> None:
-    """Draw polygons (V, 2) [m] with a pale filling."""
-    look: Look = {"facecolor": to_rgba(colour, alpha), "edgecolor": colour, "zorder": zorder}
+    """Draw polygons (V, 2) [m] in an RGB or RGBA colour, with a pale filling."""
+    look: Look = {"facecolor": (*colour[:3], alpha), "edgecolor": colour, "zorder": zorder}
     axes.add_collection(PolyCollection(polygons, linewidth=1.0, **look))
 
 
