@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from numpy.polynomial import Polynomial
 
 
 def tree(leaves, root="", **optional):
@@ -23,6 +24,16 @@ def flight(leaves, **optional):
     case.trajectory = SimpleNamespace(coeffs=case.coeffs, durations=case.durations)
     case.recovery = None
     return case
+
+
+def cut(path, durations, degree=7):
+    """Cut three polynomials, x, y and z, into pieces (M, degree + 1, 3), each in its own time."""
+    coeffs = np.zeros((len(durations), degree + 1, 3))
+    for piece, start in enumerate(np.cumsum(durations) - durations):
+        for axis, line in enumerate(path):
+            powers = line(Polynomial([start, 1.0])).coef
+            coeffs[piece, : len(powers), axis] = powers
+    return coeffs
 
 
 def edit(leaves, edits):

@@ -275,12 +275,6 @@ def test_the_time_ratio_is_that_of_the_present_targets(pairs):
     np.testing.assert_allclose(ratio, [(0.2 + 0.25) / 2.0] * 4 + [0.2], rtol=1e-6)
 
 
-def test_an_unknown_decision_is_refused(pairs):
-    known = "best, greedy, random, given, policy"
-    with pytest.raises(ValueError, match=f"decide must be one of {known}, got 'worst'"):
-        pj.catch.planner(decide="worst")
-
-
 @pytest.mark.parametrize("order", [[1, 1], [0, 2], [-1, 0]])
 def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
     given = np.array([[0, 1], order, [1, 0], [0, 1], [1, 0]], np.int32)

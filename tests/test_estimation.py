@@ -11,7 +11,7 @@ from serve import DRAG, GRAVITY, LINEAR_DRAG, float64
 
 from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predict, ekf_update
 from planner_jax.ball.flight import BallState, fly, linear_drag_flight, rk4_step
-from planner_jax.sims.sensing import RlsState, rls_update, specific_energy
+from planner_jax.sims.sensing import RlsState, rls_update
 
 NUM = 121
 PERIOD = 0.01  # [s]
@@ -79,10 +79,10 @@ def linear_path(dtype=np.float32, ball=None):
     return jax.tree.map(np.asarray, path)
 
 
-def quadratic_path(dtype=np.float32, drag=DRAG):
+def quadratic_path(dtype=np.float32):
     """Return the ball at all `times`, with quadratic drag, by eight Runge-Kutta steps each."""
     ball = serve(dtype)
-    _, fine = fly_one(ball, PERIOD * (NUM - 1), drag, GRAVITY, num_steps=8 * (NUM - 1))
+    _, fine = fly_one(ball, PERIOD * (NUM - 1), DRAG, GRAVITY, num_steps=8 * (NUM - 1))
     return jax.tree.map(lambda x0, x: np.concatenate([x0[None], x[7::8]]), ball, fine)
 
 
@@ -118,9 +118,6 @@ def textbook_kalman(mean, covariance, observations, drag, density, std):
         mean = mean + gain @ (z - H @ mean)
         covariance = (np.eye(6) - gain @ H) @ covariance
     return mean, covariance
-
-
-# The Kalman filter
 
 
 @float64
@@ -255,19 +252,6 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
         np.testing.assert_allclose(slope, (forward - backward) / (2.0 * step), rtol=1e-6)
 
 
-# Estimation of K_D from the loss of energy
-
-
-@float64
-def test_energy_is_kept_without_drag_and_lost_with_it():
-    for drag, kept in ((0.0, True), (DRAG, False)):
-        energy = [
-            specific_energy(BallState(*ball), GRAVITY)
-            for ball in zip(*jax.tree.leaves(quadratic_path(np.float64, drag)), strict=True)
-        ]
-        assert np.ptp(energy) < 1e-9 if kept else np.all(np.diff(energy) < 0.0)
-
-
 @float64
 def test_recursive_least_squares_is_the_batch_solution():
     """Count the prior as one additional measurement."""
@@ -281,9 +265,6 @@ def test_recursive_least_squares_is_the_batch_solution():
     batch = (estimate / variance + np.sum(h * y)) / information
     np.testing.assert_allclose(state.estimate, batch, rtol=1e-12)
     np.testing.assert_allclose(state.variance, 1.0 / information, rtol=1e-12)
-
-
-# Batches
 
 
 def test_batch_equals_loop():

@@ -90,9 +90,6 @@ def test_no_bytes_crash_it(data):
         read_answer(prefix + data)
 
 
-# Selection.
-
-
 def packet(sequence, sent):
     return Packet(BALL, 0, sequence, sent, sent, (0.0, 0.0, 0.0))
 

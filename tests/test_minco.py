@@ -153,9 +153,6 @@ def energy(coeffs, durations):
     return np.sum(flat * (energy_form(coeffs.shape[1] // 2, np.asarray(durations)) @ flat))
 
 
-# The trajectory
-
-
 @every_size
 def test_the_trajectory_solves_the_dense_quadratic_program_and_its_pieces_join(order, pieces):
     """Pieces join up to the derivative 2s - 2; the program demands only derivatives below s.
@@ -209,9 +206,6 @@ def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
     powers = np.asarray(times)[:, :, None] ** np.arange(8)
     positions = [powers @ np.asarray(x.coeffs, np.float64) for x in (single, double)]
     np.testing.assert_allclose(*positions, atol=1e-4)
-
-
-# The maps
 
 
 def weigh_energy_and_coefficients(maps, point):

@@ -173,9 +173,6 @@ def test_a_broken_package_beside_it_is_named_in_one_line_and_the_rest_works(tmp_
         assert words in done.out
 
 
-# From Python.
-
-
 @pytest.fixture
 def exact(meet, float64):
     """Return the task's planner with a search to the limits of float64, and six cases."""

@@ -53,9 +53,6 @@ def swing(t):
     return pos, np.array([np.cos(t), -2.0 * np.sin(2.0 * t), -np.exp(-t)])
 
 
-# The table
-
-
 @float64
 def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_horizon():
     table = jax.tree.map(np.asarray, path())
@@ -72,9 +69,6 @@ def test_nodes_are_runge_kutta_steps_from_one_before_the_start_to_one_past_the_h
 def test_a_table_of_too_few_nodes_is_refused():
     with pytest.raises(ValueError, match=r"^num_nodes must be >= 5, got 4$"):
         predict_path(serve(), HORIZON, DRAG, GRAVITY, num_nodes=4)
-
-
-# Between the nodes
 
 
 @float64
@@ -113,9 +107,6 @@ def test_a_path_in_float32_is_right_to_some_micrometres(float64):
     single = many_targets(path(dtype=np.float32), times.astype(np.float32))
     assert single.pos.dtype == single.vel.dtype == np.float32
     assert_close(single, many_targets(path(), times), atol=1e-5)
-
-
-# Derivatives by time
 
 
 @float64
@@ -177,9 +168,6 @@ def test_a_time_outside_the_table_continues_at_constant_velocity(time, end):
     np.testing.assert_allclose(state.pos, last.pos + last.vel * (time - end), rtol=1e-14)
 
 
-# Derivatives by other arguments
-
-
 def somewhere_on_the_path(point):
     ball, drag, gravity, time = point
     table = predict_path(ball, HORIZON, drag, gravity, num_nodes=5)
@@ -192,9 +180,6 @@ def somewhere_on_the_path(point):
 def test_the_gradient_in_ball_drag_gravity_and_time_matches_finite_differences(position):
     point = (serve(), DRAG, GRAVITY, position * HORIZON / 2.0)
     assert_gradient_matches_differences(somewhere_on_the_path, point, step=1e-6, rtol=1e-6)
-
-
-# Batches
 
 
 @float64

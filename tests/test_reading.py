@@ -27,9 +27,6 @@ def task(request):
     return pj.task_named(request.param)
 
 
-# Lanes.
-
-
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
 def test_a_lane_is_an_entry_of_every_leaf(array):
     cases = jax.tree.map(array, pj.hit.draw(5))
@@ -57,9 +54,6 @@ def test_solved_is_read_from_the_status():
     assert pj.solved(pj.take(plans, 1)) and not pj.solved(pj.take(plans, 4))
     # Broken, blocked, unreachable or too distant cases are unsolved, but need no further attempt.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
-
-
-# Verdicts.
 
 
 @pytest.mark.parametrize("array", [np.asarray, jnp.asarray])
@@ -102,9 +96,6 @@ def test_only_cases_and_plans_of_the_task_are_judged(task):
         task.judge(cases, [])
     with pytest.raises(TypeError, match="samples must be a setting of the referee, got 400"):
         task.judge(cases, plans, samples=400)
-
-
-# Draws.
 
 
 @pytest.mark.parametrize(("task_name", "suite"), SUITES)

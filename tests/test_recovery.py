@@ -150,9 +150,6 @@ def test_catches_that_end_too_fast_for_the_limits_are_planned_slower():
     assert verdict.success.all(), verdict.failed_limit
 
 
-# Sweeps.
-
-
 def sweep(out, **settings):
     """Plan and judge a few hits, and draw nothing; return the folder and its manifest."""
     with pytest.MonkeyPatch.context() as patch:
@@ -207,9 +204,6 @@ def test_another_recovery_is_refused_in_one_line():
     assert_refused(f"^to {rule}", RecoveryPlanner, to="land")
 
 
-# Exports of single plans.
-
-
 export = functools.partial(pj.export, to="csv", out="a.csv")
 
 
@@ -259,9 +253,6 @@ def test_nothing_is_written_if_no_recovery_keeps_the_limits(hit, here):
     assert not list(here.iterdir())
 
 
-# Rows of a sweep.
-
-
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory):
     return sweep(tmp_path_factory.mktemp("runs") / "bare")[0]
@@ -292,9 +283,6 @@ def test_a_file_of_plans_does_not_hold_their_limits(here, capsys):
     says = "planner-jax: error: --recovery must be one of none, brake, home, got 'land'\n"
     assert capsys.readouterr().err == says
     assert {path.name for path in here.iterdir()} == {"one.npz"}
-
-
-# Cars.
 
 
 def driving(*walls, **settings):
@@ -366,9 +354,6 @@ def test_movers_move_during_the_recovery():
     comes = {"movers": [box(1.9, 1.0, 3.6, 3.0)], "mover_velocities": (0.0, 1.0)}
     with pytest.raises(NoRecovery, match="^mover: "):
         append_recovery(*driving(**comes), "brake")
-
-
-# Arms.
 
 
 def turning(rates, regime="R1"):

@@ -271,8 +271,7 @@ def test_an_absent_pole_is_ignored():
 
 def test_a_rig_without_beams_has_infinite_clearance():
     leaves = good()
-    for name in ("scene.beam_ends", "scene.beam_radius"):
-        leaves[name] = leaves[name][:, :0]
+    leaves |= {name: leaves[name][:, :0] for name in ("scene.beam_ends", "scene.beam_radius")}
     assert np.isposinf(assert_good(leaves).rig_clearance[0])
 
 
@@ -301,9 +300,6 @@ def test_the_shield_may_be_met_beside_its_middle_and_at_an_angle_but_not_beyond_
         leaves = good(at=CONTACT + beside * (ROTATION[:, 1] - 0.5 * ROTATION[:, 2]))
         leaves["offset"][:] = np.inf
         assert judge(leaves).failed_limit[0] == verdict
-
-
-# Times and samples --------------------------------------------------------------------------------
 
 
 def test_a_ball_is_inside_a_box_when_it_is_found_there():
@@ -378,9 +374,6 @@ def test_the_least_clearance_of_a_motion_is_that_of_a_pose_on_its_way():
         name = f"{kind}_clearance"
         least = getattr(poses, name).min()
         assert 0.0 <= least - getattr(verdict, name)[0] + 1e-12 < 1e-4
-
-
-# Solids -------------------------------------------------------------------------------------------
 
 
 def gap(first, second):
@@ -460,31 +453,23 @@ def test_capsules_of_the_base_are_kept_off_like_its_box():
     assert_fails(leaves, "base", part="link 4", capsule_link=(-1, *ARM.capsule_link[1:]))
 
 
-def vectors(random, num):
-    return random.normal(size=(3, num))
-
-
-def spans_of(first, second):
-    return [0.5 * (second - first)]
-
-
 def test_distances_of_segments_are_those_of_a_solver():
     random, num = np.random.default_rng(0), 60
-    a, b, c, d = (vectors(random, num) for _ in range(4))
+    a, b, c, d = random.normal(size=(4, 3, num))
     b[:, :5] = a[:, :5]  # points
     d[:, 3:10] = c[:, 3:10]
     d[:, 10:20] = c[:, 10:20] + (b - a)[:, 10:20] * random.normal(size=10)  # parallel
     found, points = solids.between_segments(a, b, c, d), solids.from_segment(c, a, b)
     for k in range(num):
-        first = 0.5 * (a + b)[:, k], spans_of(a[:, k], b[:, k]), 0.0
-        second = 0.5 * (c + d)[:, k], spans_of(c[:, k], d[:, k]), 0.0
+        first = 0.5 * (a + b)[:, k], [0.5 * (b - a)[:, k]], 0.0
+        second = 0.5 * (c + d)[:, k], [0.5 * (d - c)[:, k]], 0.0
         assert found[k] == pytest.approx(gap(first, second), abs=1e-9)
         assert points[k] == pytest.approx(gap(first, (c[:, k], np.zeros((1, 3)), 0.0)), abs=1e-9)
 
 
 def test_distances_of_boxes_are_those_of_a_solver():
     random, num = np.random.default_rng(1), 60
-    a, b, middle = (vectors(random, num) for _ in range(3))
+    a, b, middle = random.normal(size=(3, 3, num))
     b[0, :10] = a[0, :10]
     b[1, 5:15] = a[1, 5:15]
     half, other = random.uniform(0.01, 1.0, (2, 3, num))
@@ -495,7 +480,7 @@ def test_distances_of_boxes_are_those_of_a_solver():
     assert (segments == 0.0).any() and (boxes < 0.0).any()
     for k in range(num):
         box = np.zeros(3), np.diag(half[:, k]), 0.0
-        segment = 0.5 * (a + b)[:, k], spans_of(a[:, k], b[:, k]), 0.0
+        segment = 0.5 * (a + b)[:, k], [0.5 * (b - a)[:, k]], 0.0
         assert segments[k] == pytest.approx(gap(box, segment), abs=1e-9)
         turned = 1.5 * middle[:, k], (rotation[..., k] * half[:, k]).T, 0.0
         apart = gap(turned, (np.zeros(3), np.diag(other[:, k]), 0.0))
@@ -510,9 +495,6 @@ def test_overlapping_boxes_are_as_deep_as_the_shortest_way_out():
     corner = np.sqrt(0.5) * 0.3
     found = solids.between_boxes(middle, turn, half, other)[0]
     assert found == pytest.approx(-(0.1 + corner))
-
-
-# Batches and arguments ----------------------------------------------------------------------------
 
 
 def unequal_lanes():

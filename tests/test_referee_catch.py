@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 from numpy.polynomial import Polynomial
-from referees import add, assert_same, checks, edit, failure, flight, rows, stack
+from referees import add, assert_same, checks, cut, edit, failure, flight, rows, stack
 from scipy.integrate import solve_ivp
 
 from planner_jax.referee.catch import CatchVerdict, referee_catches
@@ -17,16 +17,6 @@ TIMES = (1.1, 2.4)  # of the two catches
 DURATIONS = (0.4, 0.7, 0.8, 0.5, 0.0, 0.0)
 STEP = Polynomial([0, 0, 0, 0, 35, -84, 70, -20])  # from 0 to 1, at rest up to jerk at both
 STEEPEST = 35.0 / 16.0  # slope of STEP, at 1/2
-
-
-def cut(path, durations, degree=7):
-    """Cut three polynomials, x, y and z, into pieces (M, degree + 1, 3), each in its own time."""
-    coeffs = np.zeros((len(durations), degree + 1, 3))
-    for piece, start in enumerate(np.cumsum(durations) - durations):
-        for axis, line in enumerate(path):
-            powers = line(Polynomial([start, 1.0])).coef
-            coeffs[piece, : len(powers), axis] = powers
-    return coeffs
 
 
 def rest_to_rest(start, end, durations):
@@ -83,7 +73,7 @@ def good():
         "limits.min_height": 0.25,
     }
     exact = {"order": int, "present": bool}
-    return {k: np.asarray(leaf, exact.get(k, float))[None] for k, leaf in leaves.items()}
+    return {k: np.array(leaf, exact.get(k, float))[None] for k, leaf in leaves.items()}
 
 
 def judge(leaves, **options) -> CatchVerdict:
@@ -406,16 +396,15 @@ def test_targets_of_a_users_class_are_followed_by_a_function():
 
 
 def unequal_lanes():
-    fast, shifted, missed, swapped = good(), good(), good(), good()
-    fast["limits.speed"] /= 4.0
-    shifted["head_state"][0, 0] += 0.2
-    missed["targets.ball.pos"][0, 2, 0] += 0.5
-    swapped["order"][0] = [0, 2, 1]
-    swapped["horizon"][:] = 3.0
-    single = good()
-    single["present"][0], single["order"][0] = [False, False, True], [2, 1, 0]
-    single["durations"][0, 2:] = 0.0
-    return [good(), fast, single, shifted, missed, swapped]
+    only = {"present": [False, False, True], "order": [2, 1, 0], ("durations", (2, 3, 4, 5)): 0.0}
+    return [
+        good(),
+        edit(good(), {"limits.speed": 1.25}),
+        edit(good(), only),
+        edit(good(), {("head_state", 0): add(0.2)}),
+        edit(good(), {("targets.ball.pos", 2, 0): add(0.5)}),
+        edit(good(), {"order": [0, 2, 1], "horizon": 3.0}),
+    ]
 
 
 def test_caught_targets_are_counted_and_none_is_caught_by_a_broken_plan():

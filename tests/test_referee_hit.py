@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from referees import add, assert_same, checks, edit, failure, flight, rows, stack
+from numpy.polynomial import Polynomial
+from referees import add, assert_same, checks, cut, edit, failure, flight, rows, stack
 from scipy.integrate import solve_ivp
 
 from planner_jax.host.machine import usable_cores
@@ -30,27 +31,11 @@ def fly(pos, vel, span, **options):
     return solve_ivp(fall, (0.0, span), np.concatenate([pos, vel]), **exact, **options)
 
 
-def derivative_row(time, order, degree):
-    return [
-        math.perm(k, order) * time ** (k - order) if k >= order else 0.0 for k in range(degree + 1)
-    ]
-
-
 def join_states(head, tail, duration):
-    """Return the coefficients (8, 3) of the polynomial between two states (4, 3)."""
-    rows = [derivative_row(time, n, 7) for time in (0.0, duration) for n in range(4)]
-    return np.linalg.solve(np.array(rows), np.concatenate([head, tail]))
-
-
-def cut(coeffs, durations):
-    """Cut a polynomial into pieces (M, D + 1, 3), each in its own time."""
-    starts = np.cumsum(durations) - durations
-    degree = len(coeffs) - 1
-    shifts = [
-        [np.array(derivative_row(t, n, degree)) / math.factorial(n) for n in range(degree + 1)]
-        for t in starts
-    ]
-    return np.array(shifts) @ coeffs
+    """Return the polynomials of x, y and z between two states (4, 3)."""
+    powers = [Polynomial(row) for row in np.eye(8)]
+    rows = [[p.deriv(n)(t) for p in powers] for t in (0.0, duration) for n in range(4)]
+    return list(map(Polynomial, np.linalg.solve(np.array(rows), np.concatenate([head, tail])).T))
 
 
 def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces=NUM_PIECES):
@@ -60,9 +45,8 @@ def volley(*, target=(3.0, 0.0, 0.0), flight_time=1.5, ball_vel=BALL_VEL, pieces
     change = after - BALL_VEL
     normal = change / np.linalg.norm(change)
     normal_speed = (RESTITUTION * BALL_VEL + after) @ normal / (1.0 + RESTITUTION)
-    head = np.zeros((4, 3))
+    head, tail = np.zeros((2, 4, 3))
     head[0] = [-3.0, 0.0, 1.5]
-    tail = np.zeros((4, 3))
     tail[0] = CONTACT - RACKET_HEIGHT * normal
     tail[1] = normal_speed * normal
     tail[2] = 1.1 * GRAVITY * normal - [0.0, 0.0, GRAVITY]
@@ -183,7 +167,7 @@ def test_a_lowered_limit_fails_by_name_time_and_excess(name, values):
 def test_ground_fails_where_the_trajectory_is_lowest():
     leaves = volley()
     times, pos = dense(leaves, 0)
-    leaves["limits.min_height"] = np.array([pos[:, 2].min() * 1.25])
+    edit(leaves, {"limits.min_height": pos[:, 2].min() * 1.25})
     lowest = {"time": times[pos[:, 2].argmin()], "apart": 1e-3}
     assert_fails(leaves, "ground", excess=0.2, **lowest, says="20.00% below the least height")
 
@@ -302,9 +286,8 @@ def test_a_ball_that_never_reaches_the_target_height_does_not_land(drag_after_im
 
 
 def test_free_fall_has_no_attitude():
-    coeffs = np.zeros((1, 1, 3, 3))
+    coeffs, head = np.zeros((1, 1, 3, 3)), np.zeros((1, 4, 3))
     coeffs[0, 0, :, 2] = [3.0, 0.0, -0.5 * GRAVITY]
-    head = np.zeros((1, 4, 3))
     head[0, 0, 2], head[0, 2, 2] = 3.0, -GRAVITY
     leaves = volley() | {"coeffs": coeffs, "head_state": head}
     leaves |= {"durations": np.array([[0.3]]), "stroke.time": np.array([0.3])}
@@ -313,11 +296,14 @@ def test_free_fall_has_no_attitude():
 
 
 def unequal_lanes():
-    fast, shifted, missed = volley(), volley(flight_time=1.4), volley(target=(3.0, -1.0, 0.0))
-    fast["limits.speed"] /= 4.0
-    shifted["head_state"][0, 0] += 0.2
-    missed["target"][0, 0] += 0.5
-    return [volley(), fast, volley(flight_time=1.6), shifted, missed, volley(target=(3.5, 1, 0))]
+    return [
+        volley(),
+        edit(volley(), {"limits.speed": 1.25}),
+        volley(flight_time=1.6),
+        edit(volley(flight_time=1.4), {("head_state", 0): add(0.2)}),
+        edit(volley(target=(3.0, -1.0, 0.0)), {("target", 0): add(0.5)}),
+        volley(target=(3.5, 1, 0)),
+    ]
 
 
 IMPACT_VEL = np.abs(dense(volley(), 1)[1][-1])
@@ -385,12 +371,9 @@ def test_many_lanes_on_several_threads_are_judged_as_a_few():
 
 
 def test_an_infinite_limit_is_no_limit():
-    leaves = volley()
-    for name in ("limits.speed", "limits.acceleration", "limits.body_rate", "hit_limits.max_apex"):
-        leaves[name] = np.array([np.inf])
-    leaves["limits.min_height"] = np.array([-np.inf])
-    leaves["hit_limits.hitting_speed"] = np.full((1, 3), np.inf)
-    assert_good(leaves)
+    names = "limits.speed", "limits.acceleration", "limits.body_rate", "hit_limits.max_apex"
+    limits = dict.fromkeys((*names, "hit_limits.hitting_speed"), np.inf)
+    assert_good(edit(volley(), limits | {"limits.min_height": -np.inf}))
 
 
 @pytest.mark.parametrize(
@@ -402,11 +385,8 @@ def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
     leaves = volley()
     after = leaves["target"][0] - CONTACT
     aside = np.array([-after[1], after[0], 0.0]) / np.hypot(*after[:2])
-    normal_free = (
-        off * aside
-    )  # across the return, which keeps the apex and the distance from the target
-    leaves["ball.pos"] = leaves["ball.pos"] + normal_free
-    leaves["target"] = leaves["target"] + normal_free
+    # A shift across the return keeps the apex and the distance from the target.
+    edit(leaves, {"ball.pos": add(off * aside), "target": add(off * aside)})
     if radius is not None:
         leaves["racket_radius"] = np.array([radius])
     verdict = judge(leaves, contact_tolerance=0.2)
@@ -416,8 +396,7 @@ def test_a_racket_is_met_within_its_radius_less_a_margin(radius, off, passes):
 
 
 def test_a_small_racket_tightens_the_usual_tolerance():
-    leaves = volley()
-    leaves["ball.pos"] = leaves["ball.pos"] + [0.0, 0.0, 0.003]
+    leaves = edit(volley(), {("ball.pos", 2): add(0.003)})
     assert judge(leaves).success[0]
     leaves["racket_radius"] = np.array([0.003])
     assert judge(leaves).failed_limit[0] == "contact"

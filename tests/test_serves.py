@@ -67,9 +67,6 @@ def floor_points(position, velocity, step=1e-3):
     return point
 
 
-# The court.
-
-
 def test_the_court_has_36_scenarios_without_mirror_images():
     assert len(court.SCENARIOS) == len(set(court.SCENARIOS)) == 36
     mirror = str.maketrans("LR", "RL")
@@ -97,9 +94,6 @@ def test_each_target_lies_in_the_region_that_its_scenario_names():
     target = court.target_of(np.arange(36))
     named = [1 + court.REGIONS.index(name[2]) for name in court.SCENARIOS]
     np.testing.assert_array_equal(region_of(target[:, 0], target[:, 1]), named)
-
-
-# The published files.
 
 
 def test_trial_files_are_read_with_the_outcome_of_each_planner(tmp_path):
@@ -198,9 +192,6 @@ def test_the_published_serves_are_read_with_their_rates():
     np.testing.assert_allclose(rates, read_published_rates().trials.mean(axis=0), atol=1.0)
 
 
-# Flight on the host.
-
-
 def test_the_host_flies_a_ball_as_the_library_does(float64):
     position, velocity = np.array([2.0, 0.3, 2.0]), np.array([-5.0, 1.0, 7.0])
     ball = flight.BallState(pos=jnp.asarray(position), vel=jnp.asarray(velocity))
@@ -227,9 +218,6 @@ def test_the_landing_point_agrees_with_a_fine_integration(drag):
     time, point = landing(position, velocity, drag, GRAVITY)
     fine, _ = fly(position, velocity, time, drag, GRAVITY, num_steps=4000)
     np.testing.assert_allclose(point, fine, atol=1e-3)
-
-
-# Generated serves.
 
 
 def test_fewer_serves_are_the_first_of_more_and_chunks_join():
@@ -324,9 +312,6 @@ def test_arguments_of_the_generator_out_of_range_are_named(arguments, says):
         generate_serves(**{"num": 1, "seed": 0, **arguments})
 
 
-# From serves to cases.
-
-
 def test_two_delays_in_a_row_are_their_sum():
     serves = generate_serves(36, 0)
     late = advance(serves, 0.8)
@@ -389,9 +374,6 @@ def test_uniform_starts_fill_the_half_court_and_belong_to_their_serve():
 def test_arguments_of_cases_out_of_range_are_named(arguments, says):
     with pytest.raises(ArgumentError, match=says):
         to_cases(generate_serves(1, 0), **arguments)
-
-
-# Checks of cases.
 
 
 def test_generated_cases_pass_the_check_early_and_late_and_one_by_one():

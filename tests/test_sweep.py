@@ -141,9 +141,6 @@ def test_rows_are_picked_across_the_row_groups_of_parts(tmp_path):
     assert [row["index"] for row in plans.pick(rows)] == rows
 
 
-# Resuming.
-
-
 @pytest.mark.parametrize("step", ["plan_baselines", "write_report"])
 def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(
     tmp_path, monkeypatch, no_figures, step
@@ -176,9 +173,6 @@ def test_a_serve_drawn_late_that_breaks_a_rule_leaves_nothing_behind(tmp_path):
     with pytest.raises(ArgumentError, match="delay must be shorter than each serve's flight"):
         start_sweep(TASK, settings, out, progress=False)
     assert not list(tmp_path.iterdir())
-
-
-# Serves from a folder.
 
 
 def trial_files(folder, num_rows=3):
@@ -245,9 +239,6 @@ def test_resuming_needs_the_serves_that_the_run_began_with(tmp_path, monkeypatch
         resume_sweep(TASK, out, progress=False)
 
 
-# Tables.
-
-
 def test_the_table_has_all_scenarios_beside_both_published_rates(finished):
     _, manifest = finished
     table, rates = HitSweep(TASK).table(manifest), read_published_rates()
@@ -284,9 +275,6 @@ def test_a_percentage_is_100_or_0_only_where_it_is_exact():
 
 def test_the_interval_without_trials_says_nothing():
     assert wilson_interval(0, 0) == (0.0, 1.0)
-
-
-# Clocks and curves.
 
 
 def test_overlapping_compilations_are_counted_once():
@@ -334,9 +322,6 @@ def test_hover_is_named_where_no_curve_runs(finished):
     thrust = next(axes for axes in figure.axes if axes.get_title().startswith("Thrust"))
     assert "dotted: hover" in thrust.get_title()
     assert all("hover" not in text.get_text() for text in thrust.texts)
-
-
-# Settings.
 
 
 def test_the_truer_model_is_for_the_exact_planner_alone():

@@ -94,9 +94,6 @@ def test_a_case_can_be_made_inside_a_compiled_function():
     assert scale(2.0) == 6.0
 
 
-# Tables of positions, and classes of the user
-
-
 def swing(times, order=0):
     """Return positions (K, 3) of a smooth target, or their derivatives."""
     phase = np.array([0.0, 0.7, 1.9]) + 0.5 * order * np.pi
