@@ -21,13 +21,7 @@ from planner_jax.sims.noise import NOISES
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
 from planner_jax.sims.tasks import catch_ahead
 from planner_jax.sims.tasks.catch import CATCH_WORLD, fly_catches, throws
-from planner_jax.sims.tasks.catch_ahead import (
-    LIMITS,
-    bounds,
-    compile_attempts,
-    plan_ahead,
-    within,
-)
+from planner_jax.sims.tasks.catch_ahead import LIMITS, bounds, compile_attempts, plan_ahead, within
 from planner_jax.sims.tasks.catch_pilot import is_worth_flying
 from planner_jax.sims.tasks.hit import HIT_WORLD, fly_hits, volleys
 from planner_jax.task import catch

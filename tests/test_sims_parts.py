@@ -16,14 +16,7 @@ from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import await_ball, ready, require_plan, require_world
 from planner_jax.sims.loop import predict_balls
 from planner_jax.sims.loop_state import Loop
-from planner_jax.sims.model import (
-    BALL_MASS,
-    at_rest,
-    ball_states,
-    mujoco_model,
-    place_balls,
-    step,
-)
+from planner_jax.sims.model import BALL_MASS, at_rest, ball_states, mujoco_model, place_balls, step
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
 from planner_jax.sims.robots.quadrotor.control import Gains, rotation_error
