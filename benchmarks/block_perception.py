@@ -44,7 +44,7 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import measure_warm
-from planner_jax.sims.segment import ball_look, noisy_depth, sighting
+from planner_jax.sims.segment import ball_thresholds, noisy_depth, sighting
 from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.contact_check import end_at_contact
 from planner_jax.studies.block.flight_fit import across_std, belief_at, error_across, fit_flight
@@ -174,7 +174,7 @@ def rendered(bench: Bench, num: int, seed: int) -> None:
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
-    seer, look = eye(rate=RENDERED_RATE), ball_look()
+    seer, thresholds = eye(rate=RENDERED_RATE), ball_thresholds()
     assert isinstance(seer.noise, StereoNoise)
     cases = pj.block.draw(num, "short", seed)
     camera, found = calibrate_camera(irb1600(), seer.camera, seer.noise, seed=seed)
@@ -200,7 +200,7 @@ def rendered(bench: Bench, num: int, seed: int) -> None:
                 seconds.append(time.perf_counter() - began)
                 depth, trust = map(np.asarray, noisy(keys[k, n], seer.camera, seer.noise, depth))
                 began = time.perf_counter()
-                places[k, n] = np.asarray(seen_in(image, depth, trust, camera, look).place)
+                places[k, n] = np.asarray(seen_in(image, depth, trust, camera, thresholds).place)
                 frame_seconds.append(time.perf_counter() - began)
     report_frames(bench, seer, truth, places)
     bench.say(f"Rendering takes {1e3 * np.median(seconds):.0f} ms a frame (median).", "")

@@ -3,7 +3,7 @@
     python -m benchmarks.fly_steps [--worlds 4096,65536] [--seconds 0.4]
 
 Open loop steps the physics with constant rotor thrusts. Closed loop is a whole flight without
-re-planning: looks, Kalman filter, reference, control, physics, contact. A step is a physics and
+re-planning: observations, filter, reference, control, physics, contact. A step is a physics and
 a control step of 2 ms. Where the package crazyflow is installed, its first-principles quadrotor
 steps beside ours, without a ball. Compilation is apart.
 """
@@ -87,7 +87,7 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)
     known, drag = jax.tree.map(many, (known, drag))
     periods = loop.num_periods(seconds)
-    steps = worlds * periods * loop.looks_per_plan * loop.steps_per_look
+    steps = worlds * periods * loop.observations_per_plan * loop.steps_per_observation
     run = lambda: fly_leg(loop, CatchPilot(), flight, known, drag, num_periods=periods)  # noqa: E731
     timed(f"closed loop, {worlds} worlds", steps, lambda: run()[0].physics)
 

@@ -46,8 +46,8 @@ def show_board(
     """
     rng = np.random.default_rng(seed)
     angles = rng.uniform(arm.lower, arm.upper, (draws, 6)).astype(np.float32)
-    rotations, places = jax.jit(jax.vmap(link_frames, (None, 0)))(arm, angles)
-    flange = pose(np.asarray(rotations[:, 5], float), np.asarray(places[:, 5], float))
+    rotations, positions = jax.jit(jax.vmap(link_frames, (None, 0)))(arm, angles)
+    flange = pose(np.asarray(rotations[:, 5], float), np.asarray(positions[:, 5], float))
     half = float(arm.shield_half)
     grid = np.stack(np.meshgrid(*[np.linspace(-half, half, _CORNERS)] * 2), axis=-1)
     points = np.asarray(arm.shield_centre) + np.pad(grid.reshape(-1, 2), ((0, 0), (1, 0)))

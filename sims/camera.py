@@ -23,7 +23,7 @@ from jax import Array
 
 from planner_jax.core.errors import PlannerJaxError
 from planner_jax.sims.scenery import GROUND_COLOUR, xml_colour, xml_numbers
-from planner_jax.sims.segment import BallLook, Sighting, noisy_depth, sighting
+from planner_jax.sims.segment import BallThresholds, Sighting, noisy_depth, sighting
 from planner_jax.studies.block.camera import Camera
 from planner_jax.studies.block.noise import StereoNoise
 from planner_jax.task.block.scene import Scene
@@ -91,7 +91,7 @@ class SceneCamera:
         self.close()
 
     def close(self) -> None:
-        """Free the OpenGL context."""
+        """Release the OpenGL context."""
         self._to.free()
         self._context.free()
 
@@ -135,8 +135,8 @@ class SceneCamera:
 
 
 @jax.jit
-def look(
-    key: Array, image: Array, depth: Array, camera: Camera, noise: StereoNoise, ball: BallLook
+def measure_ball(
+    key: Array, image: Array, depth: Array, camera: Camera, noise: StereoNoise, ball: BallThresholds
 ) -> Sighting:
     """Return where the ball is in one frame of a stereo camera, from an image and its true depth.
 
@@ -152,11 +152,11 @@ def look(
     return sighting(image, seen, confidence, camera, ball)
 
 
-def sightings_of(
+def measure_balls(
     eye: SceneCamera,
     places: np.ndarray,
     noise: StereoNoise,
-    ball: BallLook,
+    ball: BallThresholds,
     *,
     seed: int = 0,
     believed: Camera | None = None,
@@ -174,7 +174,7 @@ def sightings_of(
     camera = eye.camera if believed is None else believed
     keys = jax.random.split(jax.random.key(seed), len(places))
     found = [
-        look(key, *map(jnp.asarray, eye.take(place)), camera, noise, ball).place
+        measure_ball(key, *map(jnp.asarray, eye.take(place)), camera, noise, ball).place
         for key, place in zip(keys, np.asarray(places, float), strict=True)
     ]
     return np.array(found)

@@ -54,7 +54,7 @@ class _Setting:
     torques: Array  # (6,) [N m], torque limits
     lag: Array  # () [s], of the torques, first order
     stds: Array  # (2,), of measured angles [rad] and rates [rad/s]
-    mass_error: Array  # () relative error of the masses that control believes
+    mass_error: Array  # () relative error of the masses in the controller's model
 
 
 @dataclasses.dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Scene:
         """
         world = task.world()
         self.world, self.recording, self.flight = world, recording, flight
-        self.num_looks = recording.num_looks(flight)
+        self.num_samples = recording.num_samples(flight)
         self.times, self.met = recording.time[flight], recording.met[flight]
         balls, met = recording.balls[flight], np.nan_to_num(self.met, nan=np.inf)
         after = self.times[:, None] > met
@@ -80,10 +80,10 @@ class Scene:
             self.returned = self.axes.plot([], [], [], color=GREEN, lw=1.6, label="returned ball")[
                 0
             ]
-        self.ways = []
+        self.predictions = []
         if recording.expected.shape[2]:
-            look = {"color": RED, "lw": 1.0, "ls": ":", "label": f"{thing} as expected"}
-            self.ways = self.axes.plot([], [], [], **look)
+            style = {"color": RED, "lw": 1.0, "ls": ":", "label": f"{thing} as expected"}
+            self.predictions = self.axes.plot([], [], [], **style)
         prisms = task.surroundings(int(recording.index[flight]))
         standing = [prism for prism in prisms if not any(prism.velocity)]
         self.movers = [prism for prism in prisms if any(prism.velocity)]
@@ -114,8 +114,8 @@ class Scene:
         for line in edges:
             self.axes.plot(*line.T, color=GREY, lw=0.8, zorder=1)
         for part, patch in zip(flat, patches, strict=True):
-            look = {"facecolor": part.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.4}
-            self.axes.add_collection3d(Poly3DCollection([patch], zorder=0, **look))
+            style = {"facecolor": part.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.4}
+            self.axes.add_collection3d(Poly3DCollection([patch], zorder=0, **style))
         for prism in standing:
             self._fill(prism, 0.0)
         for part in solid:
@@ -138,26 +138,26 @@ class Scene:
     def _fill(self, prism: Prism, time: float) -> list[Any]:
         """Draw a prism's top as a filled polygon at a time [s]; return what was drawn."""
         top = prism.outlines(time)[1]
-        look = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
-        return [self.axes.add_collection3d(Poly3DCollection([top], **look))]
+        style = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
+        return [self.axes.add_collection3d(Poly3DCollection([top], **style))]
 
     def _add_solid(self, solid: Solid, colour: str, opacity: float, shade: bool = False) -> Any:
         """Draw the faces of a solid in the world frame; return what was drawn."""
         faces = solid.corners[solid.triangles]
-        look = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
-        look |= {"alpha": opacity, "shade": shade}
-        return self.axes.add_collection3d(Poly3DCollection(faces, **look))
+        style = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
+        style |= {"alpha": opacity, "shade": shade}
+        return self.axes.add_collection3d(Poly3DCollection(faces, **style))
 
     def plan_path(self) -> np.ndarray:
         """Return the path of the executed plans (M, 3) [m], up to the last contact."""
-        wanted = self.recording.wanted[self.flight, : self.last_met() + 1]
+        wanted = self.recording.wanted[self.flight, : self.find_last_contact() + 1]
         return wanted[np.isfinite(wanted).all(axis=1)]
 
-    def last_met(self) -> int:
+    def find_last_contact(self) -> int:
         """Return the index of the sample at the last contact; by default the last sample."""
         end = np.nanmax(np.append(self.met, -np.inf))
-        at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_looks
-        return min(at, self.num_looks - 1)
+        at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_samples
+        return min(at, self.num_samples - 1)
 
     def _machine(self) -> list[Part]:
         """Return the parts of the pitching machine at the launch position, if there is one."""
@@ -178,8 +178,8 @@ class Scene:
                 drawn.append(self._add_solid(solid, colour, alpha, shade=True))
             drawn += [self.axes.plot(*line.T, color=BLUE, lw=1.4, alpha=alpha)[0] for line in lines]
             if shape.tool:
-                look = {"facecolor": SKY, "edgecolor": "none", "alpha": 0.5 * alpha}
-                drawn.append(self.axes.add_collection3d(Poly3DCollection([lines[-1]], **look)))
+                style = {"facecolor": SKY, "edgecolor": "none", "alpha": 0.5 * alpha}
+                drawn.append(self.axes.add_collection3d(Poly3DCollection([lines[-1]], **style)))
         return drawn
 
     def ghosts(self, last: int) -> None:
@@ -189,10 +189,10 @@ class Scene:
         """
         path = self.world.robot.place(self.recording.robot[self.flight, : last + 1])
         path = path[np.isfinite(path).all(axis=1)]
-        way = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
-        number = int(np.clip(way[-1] / _APART, 1, _GHOSTS))
+        distance = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1)))
+        number = int(np.clip(distance[-1] / _APART, 1, _GHOSTS))
         for share in np.arange(number) / number:
-            at = int(np.searchsorted(way, share * way[-1]))
+            at = int(np.searchsorted(distance, share * distance[-1]))
             self.robot(at, 0.15 + 0.4 * share)
             for ball, trail in zip(self.balls[at], self.trails, strict=True):
                 self.axes.plot(*ball[:, None], ".", ms=7, color=trail.get_color())
@@ -227,8 +227,8 @@ class Scene:
         self.moving = self.robot(at)
         for prism in self.movers:
             self.moving += self._fill(prism, float(self.times[at]))
-        for way in self.ways:
-            way.set_data_3d(*self.recording.expected[self.flight, at].T)
+        for line in self.predictions:
+            line.set_data_3d(*self.recording.expected[self.flight, at].T)
 
 
 def draw_flight(
@@ -254,8 +254,8 @@ def draw_flight(
     FigureCanvasAgg(figure)
     scene = Scene(figure, task, recording, flight, title, view)
     figure.subplots_adjust(left=0.0, right=0.96, bottom=0.04, top=0.95)
-    scene.ghosts(scene.last_met())
-    scene.show(scene.last_met(), scene.num_looks - 1)
+    scene.ghosts(scene.find_last_contact())
+    scene.show(scene.find_last_contact(), scene.num_samples - 1)
     scene.contacts(task.CONTACT)
     _write(path, lambda scratch: figure.savefig(scratch, dpi=110, format="png"))
 
@@ -286,7 +286,7 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
             for flight in range(num):
                 figure.clear()
                 scene = Scene(figure, task, recording, flight)
-                for at in range(0, scene.num_looks, _FRAME):
+                for at in range(0, scene.num_samples, _FRAME):
                     scene.show(at)
                     writer.grab_frame()
 

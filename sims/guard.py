@@ -53,7 +53,7 @@ def guard_server(names: set[str], token: str | None) -> Iterator[Callable[[], bo
     """
     from websockets.asyncio import server
 
-    begun, plain = [], server.serve
+    started, plain = [], server.serve
 
     def serve(*arguments: Any, process_request: Any = None, **how: Any) -> Any:
         def process(connection: Any, request: Any) -> Any:
@@ -61,15 +61,15 @@ def guard_server(names: set[str], token: str | None) -> Iterator[Callable[[], bo
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "not allowed\n")
             answer = process_request(connection, request) if process_request else None
             if token is not None and answer is not None:
-                kept = f"{_COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
-                answer.headers["Set-Cookie"] = kept
+                cookie = f"{_COOKIE}={token}; Path=/; HttpOnly; SameSite=Strict"
+                answer.headers["Set-Cookie"] = cookie
             return answer
 
-        begun.append(True)
+        started.append(True)
         return plain(*arguments, process_request=process, **how)
 
     server.serve = serve  # type: ignore[assignment, misc]
     try:
-        yield lambda: bool(begun)
+        yield lambda: bool(started)
     finally:
         server.serve = plain  # type: ignore[misc]

@@ -48,7 +48,7 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
         estimates = jax.vmap(sight.first_estimate)(*unknown)
         return FlightState(
             physics=at_rest(loop.world, start),
-            shown=jnp.zeros((loop.late_looks, number, 3)),
+            shown=jnp.zeros((loop.late_observations, number, 3)),
             estimates=estimates,
             earlier=estimates,
             launched=nothing,
@@ -102,7 +102,7 @@ def _launch_ball(
     ball: Array,
     seen: float,
 ) -> FlightState:
-    """Launch a ball as `launch_ball` does, in flights without plans."""
+    """Add a ball to flights without plans; see `launch_ball`."""
 
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
@@ -184,19 +184,19 @@ def watch_ball(
     ages = (num - 1 - np.arange(num)) / sensing.rate
     place = lambda age: fly(ball, -age, drag, gravity, num_steps=16)[0].pos  # noqa: E731
     path = jax.vmap(place)(jnp.asarray(ages, dtype))
-    looks, shown = path[: num - loop.late_looks], path[num - loop.late_looks :]
-    keys = jax.random.split(key, looks.shape[0])
-    seen = jax.vmap(lambda k, at: sight.observe(k, at[None], sensing)[0])(keys, looks)
+    observed, shown = path[: num - loop.late_observations], path[num - loop.late_observations :]
+    keys = jax.random.split(key, observed.shape[0])
+    seen = jax.vmap(lambda k, at: sight.observe(k, at[None], sensing)[0])(keys, observed)
 
-    look = sight.look if loop.kalman else sight.look_unfiltered
+    update = sight.update_estimate if loop.kalman else sight.update_unfiltered
 
     def advance(estimate: Estimate, at: Array) -> tuple[Estimate, Estimate]:
-        after = look(estimate, at, sensing, gravity)
+        after = update(estimate, at, sensing, gravity)
         return after, after
 
-    first = sight.first_estimate(looks[0], believed)
+    first = sight.first_estimate(observed[0], believed)
     now, history = lax.scan(advance, first, seen)
-    earlier = jax.tree.map(lambda leaf: leaf[-1 - loop.looks_per_plan], history)
+    earlier = jax.tree.map(lambda leaf: leaf[-1 - loop.observations_per_plan], history)
     return shown, earlier, sight.anchor_energy(now, gravity)
 
 

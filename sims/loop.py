@@ -33,12 +33,12 @@ from planner_jax.sims.sensing import Estimate
 _FEW = 1024  # largest batch for which compilation takes longer than the flights themselves
 
 
-def _fly_look(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
+def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
     """Simulate physics and control up to the next observation, and update the estimates with it."""
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
-    times = flight.time + world.timestep * jnp.arange(loop.steps_per_look, dtype=dtype)
+    times = flight.time + world.timestep * jnp.arange(loop.steps_per_observation, dtype=dtype)
     references = robot.references(flight.plan, times - flight.began, world)
     planned = flight.began + pilot.times(flight.plan)
     last = jnp.max(jnp.where(flight.present, planned, -jnp.inf))
@@ -89,8 +89,8 @@ def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
-        looked = sight.look if loop.kalman else sight.look_unfiltered
-        estimate = looked(estimate, at, loop.sensing, gravity)
+        update = sight.update_estimate if loop.kalman else sight.update_unfiltered
+        estimate = update(estimate, at, loop.sensing, gravity)
         return sight.with_drag(estimate, gravity) if loop.estimate_drag else estimate
 
     return jax.vmap(one)(estimates, seen)
@@ -142,13 +142,15 @@ def _fly(
     """Fly some periods by the current plans; return flights (B, ...) and records (B, K, ...)."""
 
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
-        def next_look(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
-            flight = _fly_look(loop, pilot, flight, drag)
+        def next_observation(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
+            flight = _fly_to_observation(loop, pilot, flight, drag)
             return flight, _record(loop, pilot, flight, drag) if loop.record else None
 
         def next_period(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
             flight = dataclasses.replace(flight, earlier=flight.estimates)
-            flight, record = lax.scan(next_look, flight, None, length=loop.looks_per_plan)
+            flight, record = lax.scan(
+                next_observation, flight, None, length=loop.observations_per_plan
+            )
             gone = pilot.times(flight.plan) <= flight.time - flight.began
             return dataclasses.replace(flight, present=flight.present & ~gone), record
 

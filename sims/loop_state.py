@@ -81,25 +81,25 @@ class Loop:
         require_whole(control_rate / sensing.rate, "rate", rule, sensing.rate)
         rule = f"a multiple of the observations' {1.0 / sensing.rate:g} s"
         require_whole(sensing.latency * sensing.rate, "latency", rule, sensing.latency)
-        sensing.looks_per_plan(self.replan)
+        sensing.observations_per_plan(self.replan)
 
     @property
-    def steps_per_look(self) -> int:
+    def steps_per_observation(self) -> int:
         """The number of physics steps from one observation to the next."""
         return round(1.0 / (self.sensing.rate * self.world.timestep))
 
     @property
-    def looks_per_plan(self) -> int:
+    def observations_per_plan(self) -> int:
         """The number of observations from one plan to the next; one without replanning."""
-        return self.sensing.looks_per_plan(self.replan)
+        return self.sensing.observations_per_plan(self.replan)
 
     @property
     def period(self) -> float:
         """The time [s] from one plan to the next."""
-        return self.looks_per_plan / self.sensing.rate
+        return self.observations_per_plan / self.sensing.rate
 
     @property
-    def late_looks(self) -> int:
+    def late_observations(self) -> int:
         """The latency of an observation, in observation periods."""
         return round(self.sensing.latency * self.sensing.rate)
 

@@ -35,7 +35,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.sims.robot import Physics, Robot, ToolRobot
 from planner_jax.sims.scenery import (
     GROUND_COLOUR,
-    LOOK,
+    VISUAL,
     Part,
     machine_parts,
     part_xml,
@@ -87,7 +87,7 @@ def mjcf(world: World) -> str:
     balls = "".join(
         f'<body name="ball{k}">{slides}'
         f'<inertial pos="0 0 0" mass="{BALL_MASS}" diaginertia="{xml_numbers(*[inertia] * 3)}"/>'
-        f'<geom name="ball{k}" type="sphere" size="{BALL_RADIUS}" rgba="1 .5 0 1" {LOOK}/></body>'
+        f'<geom name="ball{k}" type="sphere" size="{BALL_RADIUS}" rgba="1 .5 0 1" {VISUAL}/></body>'
         for k in range(world.num_balls)
     )
     return f"""
@@ -101,7 +101,7 @@ def mjcf(world: World) -> str:
   </visual>
   <worldbody>
     <light directional="true" dir="0 .3 -1" diffuse=".5 .5 .5" castshadow="false"/>
-    <geom name="ground" type="plane" size="10 10 .1" rgba="{xml_colour(GROUND_COLOUR)}" {LOOK}/>
+    <geom name="ground" type="plane" size="10 10 .1" rgba="{xml_colour(GROUND_COLOUR)}" {VISUAL}/>
     {"".join(map(part_xml, (*machine, *world.scenery)))}
     {body}
     {balls}

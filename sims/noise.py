@@ -40,7 +40,7 @@ class Sensing:
         if not self.dropout < 1.0:
             raise ArgumentError("dropout", "< 1", self.dropout)
 
-    def looks_per_plan(self, replan: float) -> int:
+    def observations_per_plan(self, replan: float) -> int:
         """Return the number of observations from one plan to the next; one without replanning.
 
         Args:

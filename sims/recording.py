@@ -50,7 +50,7 @@ class Recording:
     def __len__(self) -> int:
         return len(self.index)
 
-    def num_looks(self, flight: int) -> int:
+    def num_samples(self, flight: int) -> int:
         """Return the number of samples of a flight up to the last one with a moving object."""
         there = np.isfinite(self.robot[flight]).all(axis=1)
         there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
@@ -87,7 +87,7 @@ class Launches:
     target: Any = None  # (F, 3) [m], of a returned ball
 
 
-def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
+def frame(recording: Recording, robot: Robot, flight: int, sample: int) -> Frame:
     """Return the positions of robot and balls at a sample of a flight.
 
     After the end of its simulation the robot stays where it was. A caught ball lies in its net.
@@ -96,21 +96,21 @@ def frame(recording: Recording, robot: Robot, flight: int, look: int) -> Frame:
         recording: of the run.
         robot: that was flown.
         flight: row of the recording.
-        look: index of the sample.
+        sample: index of the sample.
 
     Raises:
         ValueError: there is no such flight or sample.
     """
     for name, value, number in (
         ("flight", flight, len(recording)),
-        ("look", look, recording.time.shape[1]),
+        ("sample", sample, recording.time.shape[1]),
     ):
         if not 0 <= value < number:
             raise ArgumentError(name, f">= 0 and < {number}", value)
     flown = np.isfinite(recording.robot[flight]).all(axis=1)
-    at = min(look, int(np.flatnonzero(flown)[-1]))
+    at = min(sample, int(np.flatnonzero(flown)[-1]))
     pose = recording.robot[flight, at]
-    balls, time = recording.balls[flight, look].copy(), recording.time[flight, look]
+    balls, time = recording.balls[flight, sample].copy(), recording.time[flight, sample]
     held = robot.find_held_ball(pose)
     if np.isfinite(held).all():
         balls[time > _or_never(recording.met[flight])] = held
@@ -135,7 +135,7 @@ def make_recording(
     balls, drag, seen, returned = launches.balls, launches.drag, launches.seen, launches.returned
     steps, begins = np.asarray(record.time, float), np.asarray(launches.begins, float)
     apart = float(np.median(np.diff(steps[0])))
-    number, looks = steps.shape
+    number, samples = steps.shape
     met = np.where(flown.contact.met, flown.contact.time, np.nan)
     down = np.full((number, 1), np.nan)  # times at which returned balls reach the ground
     if returned is not None:
@@ -143,13 +143,13 @@ def make_recording(
         down = met[:, :1] + np.minimum(np.nan_to_num(away, nan=_LONGEST), _LONGEST)[:, None]
     before = round((seen + steps[0, 0]) / apart)
     after = int(np.ceil((np.nanmax(np.append(down, steps[0, -1])) - steps[0, -1]) / apart - 1e-6))
-    grid = steps[0, 0] + apart * np.arange(-before, looks + after)
+    grid = steps[0, 0] + apart * np.arange(-before, samples + after)
     time = np.broadcast_to(grid, (number, grid.size))
 
     def extend(leaf: np.ndarray) -> np.ndarray:
         """Extend a leaf over all samples: its first value before the record, NaN after it."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
-        whole[:, before : before + looks], whole[:, :before] = leaf, leaf[:, :1]
+        whole[:, before : before + samples], whole[:, :before] = leaf, leaf[:, :1]
         return whole
 
     def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
@@ -160,7 +160,7 @@ def make_recording(
     robot, simulated = np.split(
         np.asarray(record.physics.qpos, float), [world.robot.num_pos], axis=2
     )
-    paths = extend(simulated.reshape(number, looks, -1, 3))
+    paths = extend(simulated.reshape(number, samples, -1, 3))
     own = time[:, :, None] - begins  # (F, K, N) [s], since each ball was planned for
     early = flight_of(balls, np.clip(own, -seen, 0.0), drag)
     paths = np.where((own < 0.5 * apart)[..., None], early, paths)
@@ -233,11 +233,11 @@ def read_recording(table: pa.Table) -> Recording:
         name: np.array(table[name].to_pylist(), None if name in ("index", "success") else float)
         for name in table.column_names
     }
-    number, looks = columns["time"].shape
+    number, samples = columns["time"].shape
     for name in ("robot", "wanted"):
-        columns[name] = columns[name].reshape(number, looks, -1)
-    columns["balls"] = columns["balls"].reshape(number, looks, -1, 3)
+        columns[name] = columns[name].reshape(number, samples, -1)
+    columns["balls"] = columns["balls"].reshape(number, samples, -1, 3)
     columns["contact"] = columns["contact"].reshape(number, -1, 3)
-    points = columns["expected"].shape[1] // (3 * looks)
-    columns["expected"] = columns["expected"].reshape(number, looks, points, 3)
+    points = columns["expected"].shape[1] // (3 * samples)
+    columns["expected"] = columns["expected"].reshape(number, samples, points, 3)
     return Recording(**columns)

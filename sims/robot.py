@@ -121,7 +121,7 @@ class Robot(Protocol):
 
 
 class ToolRobot(Robot, Protocol):
-    """A robot that meets balls with a tool."""
+    """A robot that hits or catches balls with a tool."""
 
     @property
     def model(self) -> QuadrotorModel:

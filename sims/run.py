@@ -290,7 +290,7 @@ def write_flight_report(folder: RunFolder) -> None:
         f"{''.join(f'<h2>{html.escape(each.title)}</h2>{chr(10)}{to_html(each)}' for each in more)}"
         f"<ul>\n{notes}</ul>\n"
         f'<p>All rows: <a href="plans/">plans/</a>. The first '
-        f"{len(recording)} flights look by look: "
+        f"{len(recording)} flights, sample by sample: "
         f'<a href="{FLIGHTS}/">{FLIGHTS}/</a>; play them with <code>planner-jax view</code>.</p>\n'
         f"<details><summary>manifest.json</summary><pre>{record}</pre></details>\n"
         "</body></html>\n",

@@ -10,7 +10,7 @@ from planner_jax.sims.robot import Solid
 
 GROUND_COLOUR = "#A9C4A9"
 FLAT = 0.01  # [m]; parts that are no higher lie flat on the ground
-LOOK = 'mass="0" contype="0" conaffinity="0"'  # MJCF attributes of visual geoms
+VISUAL = 'mass="0" contype="0" conaffinity="0"'  # MJCF attributes of visual geoms
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
 _SIDES, _RINGS = 14, 3  # facets of a drawn capsule, around its axis and at each end
 
@@ -162,5 +162,5 @@ def part_xml(part: Part) -> str:
     return (
         f'<geom type="{part.kind}" size="{xml_numbers(*half)}" pos="{xml_numbers(*part.centre)}" '
         f'quat="{xml_numbers(*part.quat_wxyz)}" '
-        f'rgba="{xml_colour(part.colour, part.opacity)}" {LOOK}/>'
+        f'rgba="{xml_colour(part.colour, part.opacity)}" {VISUAL}/>'
     )

@@ -22,7 +22,7 @@ _WHOLE = 0.7  # least visible share of a ball's pixels at its depth
 
 
 @struct.dataclass
-class BallLook:
+class BallThresholds:
     """Thresholds that separate a ball's pixels from others."""
 
     lower: Array  # (3,) hue, saturation and value, each 0 to 1
@@ -33,7 +33,7 @@ class BallLook:
     reach: Array  # () [m], greatest depth
 
 
-def ball_look(
+def ball_thresholds(
     lower: np.ndarray | tuple[float, ...] = (0.02, 0.5, 0.25),
     upper: np.ndarray | tuple[float, ...] = (0.13, 1.0, 1.0),
     *,
@@ -41,7 +41,7 @@ def ball_look(
     confidence: float = 0.5,
     pixels: float = 4,
     reach: float = 14.0,
-) -> BallLook:
+) -> BallThresholds:
     """Return thresholds of a ball as NumPy float32 leaves; the default ball is orange.
 
     Raises:
@@ -54,7 +54,7 @@ def ball_look(
     if not radius > 0.0:
         raise ValueError(f"radius must be > 0, got {radius:g}")
     return from_numbers(
-        BallLook,
+        BallThresholds,
         lower=np.asarray(lower),
         upper=np.asarray(upper),
         radius=radius,
@@ -90,7 +90,7 @@ def hue_saturation_value(rgb: Array) -> Array:
     return jnp.stack([hue, saturation, value], axis=-1)
 
 
-def colour_mask(image: Array, look: BallLook) -> Array:
+def colour_mask(image: Array, thresholds: BallThresholds) -> Array:
     """Return which pixels have the ball's colour, (rows, columns), of bytes (rows, columns, 3).
 
     The result equals a comparison with `hue_saturation_value`, but needs no division per pixel.
@@ -104,16 +104,16 @@ def colour_mask(image: Array, look: BallLook) -> Array:
         green - blue + jnp.where(green < blue, 6.0, 0.0) * span,
         jnp.where(value == green, 2.0 * span + blue - red, 4.0 * span + red - green),
     )
-    low, high = 6.0 * look.lower[0], 6.0 * look.upper[0]
+    low, high = 6.0 * thresholds.lower[0], 6.0 * thresholds.upper[0]
     above, below = turn >= low * span, turn <= high * span
-    hue = jnp.where(look.lower[0] <= look.upper[0], above & below, above | below)
-    saturation = (span >= look.lower[1] * value) & (span <= look.upper[1] * value)
-    bright = (value >= 255.0 * look.lower[2]) & (value <= 255.0 * look.upper[2])
+    hue = jnp.where(thresholds.lower[0] <= thresholds.upper[0], above & below, above | below)
+    saturation = (span >= thresholds.lower[1] * value) & (span <= thresholds.upper[1] * value)
+    bright = (value >= 255.0 * thresholds.lower[2]) & (value <= 255.0 * thresholds.upper[2])
     return hue & saturation & bright
 
 
 def sighting(
-    image: Array, depth: Array, confidence: Array, camera: Camera, look: BallLook
+    image: Array, depth: Array, confidence: Array, camera: Camera, thresholds: BallThresholds
 ) -> Sighting:
     """Return where the ball is in one frame.
 
@@ -136,18 +136,20 @@ def sighting(
         depth: (rows, columns) [m]; NaN where there is none.
         confidence: (rows, columns), 0 to 1.
         camera: that took the frame.
-        look: thresholds of the ball.
+        thresholds: thresholds of the ball.
     """
-    mask = colour_mask(image, look)
+    mask = colour_mask(image, thresholds)
     corner = [_middle(jnp.sum(mask, axis=1 - axis)) - WINDOW // 2 for axis in range(2)]
     corner = [jnp.clip(at, 0, mask.shape[axis] - WINDOW) for axis, at in enumerate(corner)]
     mask, depth, confidence = (
         lax.dynamic_slice(each, corner, (WINDOW, WINDOW)) for each in (mask, depth, confidence)
     )
-    usable = mask & (confidence >= look.confidence) & (depth > 0.0) & (depth < look.reach)
+    usable = (
+        mask & (confidence >= thresholds.confidence) & (depth > 0.0) & (depth < thresholds.reach)
+    )
     middle = _median(depth, usable)
     spread = 1.4826 * _median(jnp.abs(depth - middle), usable)
-    usable = usable & (jnp.abs(depth - middle) <= 3.0 * spread + look.radius)
+    usable = usable & (jnp.abs(depth - middle) <= 3.0 * spread + thresholds.radius)
     num = jnp.sum(usable)
 
     def mean(values: Array, of: Array) -> Array:
@@ -157,15 +159,15 @@ def sighting(
     first = jnp.stack([mean(column, usable), mean(row, usable)])
     across = (first + jnp.stack(corner[::-1]) - camera.centre) / camera.focal
     along = jnp.sqrt(1.0 + jnp.sum(across**2))
-    deep = mean(depth, usable) + _MEAN_HEIGHT * look.radius / along
+    deep = mean(depth, usable) + _MEAN_HEIGHT * thresholds.radius / along
     # Holes in the depth would bias the centroid. So it uses all pixels of the ball's colour within
     # its apparent radius. Away from the camera's axis the image of a ball is stretched.
-    round_px = camera.focal * look.radius / jnp.maximum(deep, look.radius)
+    round_px = camera.focal * thresholds.radius / jnp.maximum(deep, thresholds.radius)
     within = 1.5 * along * round_px + 1.0
     near = mask & ((column - first[0]) ** 2 + (row - first[1]) ** 2 <= within**2)
     pixel = jnp.stack([mean(column, near), mean(row, near)]) + jnp.stack(corner[::-1])
     whole = jnp.sum(near) >= _WHOLE * jnp.pi * round_px**2 * along
-    seen = (num >= look.pixels) & whole
+    seen = (num >= thresholds.pixels) & whole
     place = back_project(camera, pixel, deep)
     return Sighting(
         place=jnp.where(seen, place, jnp.nan),

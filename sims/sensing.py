@@ -99,7 +99,7 @@ def first_estimate(pos: Array, drag: Array) -> Estimate:
     )
 
 
-def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
+def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
     """Return the estimate of one ball after one more observation (3,)."""
     model = _model(sensing, estimate.drag, gravity)
     period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
@@ -109,7 +109,9 @@ def look(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> E
     return dataclasses.replace(estimate, belief=belief, lever=estimate.lever + speed**3 * period)
 
 
-def look_unfiltered(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
+def update_unfiltered(
+    estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array
+) -> Estimate:
     """Return the estimate after one more observation without a filter.
 
     The position is the observed one; the velocity follows from the previous position.

@@ -54,7 +54,7 @@ def require_interval(sensing: Sensing, replan: float) -> None:
         sensing: whose observation periods divide a planning period.
         replan: [Hz], rate of replanning; 0 for never.
     """
-    period = sensing.looks_per_plan(replan) / sensing.rate
+    period = sensing.observations_per_plan(replan) / sensing.rate
     rule = f"such that its period divides {INTERVAL:g} s"
     require_whole(INTERVAL / period, "replan", rule, replan)
 
@@ -132,7 +132,7 @@ class BallFly(FlySettings):
 
     def check_rate(self) -> None:
         """Raise `ValueError` unless a planning period is a whole number of observation periods."""
-        NOISES[self.noise].looks_per_plan(self.rate)
+        NOISES[self.noise].observations_per_plan(self.rate)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +305,7 @@ class BlockFly(FlySettings):
     encoders: str = option(
         "fine", "NAME", f"preset of encoder noise in angles and rates: {', '.join(ENCODERS)}"
     )
-    mass_error: float = option(0.05, "F", "relative error of the masses that control believes")
+    mass_error: float = option(0.05, "F", "relative error of the masses in the controller's model")
 
     TASK: ClassVar[Task] = BLOCK
     FLIGHT: ClassVar[str] = "planner_jax.sims.tasks.block:BlockFlight"

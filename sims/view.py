@@ -137,7 +137,7 @@ class Viewer:
         if task.HAS_REACH:
             self.reach = gui.add_checkbox("What can be reached", False)
         self._note = gui.add_markdown("")
-        self._stand()
+        self._add_fixed_objects()
         self._draw_flight()
         self.flight.on_update(lambda _: self._draw_flight())
         self.time.on_update(lambda _: self._show())
@@ -145,11 +145,11 @@ class Viewer:
             self.reach.on_update(lambda _: self._draw_flight())
 
     @property
-    def look(self) -> int:
+    def sample(self) -> int:
         """The index of the displayed sample."""
         times = self.recording.time[self._row]
         nearest = int(np.argmin(np.abs(times - self.time.value)))
-        return min(nearest, self.recording.num_looks(self._row) - 1)
+        return min(nearest, self.recording.num_samples(self._row) - 1)
 
     @property
     def _row(self) -> int:
@@ -179,7 +179,7 @@ class Viewer:
         """Stop the server."""
         self._server.stop()
 
-    def _stand(self) -> None:
+    def _add_fixed_objects(self) -> None:
         """Add what all flights share: ground, scenery, robot, balls and their trails."""
         add = self._scene
         add.set_up_direction("+z")
@@ -216,7 +216,7 @@ class Viewer:
             self._trails.append(self._add_line(f"/trail{k}", nothing, colour, 0.012))
         camera = self._server.initial_camera
         camera.position, camera.look_at = self.task.EYE
-        self._way = self._add_line("/expected", nothing, RED, 0.006)
+        self._prediction = self._add_line("/expected", nothing, RED, 0.006)
 
     def _add_line(self, name: str, pieces: np.ndarray, colour: str, thickness: float) -> Any:
         return self._scene.add_line_segments(name, pieces, _rgb(colour), thickness=thickness)
@@ -233,15 +233,15 @@ class Viewer:
     def _add_parts(self, name: str, parts: Sequence[Part]) -> list[Any]:
         drawn = []
         for number, part in enumerate(parts):
-            look = {"color": _rgb(part.colour), "wxyz": part.quat_wxyz, "position": part.centre}
+            style = {"color": _rgb(part.colour), "wxyz": part.quat_wxyz, "position": part.centre}
             if part.opacity < 1.0:
-                look["opacity"] = part.opacity
+                style["opacity"] = part.opacity
             own = f"{name}/{number}"
             if part.kind == "box":
-                drawn.append(self._scene.add_box(own, dimensions=part.size, **look))
+                drawn.append(self._scene.add_box(own, dimensions=part.size, **style))
             else:
                 radius, height = 0.5 * part.size[0], part.size[2]
-                drawn.append(self._scene.add_cylinder(own, radius, height, **look))
+                drawn.append(self._scene.add_cylinder(own, radius, height, **style))
         return drawn
 
     def _draw_flight(self) -> None:
@@ -288,24 +288,24 @@ class Viewer:
             word, none = self.task.CONTACT.capitalize(), f"No {self.task.THING} was met."
             self._note.content = f"{word} at {', '.join(met)}." if met else none
             self.time.value = self.time.min
-            last = recording.num_looks(row) - 1
+            last = recording.num_samples(row) - 1
             self.time.max = round(float(recording.time[row, last]), 3)
             self._show()
 
     def _show(self) -> None:
         """Draw the moving objects at the time of the slider."""
         with self._lock, self._server.atomic():
-            row, look = self._row, self.look
+            row, sample = self._row, self.sample
             robot = self.world.robot
-            now = frame(self.recording, robot, row, look)
+            now = frame(self.recording, robot, row, sample)
             for shape, place in zip(self.robot, robot.places(now.robot), strict=True):
                 shape.position, shape.wxyz = place
             for prism, solid in self._prisms:
                 solid.position = (*(now.time * np.asarray(prism.velocity)), 0.0)
-            way = segments(self.recording.expected[row, look])
-            self._way.visible = len(way) > 0
-            if self._way.visible:
-                self._way.points = way.astype(np.float32)
+            path = segments(self.recording.expected[row, sample])
+            self._prediction.visible = len(path) > 0
+            if self._prediction.visible:
+                self._prediction.points = path.astype(np.float32)
             if self._layers:
                 nearest = np.argmin([abs(time - now.time) for time, _ in self._layers])
                 points = self._layers[nearest][1]
@@ -315,7 +315,7 @@ class Viewer:
                 ball.visible = bool(np.isfinite(now.balls[k]).all())
                 if ball.visible:
                     ball.position = now.balls[k]
-                behind = segments(self.recording.balls[row, : look + 1, k])
+                behind = segments(self.recording.balls[row, : sample + 1, k])
                 trail.visible = len(behind) > 0
                 if trail.visible:
                     trail.points = behind.astype(np.float32)

@@ -256,7 +256,7 @@ def test_hue_saturation_and_value_are_those_of_the_standard_library():
 def test_the_mask_compares_hue_saturation_and_value(hues):
     rng = np.random.default_rng(1)
     image = rng.integers(0, 256, (40, 50, 3)).astype(np.uint8)
-    look = segment.ball_look((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
+    look = segment.ball_thresholds((hues[0], 0.4, 0.3), (hues[1], 0.9, 0.95))
     hsv = np.asarray(segment.hue_saturation_value(image.astype(np.float32) / 255.0), float)
     edges = np.stack([look.lower, look.upper])
     near = (np.abs(hsv[:, :, None] - edges) < 1e-5).any(axis=(2, 3))  # rounding decides there
@@ -289,7 +289,7 @@ def ball_frame(place, radius=0.05):
 @pytest.mark.parametrize("place", [(1.5, 0.4, 1.2), (4.0, 1.0, 1.5), (3.0, -2.0, 2.0)])
 def test_a_ball_is_seen_where_it_is(place):
     image, depth = ball_frame(np.array(place))
-    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_look())
+    found = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_thresholds())
     pixel, distance = project(CAMERA, jnp.array(place))
     np.testing.assert_allclose(found.pixel, pixel, atol=0.35)
     assert found.depth == pytest.approx(float(distance), abs=0.02)
@@ -298,7 +298,7 @@ def test_a_ball_is_seen_where_it_is(place):
 def test_pixels_of_little_confidence_or_another_depth_are_dropped():
     place = np.array([2.0, 0.3, 1.3])
     image, depth = ball_frame(place)
-    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_look())
+    clean = sighting_one(image, depth, np.ones_like(depth), CAMERA, segment.ball_thresholds())
     ball = np.argwhere(depth < 12.0)
     wrong = ball[:: len(ball) // 6]
     spoiled, trust = depth.copy(), np.ones_like(depth)
@@ -306,7 +306,7 @@ def test_pixels_of_little_confidence_or_another_depth_are_dropped():
     spoiled[tuple(wrong[1::2].T)] *= 1.02
     trust[tuple(wrong[1::2].T)] = 0.1
     image[:3, :2] = image[tuple(ball[0])]  # as if something far away had the colour
-    found = sighting_one(image, spoiled, trust, CAMERA, segment.ball_look())
+    found = sighting_one(image, spoiled, trust, CAMERA, segment.ball_thresholds())
     assert found.pixels == clean.pixels - len(wrong)
     np.testing.assert_allclose(found.place, clean.place, atol=0.02)
 
@@ -320,7 +320,7 @@ def test_a_frame_without_the_ball_shows_nothing():
         (image, depth, 0.0 * trust),
         (image, 20.0 * depth, trust),
     ):
-        found = sighting_one(*frame, CAMERA, segment.ball_look())
+        found = sighting_one(*frame, CAMERA, segment.ball_thresholds())
         assert found.pixels == 0 and np.isnan(found.place).all() and np.isnan(found.depth)
 
 

@@ -344,7 +344,7 @@ def test_the_viewer_places_the_links_of_the_arm(recorded):
     viewer = Viewer(task, kept, port=0)
     try:
         viewer.time.value = 0.3
-        there = BLOCK_ARM.places(kept.robot[0, viewer.look])
+        there = BLOCK_ARM.places(kept.robot[0, viewer.sample])
         for shown, (place, _) in zip(viewer.robot, there, strict=True):
             np.testing.assert_allclose(shown.position, place, atol=1e-6)
     finally:

@@ -13,8 +13,8 @@ from planner_jax.ball.flight import drag_free_flight
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sims import camera as scene_camera
 from planner_jax.sims.board import calibrate_camera, show_board
-from planner_jax.sims.camera import RenderError, SceneCamera, sightings_of
-from planner_jax.sims.segment import ball_look, sighting
+from planner_jax.sims.camera import RenderError, SceneCamera, measure_balls
+from planner_jax.sims.segment import ball_thresholds, sighting
 from planner_jax.studies.block.camera import project
 from planner_jax.studies.block.flight_fit import belief_at, error_across, fit_flight
 from planner_jax.studies.block.noise import information, stereo_noise
@@ -38,7 +38,7 @@ def scene():
 @pytest.mark.parametrize("place", [(1.2, 0.4, 1.2), (2.5, -1.8, 1.0), (3.0, 3.0, 2.2)])
 def test_a_rendered_ball_is_measured_at_its_true_position(scene, place):
     image, depth = scene.take(np.array(place))
-    found = see(image, depth, np.ones_like(depth), CAMERA, ball_look())
+    found = see(image, depth, np.ones_like(depth), CAMERA, ball_thresholds())
     pixel, distance = project(CAMERA, jnp.array(place))
     np.testing.assert_allclose(found.pixel, pixel, atol=0.3)
     assert found.depth == pytest.approx(float(distance), abs=0.01)
@@ -64,7 +64,7 @@ def test_a_ball_behind_the_pole_or_out_of_view_is_not_seen(scene):
     half_hidden = behind + 0.5 * 0.15 * np.asarray(CAMERA.rotation)[:, 0]
     for place in (behind, half_hidden, np.array([-4.0, 0.0, 1.0]), None):
         image, depth = scene.take(place)
-        found = see(image, depth, np.ones_like(depth), CAMERA, ball_look())
+        found = see(image, depth, np.ones_like(depth), CAMERA, ball_thresholds())
         assert found.pixels == 0 and np.isnan(found.place).all()
 
 
@@ -76,7 +76,7 @@ def test_the_error_of_a_flight_fitted_to_images_matches_its_estimated_error(scen
     # The last part of the flight, where this small image has enough pixels of the ball.
     times = jnp.arange(10) / 30.0 + 0.4
     places = jax.vmap(drag_free_flight, (None, 0, None))(ball, times, GRAVITY).pos
-    seen = sightings_of(scene, np.asarray(places), noise, ball_look(), seed=3)
+    seen = measure_balls(scene, np.asarray(places), noise, ball_thresholds(), seed=3)
     assert np.isfinite(seen).all(axis=1).sum() >= 8
     fit = jax.jit(fit_flight)(times, seen, information(CAMERA, noise, jnp.asarray(seen)), GRAVITY)
     truth = drag_free_flight(ball, times[-1], GRAVITY)

@@ -42,7 +42,7 @@ CAR = Vehicle()
 CURVATURE = 1.3  # [1/m], of the circle in open loop
 END, PIECES = 4.0, 20
 SHARE = np.linspace(0.0, 1.0, PIECES + 1)
-WAYS = {  # speed and curvature at the knots
+PATHS = {  # speed and curvature at the knots
     "straight": (0.5 + 0.8 * SHARE, 0.0 * SHARE),
     "circle": (1.0 + 0.0 * SHARE, 1.0 + 0.0 * SHARE),
     "slalom": (0.5 + 0.6 * SHARE, 1.2 * np.sin(8.0 * SHARE)),
@@ -68,11 +68,11 @@ def plans(speed, curvature):
 
 
 def drive_paths(sensing):
-    """Return drives along all paths of WAYS at their end, and all frames."""
+    """Return drives along all paths of PATHS at their end, and all frames."""
     loop = DriveLoop(CAR_WORLD, sensing)
-    keys = jax.random.split(jax.random.key(3), len(WAYS))
-    drives = start_drives(loop, plans(*zip(*WAYS.values(), strict=True)), keys)
-    until = np.full(len(WAYS), END, np.float32)  # shares its program with the flights
+    keys = jax.random.split(jax.random.key(3), len(PATHS))
+    drives = start_drives(loop, plans(*zip(*PATHS.values(), strict=True)), keys)
+    until = np.full(len(PATHS), END, np.float32)  # shares its program with the flights
     for _ in range(2):
         drives, frames = drive_on(CAR_WORLD, drives, until, num_frames=100)
     return jax.device_get((drives.replace(key=None), frames))
@@ -203,7 +203,7 @@ def test_contacts_of_planned_poses_equal_those_of_the_referee():
         tracking=np.zeros((6, 2)),
         saturation=np.zeros((6, 2)),
         plans=np.ones(6, int),
-        ways=np.zeros((6, len(setpoints.time), 0, 2)),
+        paths=np.zeros((6, len(setpoints.time), 0, 2)),
     )
     found, verdict = score(cases, plan, flown), intercept.judge(cases, plan)
     for name in ("wall_clearance", "mover_clearance", "miss"):

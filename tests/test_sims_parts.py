@@ -27,9 +27,9 @@ from planner_jax.sims.scoring import Moment, nearest, no_contact, passage
 from planner_jax.sims.sensing import (
     anchor_energy,
     first_estimate,
-    look,
     observe,
     predict,
+    update_estimate,
     with_drag,
 )
 from planner_jax.sims.tasks.catch import CATCH_WORLD
@@ -283,7 +283,7 @@ def test_the_drag_is_estimated_from_the_lost_energy():
 
     def advance(estimate, now):
         number, at = now
-        estimate = look(estimate, at, sensing, GRAVITY)
+        estimate = update_estimate(estimate, at, sensing, GRAVITY)
         fresh = anchor_energy(estimate, GRAVITY)
         later = with_drag(estimate, GRAVITY)
         return jax.tree.map(lambda a, b: jnp.where(number < 30, a, b), fresh, later), None

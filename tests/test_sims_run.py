@@ -252,8 +252,8 @@ class DropFlight(BallFlightTask):
         return FlightCases(np.arange(self.settings.num))
 
     def fly(self, cases, record):
-        state, looks, plan = self.leg(self.loop(record), cases, DropPilot(), 60)
-        return DropFlights(plan, collect_flights(state, looks), 0.0)
+        state, records, plan = self.leg(self.loop(record), cases, DropPilot(), 60)
+        return DropFlights(plan, collect_flights(state, records), 0.0)
 
     def leg(self, loop, cases, pilot, periods):
         num = len(cases)
@@ -287,11 +287,11 @@ def test_the_parts_of_a_period_give_the_same_flights_as_one_program(monkeypatch)
     flights = []
     for in_parts in (False, True):
         monkeypatch.setattr(sims_loop, "in_parts", lambda _, parts=in_parts: parts)
-        state, looks, _ = flight.leg(loop, flight.cases(), RisingPilot(), 8)
-        flights.append(dataclasses.asdict(collect_flights(state, looks)))
+        state, records, _ = flight.leg(loop, flight.cases(), RisingPilot(), 8)
+        flights.append(dataclasses.asdict(collect_flights(state, records)))
     whole, parts = flights
     assert whole["plan"]["trajectory"]["coeffs"][0, 0, 0, 2] == pytest.approx(1.004, abs=1e-6)
-    assert whole["record"]["time"].shape == (2, 8 * loop.looks_per_plan)
+    assert whole["record"]["time"].shape == (2, 8 * loop.observations_per_plan)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), whole, parts)
 
 

@@ -94,7 +94,7 @@ def test_a_recording_contains_the_ball_from_the_machine_to_the_ground():
     np.testing.assert_allclose(path[-1], [*back.pos[0, :2], 0.0], atol=1e-4)
     assert np.isfinite(path).all()
     assert np.isnan(whole.robot[0, times > 0.505]).all()  # the simulation has ended
-    assert whole.num_looks(0) == len(times)
+    assert whole.num_samples(0) == len(times)
 
 
 def test_a_second_ball_is_recorded_from_its_own_launch():
@@ -119,7 +119,7 @@ def test_a_second_ball_is_recorded_from_its_own_launch():
     np.testing.assert_allclose(second[early], expected, atol=1e-6)
     assert np.isnan(second[times > begin + 0.005]).all()  # the record has it far away
     assert np.isnan(whole.met).all() and np.isnan(whole.contact).all()
-    assert whole.num_looks(0) == len(times) == 81
+    assert whole.num_samples(0) == len(times) == 81
 
 
 def test_a_recording_is_read_as_it_was_written(tmp_path):
@@ -149,16 +149,16 @@ def test_after_its_end_a_flight_stands_still_and_a_caught_ball_lies_in_the_net()
 
 
 @pytest.mark.parametrize(
-    ("flight", "look", "message"),
+    ("flight", "sample", "message"),
     [
         (1, 0, "flight must be >= 0 and < 1, got 1"),
-        (0, 6, "look must be >= 0 and < 6, got 6"),
-        (0, -1, "look must be >= 0 and < 6, got -1"),
+        (0, 6, "sample must be >= 0 and < 6, got 6"),
+        (0, -1, "sample must be >= 0 and < 6, got -1"),
     ],
 )
-def test_a_missing_frame_is_refused(flight, look, message):
+def test_a_missing_frame_is_refused(flight, sample, message):
     with pytest.raises(ValueError) as error:
-        frame(recording(), NET, flight, look)
+        frame(recording(), NET, flight, sample)
     assert str(error.value) == message
 
 
@@ -248,19 +248,19 @@ def test_a_flight_is_served_scrubbed_and_played():
         with urllib.request.urlopen(viewer.url, timeout=10) as page:
             assert page.status == 200 and b"<html" in page.read()
         viewer.time.value = 0.02
-        assert viewer.look == 2
+        assert viewer.sample == 2
         np.testing.assert_allclose(viewer.robot[0].position, [0.0, 0.0, 1.02])
         viewer.flight.value = "catch 1, success"
-        assert viewer.look == 0
+        assert viewer.sample == 0
         viewer.speed.value = 1.0
         viewer.advance(0.03)
-        assert viewer.look == 3
+        assert viewer.sample == 3
         viewer.playing.value = False
         viewer.advance(0.01)
-        assert viewer.look == 3
+        assert viewer.sample == 3
         viewer.playing.value = True
         viewer.advance(0.03)
-        assert viewer.look == 0  # back at the start
+        assert viewer.sample == 0  # back at the start
     finally:
         viewer.close()
 

@@ -208,7 +208,7 @@ def fly_catches(
         begun = jax.tree.map(jnp.asarray, found)
         flight = with_catch(flight, begun, jnp.asarray(known.present))
         compiled()
-        flight, looks = fly_leg(
+        flight, leg = fly_leg(
             loop,
             pilot,
             flight,
@@ -216,7 +216,7 @@ def fly_catches(
             drag,
             num_periods=loop.num_periods(float(cases.horizon.max()) + _AFTER if last else INTERVAL),
         )
-        records += looks
+        records += leg
     return CatchFlights(first, collect_flights(flight, records), planning)
 
 

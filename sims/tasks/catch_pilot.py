@@ -100,9 +100,8 @@ class CatchPilot:
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            since = jnp.mod(
-                outlook.time + _INSTANT, 1.0 / self.redecide
-            )  # [s], since a decision was due
+            # [s], since a decision was due.
+            since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)
             plan = jax.tree.map(lambda new, old: jnp.where(take, new, old), fresh, plan)

@@ -202,7 +202,7 @@ class Driven:
     tracking: np.ndarray  # (B, 2) [m], of the rear axle from its plans: rms and worst
     saturation: np.ndarray  # (B, 2), share of the time with drive and steering saturated
     plans: np.ndarray  # (B,) int, number of executed plans
-    ways: np.ndarray  # (B, S, M, 2) [m], predicted path of the target from each frame on
+    paths: np.ndarray  # (B, S, M, 2) [m], predicted path of the target from each frame on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -259,12 +259,12 @@ def fly_intercepts(
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
     planner = planner or intercept_planner()
-    ways = functools.partial(
+    predict = functools.partial(
         predict_scene, loop, cases, known_target=known_target, predict_movers=predict_movers
     )
     truth = jax.tree.map(jnp.asarray, cases.cases)
     until, zero = truth.time, jnp.zeros((), truth.time.dtype)
-    target, movers = ways(zero)
+    target, movers = predict(zero)
     begun = remaining(
         truth, jnp.zeros_like(until), target, movers, truth.start, truth.speed, truth.curvature
     )
@@ -280,7 +280,7 @@ def fly_intercepts(
         drive, part = drive_on(loop.world, drive, until, num_frames=frames)
         parts.append(part)
         if replan > 0.0 and period + 1 < periods:
-            target, movers = ways(drive.time[0])
+            target, movers = predict(drive.time[0])
             drive, begun, good = plan_again(loop, planner, drive, begun, target, movers)
             number += np.asarray(good)
     flown = _collect_drives(truth, drive, parts, seen, number)
@@ -295,7 +295,7 @@ def plan_again(
     target: TurningPath,
     movers: Obstacles,
 ) -> tuple[DriveState, InterceptCase, Array]:
-    """Replan from the cars' estimated poses, and use the new plans that satisfy every limit.
+    """Plan again from the cars' estimated poses, and use the plans that satisfy every limit.
 
     Args:
         loop: of the drives.
@@ -358,7 +358,7 @@ def _collect_drives(
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]
     end = np.asarray(truth.time)
-    ways = np.concatenate([np.repeat(way[:, None], count, axis=1) for way, count in seen], axis=1)
+    paths = np.concatenate([np.repeat(path[:, None], n, axis=1) for path, n in seen], axis=1)
     return Driven(
         times=np.arange(frames.time.shape[1] + 1) / FRAME_RATE,
         poses=np.concatenate([start, frames.pose], axis=1).astype(float),
@@ -367,7 +367,7 @@ def _collect_drives(
         tracking=np.stack([np.sqrt(drive.squared_tracking / end), drive.worst_tracking], axis=1),
         saturation=np.asarray(drive.saturated) / end[:, None],
         plans=number,
-        ways=np.concatenate([ways[:, :1], ways], axis=1),
+        paths=np.concatenate([paths[:, :1], paths], axis=1),
     )
 
 

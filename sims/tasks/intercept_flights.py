@@ -127,7 +127,7 @@ class InterceptFlight(FlightTask):
             met=met[:, None],
             contact=_add_height(where, _TARGET_HEIGHT)[:, None],
             target=np.full((len(some), 3), np.nan),
-            expected=_add_height(flown.ways[lanes][:, kept], _TARGET_HEIGHT),
+            expected=_add_height(flown.paths[lanes][:, kept], _TARGET_HEIGHT),
         )
 
     @property

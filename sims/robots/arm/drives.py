@@ -27,7 +27,7 @@ class Drives:
     latency: float = 0.0  # [s], delay of a plan's start at the joints
     angle_std: float = 0.0  # [rad], of a measured angle
     rate_std: float = 0.0  # [rad/s], of a measured rate
-    mass_error: float = 0.0  # relative error of the masses and inertias that control believes
+    mass_error: float = 0.0  # relative error of the masses and inertias in the controller's model
 
     def __post_init__(self) -> None:
         if len(self.torques) != 6 or not all(torque > 0.0 for torque in self.torques):

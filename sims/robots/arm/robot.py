@@ -29,7 +29,7 @@ from planner_jax.sims.robots.arm.control import (
     control,
     reference_at,
 )
-from planner_jax.sims.scenery import LOOK, box_solid, capsule_solid, xml_numbers
+from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, xml_numbers
 
 _MODELS = importlib.resources.files("planner_jax.robot") / "models"
 _IRB1600 = (_MODELS / "irb1600.xml").read_text("utf-8")
@@ -80,18 +80,18 @@ class ShieldArm:
             ends = ends + [[0.0, 0.0, 0.0], [1e-6, 0.0, 0.0]]
             solids[link].append(
                 f'<geom type="capsule" fromto="{xml_numbers(*np.ravel(ends))}" '
-                f'size="{xml_numbers(radius)}" rgba=".9 .6 .2 1" {LOOK}/>'
+                f'size="{xml_numbers(radius)}" rgba=".9 .6 .2 1" {VISUAL}/>'
             )
         middle, half = _box(arm.base_box)
         solids[-1].append(
             f'<geom type="box" pos="{xml_numbers(*middle)}" size="{xml_numbers(*half)}" '
-            f'rgba=".3 .3 .3 1" {LOOK}/>'
+            f'rgba=".3 .3 .3 1" {VISUAL}/>'
         )
         plate = [0.5 * _THICKNESS, arm.shield_half, arm.shield_half]
         behind = arm.shield_centre - [0.5 * _THICKNESS, 0.0, 0.0]
         solids[5].append(
             f'<geom name="shield" type="box" pos="{xml_numbers(*behind)}" '
-            f'size="{xml_numbers(*plate)}" rgba=".2 .5 .8 1" {LOOK}/>'
+            f'size="{xml_numbers(*plate)}" rgba=".2 .5 .8 1" {VISUAL}/>'
         )
         base = f'<body name="base" pos="{xml_numbers(0.0, 0.0, self.base_height)}">'
         chain = "".join(self._link(k) + "".join(solids[k]) for k in range(6))
@@ -192,7 +192,7 @@ class ShieldArm:
         return [*found, found[-1]]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the middle of the shield's face, (..., 3) [m]."""
+        """Return the centre of the shield's face, (..., 3) [m]."""
         case = lanes_of(self.arm)
         angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
         middle = shield_middle(case, *links_of(case, angles))[:, 0].T

@@ -19,7 +19,7 @@ from planner_jax.sims.robot import Physics, Shape
 from planner_jax.sims.robots.car.control import CarState, Gains, Reference, control, reference_at
 from planner_jax.sims.robots.car.tyres import tyre_forces
 from planner_jax.sims.robots.car.vehicle import Vehicle
-from planner_jax.sims.scenery import LOOK, xml_numbers
+from planner_jax.sims.scenery import VISUAL, xml_numbers
 
 _HEIGHT = 0.1  # [m], of the body
 _CLEARANCE = 0.03  # [m], of the body above the ground
@@ -46,7 +46,7 @@ class Car:
         body = np.array([0.5 * vehicle.length, 0.5 * vehicle.width, 0.5 * _HEIGHT])
         wheels = "".join(
             f'<geom type="cylinder" size="{xml_numbers(vehicle.wheel_radius, 0.015)}" '
-            f'pos="{xml_numbers(*place)}" quat=".7071068 .7071068 0 0" rgba=".1 .1 .1 1" {LOOK}/>'
+            f'pos="{xml_numbers(*place)}" quat=".7071068 .7071068 0 0" rgba=".1 .1 .1 1" {VISUAL}/>'
             for place in self._wheels()
         )
         force = vehicle.mass * vehicle.acceleration
@@ -65,7 +65,7 @@ class Car:
             f'mass="{vehicle.mass}" diaginertia="{xml_numbers(*[vehicle.yaw_inertia] * 3)}"/>'
             f'<site name="rear_axle"/><geom type="box" size="{xml_numbers(*body)}" '
             f'pos="{xml_numbers(middle, 0.0, _CLEARANCE + 0.5 * _HEIGHT)}" rgba=".2 .4 .8 1" '
-            f"{LOOK}/>{wheels}</body>"
+            f"{VISUAL}/>{wheels}</body>"
         )
         return text, actuators
 

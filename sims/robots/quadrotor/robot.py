@@ -17,7 +17,7 @@ from planner_jax.sims.model import BALL_RADIUS, World
 from planner_jax.sims.robot import Physics, Shape, rotation
 from planner_jax.sims.robots.quadrotor.control import Gains, RobotState, control
 from planner_jax.sims.robots.quadrotor.reference import Reference, reference_at, with_rest
-from planner_jax.sims.scenery import LOOK, xml_numbers
+from planner_jax.sims.scenery import VISUAL, xml_numbers
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 
 _SEGMENTS = 12  # number of capsules of the hoop
@@ -46,8 +46,8 @@ class Quadrotor:
         discs = "".join(
             f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
             f'<geom type="cylinder" size="{rotors.radius:g} .003" '
-            f'pos="{xml_numbers(*place)}" rgba=".2 .2 .2 .6" {LOOK}/>'
-            f'<geom type="capsule" size=".008" fromto="0 0 0 {xml_numbers(*place)}" {LOOK}/>'
+            f'pos="{xml_numbers(*place)}" rgba=".2 .2 .2 .6" {VISUAL}/>'
+            f'<geom type="capsule" size=".008" fromto="0 0 0 {xml_numbers(*place)}" {VISUAL}/>'
             for i, place in enumerate(rotors.positions)
         )
         motors = "".join(
@@ -69,13 +69,13 @@ class Quadrotor:
         low = tool.height - BALL_RADIUS * (1.0 if tool.kind == RACKET else 3.0)
         plate = (
             f'<geom type="cylinder" size="{xml_numbers(tool.radius)} .002" '
-            f'pos="0 0 {xml_numbers(low)}" rgba=".3 .5 .9 .5" {LOOK}/>'
+            f'pos="0 0 {xml_numbers(low)}" rgba=".3 .5 .9 .5" {VISUAL}/>'
         )
         if tool.kind == RACKET:
             return plate
         rim = _circle(np.array([0.0, 0.0, tool.height]), tool.radius, _SEGMENTS)
         ring = "".join(
-            f'<geom type="capsule" size=".004" rgba=".2 .2 .2 1" {LOOK} '
+            f'<geom type="capsule" size=".004" rgba=".2 .2 .2 1" {VISUAL} '
             f'fromto="{xml_numbers(*a, *b)}"/>'
             for a, b in zip(rim[:-1], rim[1:], strict=True)
         )
