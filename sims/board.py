@@ -35,10 +35,10 @@ def show_board(
 
     Args:
         arm: NumPy leaves.
-        camera: at its true pose.
-        noise: of the stereo camera's measurements.
+        camera: the camera at its true pose.
+        noise: parameters of the stereo camera's noise.
         num: number of views, >= 1.
-        seed: of poses and noise.
+        seed: random seed of poses and noise.
         draws: number of drawn poses; poses from which the camera cannot see the board are dropped.
 
     Raises:

@@ -52,7 +52,7 @@ class SceneCamera:
 
         Args:
             camera: NumPy leaves.
-            scene: of one case.
+            scene: the surroundings of the arm in one case.
             ball_radius: [m].
             arm_xml: MJCF text of the arm; by default the arm of the paper.
 
@@ -141,11 +141,11 @@ def measure_ball(
     """Return where the ball is in one frame of a stereo camera, from an image and its true depth.
 
     Args:
-        key: of the noise.
+        key: random key of the noise.
         image: (rows, columns, 3) bytes.
         depth: (rows, columns) [m], without noise.
-        camera: at its calibrated pose.
-        noise: of depths.
+        camera: the camera at its calibrated pose.
+        noise: parameters of the depth noise.
         ball: thresholds that separate the ball from the background.
     """
     seen, confidence = noisy_depth(key, camera, noise, depth)
@@ -166,9 +166,9 @@ def measure_balls(
     Args:
         eye: the camera that renders the frames; the arm stands still.
         places: (N, 3) [m], true positions of the ball's centre.
-        noise: of depths.
+        noise: parameters of the depth noise.
         ball: thresholds that separate the ball from the background.
-        seed: of the noise.
+        seed: random seed of the noise.
         believed: the camera at its calibrated pose; by default at its true pose.
     """
     camera = eye.camera if believed is None else believed

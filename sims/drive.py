@@ -105,9 +105,9 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
     """Return drives at the start of their plans.
 
     Args:
-        loop: with the world.
+        loop: settings of the loop, with the world.
         plans: leaves (B, ...).
-        keys: (B,) of the noise.
+        keys: (B,) random keys of the noise.
     """
 
     def one(plan: CarPlan, key: Array) -> DriveState:
@@ -208,7 +208,7 @@ def drive_on(
     """Simulate a batch of drives for some frames.
 
     Args:
-        world: with a car.
+        world: a world with a car.
         drives: leaves (B, ...).
         until: (B,) [s], up to when tracking and saturation are summed.
         num_frames: number of frames (static).

@@ -24,9 +24,9 @@ from planner_jax.sims.robots.arm.control import Course, JointReference
 from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 
-TIMESTEP = 1e-3  # [s], of physics and control
+TIMESTEP = 1e-3  # [s], time step of physics and control
 _STEPS, _FRAMES = 2, 50  # steps per frame, frames per compiled call
-FRAME = _STEPS * TIMESTEP  # [s]
+FRAME = _STEPS * TIMESTEP  # [s], duration of a frame
 
 
 @struct.dataclass
@@ -52,8 +52,8 @@ class _Setting:
     since: Array  # () [s], start of the interval in which errors and torques are summed
     until: Array  # () [s], end of that interval
     torques: Array  # (6,) [N m], torque limits
-    lag: Array  # () [s], of the torques, first order
-    stds: Array  # (2,), of measured angles [rad] and rates [rad/s]
+    lag: Array  # () [s], first-order lag of the torques
+    stds: Array  # (2,), standard deviations of measured angles [rad] and rates [rad/s]
     mass_error: Array  # () relative error of the masses in the controller's model
 
 
@@ -64,12 +64,13 @@ class Executed:
     Errors and torques are evaluated from the time at which the arm may start until its contact.
     """
 
-    times: np.ndarray  # (S,) [s], of the frames, the first 0
+    times: np.ndarray  # (S,) [s], times of the frames; the first is 0
     angles: np.ndarray  # (B, S, 6) [rad]
     wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
-    error_rms: np.ndarray  # (B, 6) [rad], of angles from the commanded course, which may start late
-    error_worst: np.ndarray  # (B, 6) [rad]
+    # (B, 6) [rad], rms distance from the commanded course, which may start late
+    error_rms: np.ndarray
+    error_worst: np.ndarray  # (B, 6) [rad], greatest distance from it
     torque_rms: np.ndarray  # (B, 6) [N m]
     torque_worst: np.ndarray  # (B, 6) [N m]
     saturation: np.ndarray  # (B, 6), share of the time in which a drive was at its limit
@@ -186,14 +187,14 @@ def execute(
     """Execute a batch of courses.
 
     Args:
-        world: with an arm, and steps of `TIMESTEP`.
+        world: a world with an arm, and steps of `TIMESTEP`.
         courses: leaves (B, ...), as planned.
-        keys: (B,) of the noise.
+        keys: (B,) random keys of the noise.
         since: (B,) [s], start of the interval in which errors and torques are evaluated.
         until: (B,) [s], end of that interval.
         end: [s], least duration of the simulation.
         late: (B,) or () [s], delay of the start of a course, in addition to the drives' latency.
-        drives: of all arms.
+        drives: limits and errors of the drives of all arms.
 
     Raises:
         ValueError: the world has no arm, or its time step is not `TIMESTEP`.

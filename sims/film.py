@@ -48,11 +48,11 @@ class Scene:
         """Draw everything that does not move.
 
         Args:
-            figure: an empty one.
-            task: that was flown.
-            recording: of the run.
+            figure: an empty figure.
+            task: the task of the run.
+            recording: the recorded flights of the run.
             flight: row of the recording.
-            title: of the picture; by default the task's.
+            title: title of the picture; by default the title that the task composes.
             view: elevation and azimuth of the eye [degree]; by default the task's.
         """
         world = task.world()
@@ -82,7 +82,7 @@ class Scene:
             ]
         self.predictions = []
         if recording.expected.shape[2]:
-            style = {"color": RED, "lw": 1.0, "ls": ":", "label": f"{thing} as expected"}
+            style = {"color": RED, "lw": 1.0, "ls": ":", "label": f"predicted {thing}"}
             self.predictions = self.axes.plot([], [], [], **style)
         prisms = task.surroundings(int(recording.index[flight]))
         standing = [prism for prism in prisms if not any(prism.velocity)]
@@ -244,10 +244,10 @@ def draw_flight(
 
     Args:
         path: ends in .png.
-        task: that was flown.
-        recording: of the run.
+        task: the task of the run.
+        recording: the recorded flights of the run.
         flight: row of the recording.
-        title: of the picture; by default the task's.
+        title: title of the picture; by default the title that the task composes.
         view: elevation and azimuth of the eye [degree]; by default the task's.
     """
     figure = Figure(figsize=(7.6, 6.0))
@@ -267,8 +267,8 @@ def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -
 
     Args:
         path: ends in .gif, or in .mp4 where ffmpeg is installed.
-        task: that was flown.
-        recording: of the run.
+        task: the task of the run.
+        recording: the recorded flights of the run.
         num: number of flights in the film.
 
     Raises:

@@ -24,8 +24,8 @@ def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> b
     """Return whether a request may be answered.
 
     Args:
-        headers: of the request.
-        path: of the request, with its query.
+        headers: headers of the request.
+        path: path of the request, with its query.
         names: host names of this machine.
         token: required of the request, or None.
     """

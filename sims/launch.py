@@ -36,9 +36,9 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
     """Return flights with the robots at rest and no ball launched.
 
     Args:
-        loop: with the world.
+        loop: settings of the loop, with the world.
         starts: (B, 3) [m], positions of the robots.
-        keys: (B,) of the noise.
+        keys: (B,) random keys of the noise.
     """
     number = loop.world.num_balls
 
@@ -79,7 +79,7 @@ def launch_ball(
     """Return the flights with one more ball in the air.
 
     Args:
-        loop: of the flights.
+        loop: settings of the flights' loop.
         flights: leaves (B, ...).
         balls: leaves (B, N, 3), each at the start of the plan for it.
         drag: (B, N) K_D [1/m], the true one.
@@ -133,7 +133,7 @@ def await_ball(
     for it.
 
     Args:
-        loop: of the flights.
+        loop: settings of the flights' loop.
         flights: leaves (B, ...).
         coming: leaves (3,), guessed state of the ball at the start of the plan for it.
         believed: (B, N) K_D [1/m], initial estimate.
@@ -167,11 +167,11 @@ def watch_ball(
     """Return the observations of one ball before the start of the plan for it.
 
     Args:
-        loop: with sensing and planning period.
+        loop: settings of the loop, with sensing and planning period.
         ball: true state at the start of the plan.
         drag: () K_D [1/m], the true one.
         believed: () K_D [1/m], initial estimate.
-        key: of the observation noise.
+        key: random key of the observation noise.
         duration: [s], how long the ball has been in flight by then (static).
 
     Returns:
@@ -204,9 +204,9 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
     """Raise `ValueError` unless the simulated world is the one for which plans are made.
 
     Args:
-        loop: with the world.
-        kind: of the tool.
-        num_balls: of a flight.
+        loop: settings of the loop, with the world.
+        kind: required kind of the tool.
+        num_balls: required number of balls of a flight.
         planned: (B,) each, the values of `gravity`, `net_height`, `net_radius`, `racket_height` or
             `racket_radius` in the plans' cases; only the passed ones are compared.
     """
@@ -232,7 +232,7 @@ def require_plan(plan: Any, kind: type, head_state: Any) -> None:
     """Raise `ValueError` unless a plan is one of the task and starts at the position of the robot.
 
     Args:
-        plan: with a trajectory, leaves (B, ...).
+        plan: plans with a trajectory, leaves (B, ...).
         kind: class of the task's plans.
         head_state: (B, 4, 3) of the robot.
     """

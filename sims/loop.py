@@ -1,9 +1,9 @@
 """The closed loop of a batch of flights, period by period: observe, estimate, replan, track, hit.
 
 Three periods are nested. A physics step is also a control step. An observation of the balls follows
-after a fixed number of steps. A plan is made for a fixed number of observations: it uses what is
-known at the start of a planning period and takes effect at its end. So a plan may take one period
-to compute. The known latency of observations is compensated by extrapolating the estimates.
+after a fixed number of steps. A planning period is a fixed number of observations. A plan uses what
+is known at the start of its planning period and takes effect at the end, so that it may take one
+period to compute. Extrapolating the estimates compensates the known latency of observations.
 
 The robot (`sims.robot.Robot`, in the world) defines its references and commands. The task's pilot
 defines what is planned and what counts as a contact with a ball. Both are written for one flight;
@@ -214,10 +214,10 @@ def _next_period(
     """Return flights (B, ...) one period later, with plans made meanwhile, and their records.
 
     Args:
-        loop: of the flights.
-        pilot: of the task.
-        flights: at the start of the period.
-        cases: of the task, leaves (B, ...).
+        loop: settings of the flights' loop.
+        pilot: the task's part of the loop.
+        flights: the flights at the start of the period.
+        cases: cases of the task, leaves (B, ...).
         drag: (B, N) K_D [1/m].
         begin: starts one part of the period with its arguments, and returns a function that waits
             for the result.
@@ -254,9 +254,9 @@ def fly_leg(
 
     Args:
         loop: settings that shape the programs.
-        pilot: of the task.
-        flights: at the start of the leg, leaves (B, ...).
-        cases: of the task, leaves (B, ...); their times count like the flights'.
+        pilot: the task's part of the loop.
+        flights: the flights at the start of the leg, leaves (B, ...).
+        cases: cases of the task, leaves (B, ...); their times count like the flights'.
         drag: (B, N) K_D [1/m], the true one.
         num_periods: number of planning periods.
 
@@ -289,9 +289,9 @@ def begin_compiling(
 
     Args:
         loop: settings that shape the programs.
-        pilot: of the task.
+        pilot: the task's part of the loop.
         flights: leaves (B, ...), which may be without plans.
-        cases: as for `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
+        cases: cases of `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
         drag: (B, N) K_D [1/m].
 
     Returns:

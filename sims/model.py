@@ -133,7 +133,7 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
     """Return the physics after one time step of one world in MJX; pure, so scan, vmap and jit it.
 
     Args:
-        world: the model.
+        world: settings of the model.
         physics: before the step.
         command: (A,), for the robot's actuators.
         drag: (N,) K_D [1/m] of the balls.
@@ -177,8 +177,8 @@ def place_balls(
     """Return the physics with some balls set to new states.
 
     Args:
-        world: the model.
-        physics: of one world.
+        world: settings of the model.
+        physics: state of one world.
         balls: leaves (N, 3).
         drag: (N,) K_D [1/m].
         which: (N,) bool, the balls to place; the others stay as they are.

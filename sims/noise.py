@@ -22,8 +22,8 @@ class Sensing:
         ValueError: a value is out of its range.
     """
 
-    rate: float = 100.0  # [Hz], of the observations of the balls
-    position_std: float = 0.0  # [m], of a ball's coordinate
+    rate: float = 100.0  # [Hz], rate of the observations of the balls
+    position_std: float = 0.0  # [m], standard deviation of a ball's coordinate
     dropout: float = 0.0  # probability that an observation is missing
     latency: float = 0.0  # [s], age of an observation when it arrives
     # Standard deviations of the robot's own state, one for each field of the state in its units.
@@ -77,8 +77,8 @@ NOISES = {
 }
 
 
-CONTROL_RATE = 200  # [Hz], of the control steps of a drive
-FRAME_RATE = 50  # [Hz], of the stored poses of a drive, which are checked for collisions
+CONTROL_RATE = 200  # [Hz], rate of the control steps of a drive
+FRAME_RATE = 50  # [Hz], rate of the stored poses of a drive, which are checked for collisions
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,11 +92,13 @@ class PlaneSensing:
         ValueError: a value is out of its range.
     """
 
-    target_std: float = 0.0  # [m], of a coordinate of the target or of a mover
-    pose_stds: tuple[float, float] = (0.0, 0.0)  # of a coordinate [m] and of the heading [rad]
+    target_std: float = 0.0  # [m], standard deviation of a coordinate of the target or of a mover
+    # Standard deviations of a coordinate [m] and of the heading [rad]
+    pose_stds: tuple[float, float] = (0.0, 0.0)
     # [Hz], of observations of the target during the drive; 0 for none
+    # [Hz], rate of observations of the target while driving; 0 for none
     observation_rate: float = 1.0
-    latency: float = 0.05  # [s], which includes the latency of the planner
+    latency: float = 0.05  # [s], latency, which includes the latency of the planner
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

@@ -37,13 +37,13 @@ class Recording:
 
     index: np.ndarray  # (F,) index in the run
     success: np.ndarray  # (F,) bool
-    time: np.ndarray  # (F, K) [s]
+    time: np.ndarray  # (F, K) [s], times of the samples
     robot: np.ndarray  # (F, K, R), its joint positions
     wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot
     balls: np.ndarray  # (F, K, N, 3) [m]
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
-    target: np.ndarray  # (F, 3) [m]
+    target: np.ndarray  # (F, 3) [m], target of a returned ball
     # (F, K, M, 3) [m], predicted path of the first ball from each sample on; M = 0 if not recorded
     expected: np.ndarray
 
@@ -84,7 +84,7 @@ class Launches:
     begins: np.ndarray  # (N,) [s], start of the plan for each ball
     seen: float  # [s], how long a ball has been in flight by then
     returned: BallState | None = None  # leaves (F, 3), the first ball just after its impact
-    target: Any = None  # (F, 3) [m], of a returned ball
+    target: Any = None  # (F, 3) [m], target of a returned ball
 
 
 def frame(recording: Recording, robot: Robot, flight: int, sample: int) -> Frame:
@@ -93,8 +93,8 @@ def frame(recording: Recording, robot: Robot, flight: int, sample: int) -> Frame
     After the end of its simulation the robot stays where it was. A caught ball lies in its net.
 
     Args:
-        recording: of the run.
-        robot: that was flown.
+        recording: the recorded flights of the run.
+        robot: the flown robot.
         flight: row of the recording.
         sample: index of the sample.
 
@@ -125,9 +125,9 @@ def make_recording(
     It joins the balls' paths before the simulation, the simulated flight and the returned balls.
 
     Args:
-        world: that was flown.
+        world: the simulated world.
         flown: F flights with their record.
-        launches: of their balls.
+        launches: states of their balls before and after the simulation.
         index: (F,) indices in the run.
         success: (F,) bool.
     """

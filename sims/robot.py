@@ -41,7 +41,7 @@ class Shape(NamedTuple):
     discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], normal to the z axis
     tool: bool = False  # whether the last line is the tool's rim
     solids: tuple[Solid, ...] = ()
-    colour: str = "#D9A441"  # of the solids
+    colour: str = "#D9A441"  # colour of the solids
 
 
 def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:

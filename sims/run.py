@@ -67,7 +67,7 @@ def start_flights(
     """Fly into a new folder, and return the manifest of the run.
 
     Args:
-        settings: of the run, of the task's own class.
+        settings: settings of the run, of the task's own class.
         out: folder, new or empty.
         video: name of a film in the folder, .gif or .mp4; None for no film.
         record: number of flights that are recorded, the first ones.
@@ -249,7 +249,7 @@ def write_flight_report(folder: RunFolder) -> None:
     """Write `table.md`, `figures/` and `index.html` of a run; existing ones are replaced.
 
     Args:
-        folder: with `manifest.json`, `plans/` and `flights/`; a film may be there.
+        folder: run folder with `manifest.json`, `plans/` and `flights/`; a film may be there.
 
     Raises:
         ArgumentError: the folder does not hold a finished run of flights.

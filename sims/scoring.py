@@ -19,14 +19,14 @@ class Contact:
     """The nearest passage of one ball so far, or the passage at which it was met; world frame."""
 
     met: Array  # () bool, within the radius
-    time: Array  # () [s]
+    time: Array  # () [s], time of the passage
     offset: Array  # () [m], distance of the ball from the disc's centre; inf before any passage
     ball_pos: Array  # (3,) [m]
     ball_vel: Array  # (3,) [m/s]
-    robot_pos: Array  # (3,) [m], of the body with the tool
+    robot_pos: Array  # (3,) [m], position of the body with the tool
     tool_vel: Array  # (3,) [m/s], velocity of the tool at the ball, rotation included
     normal: Array  # (3,) z axis of the body with the tool
-    planned_time: Array  # () [s], of the plan that was active then
+    planned_time: Array  # () [s], contact time of the plan that was active then
     tracking: Array  # () [m], distance of the robot from its plan then
 
 
@@ -74,9 +74,9 @@ def passage(
     """Return whether each ball passes the disc's plane from above within a step, and the passage.
 
     Args:
-        world: with the tool and the time step.
-        before: at `time`.
-        after: one step later.
+        world: the world with the tool and the time step.
+        before: tool and balls at `time`.
+        after: tool and balls one step later.
         time: () [s].
         planned: (N,) [s], planned contact times.
         reference: (3,) [m], planned position of the robot at `time`.

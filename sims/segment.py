@@ -27,7 +27,7 @@ class BallThresholds:
 
     lower: Array  # (3,) hue, saturation and value, each 0 to 1
     upper: Array  # (3,) the same; an upper hue below the lower one means a range across hue 1
-    radius: Array  # () [m], of the ball
+    radius: Array  # () [m], radius of the ball
     confidence: Array  # () least confidence of a pixel
     pixels: Array  # () least number of pixels of a ball
     reach: Array  # () [m], greatest depth
@@ -68,9 +68,9 @@ def ball_thresholds(
 class Sighting:
     """A ball detected in one frame; NaN where it is not seen."""
 
-    place: Array  # (3,) [m], of the ball's centre, world frame
+    place: Array  # (3,) [m], position of the ball's centre, world frame
     pixel: Array  # (2,) [px], column and row
-    depth: Array  # () [m], of the ball's centre, along the camera's axis
+    depth: Array  # () [m], depth of the ball's centre, along the camera's axis
     pixels: Array  # () int32, number of pixels from which the depth was computed
 
 
@@ -135,8 +135,8 @@ def sighting(
         image: (rows, columns, 3) bytes, red, green and blue; at least 64 each way.
         depth: (rows, columns) [m]; NaN where there is none.
         confidence: (rows, columns), 0 to 1.
-        camera: that took the frame.
-        thresholds: thresholds of the ball.
+        camera: the camera that took the frame.
+        thresholds: colour, size and depth range of the ball.
     """
     mask = colour_mask(image, thresholds)
     corner = [_middle(jnp.sum(mask, axis=1 - axis)) - WINDOW // 2 for axis in range(2)]
@@ -186,9 +186,9 @@ def noisy_depth(
     have no depth at all (NaN), or a mismatched one: up to twice or half the true depth.
 
     Args:
-        key: of the noise.
-        camera: for its focal length.
-        noise: of the stereo camera.
+        key: random key of the noise.
+        camera: the camera; its focal length is used.
+        noise: parameters of the stereo camera.
         depth: (rows, columns) [m], > 0.
 
     Returns:

@@ -16,8 +16,8 @@ from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predic
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.sims.noise import Sensing
 
-_LEAST_STD = 1e-3  # [m], that the filter assumes of a sensor without noise
-_ACCELERATION_DENSITY = 0.01  # [m^2/s^3], of the filter's process noise
+_LEAST_STD = 1e-3  # [m], least standard deviation that the filter assumes of a sensor
+_ACCELERATION_DENSITY = 0.01  # [m^2/s^3], spectral density of the filter's process noise
 _FLIGHT_STEPS = 4  # integration steps of a prediction over latency and planning
 _DRAG_SPREAD = 0.2  # relative standard deviation of the initial drag estimate
 
@@ -63,9 +63,9 @@ class Estimate:
 
     belief: EkfState
     energy: Array  # () [m^2/s^2], specific, at the first good estimate
-    energy_variance: Array  # () [m^4/s^4], of that energy
+    energy_variance: Array  # () [m^4/s^4], variance of that energy
     lever: Array  # () [m^3/s^2], integral of |v|^3 since then
-    prior: RlsState  # of K_D [1/m], before any energy loss
+    prior: RlsState  # estimate of K_D [1/m] before any energy loss
     drag: Array  # () K_D [1/m], current estimate
 
 

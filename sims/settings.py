@@ -28,8 +28,8 @@ _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != 
 _AT_ONCE = 4096  # flights per batch, by default
 # Estimated bytes of a simulated flight in a batch, and of the rows of a finished flight.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
-_FASTEST = 10_000.0  # [Hz]
-_MOST_BALLS = 12  # of one flight, as in the largest suite; compile time grows with every ball
+_FASTEST = 10_000.0  # [Hz], greatest replanning rate
+_MOST_BALLS = 12  # balls of one flight, as in the largest suite; compile time grows with every ball
 INTERVAL = 0.8  # [s], between throws [Yu2023catch, Fig. 1]
 
 
@@ -51,7 +51,7 @@ def require_interval(sensing: Sensing, replan: float) -> None:
     """Raise `ValueError` unless the interval of throws is a whole number of planning periods.
 
     Args:
-        sensing: whose observation periods divide a planning period.
+        sensing: settings of the observations.
         replan: [Hz], rate of replanning; 0 for never.
     """
     period = sensing.observations_per_plan(replan) / sensing.rate

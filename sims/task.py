@@ -56,14 +56,15 @@ class FlightTask(abc.ABC):
     balls inherits from `BallFlightTask`.
     """
 
-    settings: Any  # of the task's class of `FlySettings`
+    settings: Any  # settings of the task's class of `FlySettings`
 
     THING: ClassVar[str] = "ball"  # name of the target in pictures
     THING_RADIUS: ClassVar[float] = BALL_RADIUS  # [m]
     CONTACT: ClassVar[str]  # participle for a met target in pictures: "caught"
     SUCCESS: ClassVar[str]  # predicate of a successful flight in sentences: "caught all balls"
     PUBLISHED: ClassVar[str]  # published result of the task, for the table
-    COLUMNS: ClassVar[Sequence[Column]]  # of the rows, in addition to the columns of all tasks
+    # Columns of the rows, in addition to the columns of all tasks
+    COLUMNS: ClassVar[Sequence[Column]]
     # Corners [m] of the region that pictures show; None to fit all drawn objects.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
     HAS_REACH: ClassVar[bool] = False  # whether `reachable` returns anything
@@ -94,7 +95,7 @@ class FlightTask(abc.ABC):
         """Return the recording of some of the recorded flights.
 
         Args:
-            cases: that were flown.
+            cases: the flown cases.
             flights: their result.
             lanes: (F,) indices of the flights.
         """

@@ -25,8 +25,8 @@ from planner_jax.sims.recording import Recording, frame
 from planner_jax.sims.scenery import GROUND_COLOUR, Part, machine_parts
 from planner_jax.sims.task import FlightTask
 
-_RATE = 30.0  # [Hz], of the displayed frames
-_STEP = 0.01  # [s], of the time slider
+_RATE = 30.0  # [Hz], rate of the displayed frames
+_STEP = 0.01  # [s], step of the time slider
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
@@ -83,7 +83,7 @@ class Viewer:
     """A server that displays one flight of a recording at a time.
 
     Attributes:
-        url: of the page, with the access token if the host is not the loopback address.
+        url: address of the page, with the access token if the host is not the loopback address.
         flight: choice of the flight; its `value` is one of the task's titles.
         time: slider; its `value` [s] is the displayed time.
         playing: check box.
@@ -99,8 +99,8 @@ class Viewer:
         """Start the server, and display the first flight.
 
         Args:
-            task: that was flown.
-            recording: of the flights.
+            task: the task of the run.
+            recording: the recorded flights.
             host: name or address of this machine, at which the page is served.
             port: 0 selects any free port.
 

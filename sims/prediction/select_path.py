@@ -120,7 +120,7 @@ def select(
             default it is estimated from the residuals of the best turn.
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
-        prior: how often targets turn, and how fast.
+        prior: probability and rate of turns.
         threshold: () of the gain, above which a target turns; the gain of a straight target exceeds
             6.6 once in a hundred times.
         fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target

@@ -81,19 +81,20 @@ class BlockFlights(Flights):
     flown: Executed
     budget: Budget
     blocked: np.ndarray  # (B,) bool: the shield's face met the ball before the inner box
-    contact: np.ndarray  # (B,) [s], of the ball with the shield; NaN without contact
-    contact_pos: np.ndarray  # (B, 3) [m], of the ball's centre then; NaN without contact
+    contact: np.ndarray  # (B,) [s], time of contact between ball and shield; NaN without contact
+    contact_pos: np.ndarray  # (B, 3) [m], position of the ball's centre then; NaN without contact
     # (B,) [m], of the ball from the shield's centre, when it crosses the shield's plane
+    # (B,) [m], distance of the ball from the shield's centre, in the shield's plane
     miss: np.ndarray
     # (B,) bool, whether the ball touched base or links 1 to 3 before the contact
     struck: np.ndarray
-    clearance: np.ndarray  # (B,) [m], least up to the contact; negative inside
+    clearance: np.ndarray  # (B,) [m], least clearance up to the contact; negative inside
     nearest: np.ndarray  # (B,) str, link and obstacle at the least clearance
-    clearance_after: np.ndarray  # (B,) [m], least after the contact, while the arm brakes
+    clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    fit_error: np.ndarray  # (B,) [m], of the first fit, across the flight; NaN if it is known
-    last_fit_error: np.ndarray  # (B,) [m], of the last fit
+    fit_error: np.ndarray  # (B,) [m], error of the first fit, across the flight; NaN if it is known
+    last_fit_error: np.ndarray  # (B,) [m], error of the last fit
 
     @property
     def touched(self) -> np.ndarray:
@@ -152,14 +153,14 @@ def fly_blocks(
     """Plan and execute a batch of blocks.
 
     Args:
-        world: with an arm.
+        world: a world with an arm.
         cases: the thrown balls.
-        seed: of the noise of encoders, >= 0.
-        drives: of the arm.
-        planner: of all plans, by default `online`.
+        seed: random seed of the encoders' noise, >= 0.
+        drives: limits and errors of the drives.
+        planner: planner of all plans, by default `online`.
         planning_budget: [s], time for planning at the end of the delay; a plan that takes longer
             starts later by the excess. None: planning takes no time.
-        plan: of each case, instead of plans that are made here.
+        plan: plans of the cases, instead of plans that are made here.
         seconds: (B,) [s], wall times of these plans.
         decided: motions of arms that plan from observations of their balls, instead of plans; with
             the same delays.
@@ -256,7 +257,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
 
     Args:
         cases: leaves (B, ...).
-        plans: of the cases.
+        plans: the plans of the cases.
         flown: the simulated motions.
         budget: the times.
     """

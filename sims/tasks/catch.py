@@ -78,8 +78,8 @@ class Throws(FlightCases):
     drag: np.ndarray  # (B, N) K_D [1/m], the true one
     believed: np.ndarray  # (B, N) K_D [1/m], initial estimate
     gravity: np.ndarray  # (B,) [m/s^2], magnitude
-    net_height: np.ndarray  # (B,) [m], of the hoop above the propeller plane
-    net_radius: np.ndarray  # (B,) [m]
+    net_height: np.ndarray  # (B,) [m], height of the hoop above the propeller plane
+    net_radius: np.ndarray  # (B,) [m], radius of the hoop
 
 
 def throws(
@@ -99,7 +99,7 @@ def throws(
         seed: >= 0, of the throws and of the signs of the drag's errors.
         drag: K_D [1/m], the true one.
         drag_error: relative error of the initial estimate of K_D, of random sign.
-        robot: with a net.
+        robot: a quadrotor with a net.
     """
     if num_balls < 1:
         raise ArgumentError("num_balls", ">= 1", num_balls)
@@ -154,9 +154,9 @@ def fly_catches(
     Args:
         loop: world, sensing, rates and gains.
         cases: the balls.
-        seed: of the noise, >= 0.
-        planner: of the plans from scratch, by default `exact` with greedy decisions.
-        pilot: of the replanning in between.
+        seed: random seed of the noise, >= 0.
+        planner: planner of plans from scratch, by default `exact` with greedy decisions.
+        pilot: replans between these plans.
         plan: first plan of each flight, for the first ball, instead of a plan that is made here.
 
     Raises:

@@ -43,7 +43,7 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
     the case count from there.
 
     Args:
-        loop: of the flights.
+        loop: settings of the flights' loop.
         flights: leaves (B, ...).
         new: (N,) bool, the balls that are to be planned.
         horizon: (B, N) [s] from now, last time at which each ball may be caught.
@@ -98,7 +98,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
     the last such catch. Elsewhere the new plan is flown alone, from now on.
 
     Args:
-        flights: the same that were passed to `predict_case`.
+        flights: the flights that were passed to `predict_case`.
         found: plans (B, ...) of the cases that it returned.
         new: (B, N) bool, the balls that `found` catches.
     """
@@ -190,8 +190,8 @@ def plan_ahead(
     the plan for the ball with the least violation is returned.
 
     Args:
-        planner: of catches, which also decides their order.
-        known: of both balls, or of the last one, a batch with NumPy leaves.
+        planner: planner of catches, which also decides their order.
+        known: cases with both balls, or with the last one; a batch with NumPy leaves.
         ball: its index among the targets.
         limits: increasingly wide limits, as returned by `bounds`. `known` has the first ones for
             the first ball, and the second ones for the others.

@@ -46,8 +46,8 @@ class CatchPilot:
     # The name of a method of deciding, or "policy:FILE". With "given", order and times of the
     # current plan stay, and only the trajectory is planned from scratch.
     decide: str = "greedy"
-    redecide: float = 100.0  # [Hz], of new decisions, a divisor of the replanning rate; 0 for never
-    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # after a new decision
+    redecide: float = 100.0  # [Hz], rate of new decisions, divides the replanning rate; 0 for never
+    search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # search after a new decision
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:

@@ -165,7 +165,7 @@ def volleys(
         names: out of `court.SCENARIOS`; all of them by default.
         seed: >= 0, of the serves and of the signs of the drag's errors.
         drag_error: relative error of the initial estimate of K_D, of random sign.
-        robot: with a racket.
+        robot: a quadrotor with a racket.
     """
     if not 0.0 <= drag_error < 1.0:
         raise ArgumentError("drag_error", ">= 0 and < 1", drag_error)
@@ -180,8 +180,8 @@ def volleys(
 class HitFlights(Flights):
     """The result of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
 
-    landing: np.ndarray  # (B, 3) [m], of the returned ball; NaN where it was missed
-    miss: np.ndarray  # (B,) [m], from the target; inf where the ball was missed
+    landing: np.ndarray  # (B, 3) [m], landing point of the returned ball; NaN where it was missed
+    miss: np.ndarray  # (B,) [m], distance from the target; inf where the ball was missed
 
     @property
     def success(self) -> np.ndarray:
@@ -227,9 +227,9 @@ def fly_hits(
     Args:
         loop: world, sensing, rates and gains.
         cases: the serves.
-        seed: of the noise, >= 0.
-        planner: of the first plan, by default `smooth_planner()`.
-        pilot: of the replanning.
+        seed: random seed of the noise, >= 0.
+        planner: planner of the first plan, by default `smooth_planner()`.
+        pilot: replans after the first plan.
         plan: first plan of each flight, instead of a plan that is made here.
 
     Raises:

@@ -50,7 +50,7 @@ CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
 SUCCESS = 0.3  # [m], greatest miss of a success
 TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
 _SHORTEST = 0.3  # [s], least time to the meeting at which the car replans
-_LEAST_STD = 1e-3  # [m], that the prediction assumes of observations without noise
+_LEAST_STD = 1e-3  # [m], least standard deviation that the prediction assumes of an observation
 _CAUTION = 2.0  # standard deviations by which predicted movers are enlarged
 _POINTS = 9  # points of a predicted path in a recording
 
@@ -60,7 +60,7 @@ class Meetings(FlightCases):
     """B interceptions and their observations, NumPy leaves."""
 
     cases: InterceptCase  # the true ones
-    times: np.ndarray  # (B, L) [s], of the observations
+    times: np.ndarray  # (B, L) [s], times of the observations
     target: np.ndarray  # (B, L, 2) [m], observed positions of the target
     movers: np.ndarray  # (B, L, N, 2) [m], observed centres of the movers
 
@@ -74,7 +74,7 @@ def meetings(
     """Return interceptions of a suite, with observations before the start and during the drive.
 
     Args:
-        suite: of `pj.intercept.draw`.
+        suite: name of a suite of `pj.intercept.draw`.
         num: B >= 1.
         seed: >= 0, of cases and noise.
         noise: [m], standard deviation of an observed coordinate.
@@ -118,7 +118,7 @@ def predict_scene(
     Predicted movers are enlarged by `_CAUTION` standard deviations of their position.
 
     Args:
-        loop: with the sensing.
+        loop: settings of the loop, with the sensing.
         meetings: leaves (B, ...).
         now: () [s].
         known_target: whether the targets' paths are known (static).
@@ -171,10 +171,10 @@ def remaining(
     """Return the remaining cases (B, ...), `elapsed` (B,) [s] after their start.
 
     Args:
-        cases: whose times count from their start.
+        cases: the cases at their start.
         elapsed: (B,) [s].
         target: predicted paths, with times that count from now.
-        movers: predicted ones, at their current positions.
+        movers: predicted movers at their current positions.
         pose: (B, 3) [m, m, rad], of the rear axle.
         speed: (B,) [m/s].
         curvature: (B,) [1/m].
@@ -195,11 +195,11 @@ def remaining(
 class Driven:
     """The result of a batch of drives, on the host; leaves with a leading axis B."""
 
-    times: np.ndarray  # (S,) [s], of the frames, the first 0
-    poses: np.ndarray  # (B, S, 3) of the rear axle's centre [m], and heading [rad]
+    times: np.ndarray  # (S,) [s], times of the frames; the first is 0
+    poses: np.ndarray  # (B, S, 3), x, y [m] of the rear axle's centre and heading [rad]
     wanted: np.ndarray  # (B, S, 2) [m], planned positions
     meeting: np.ndarray  # (B,) [s], end of the last plan
-    tracking: np.ndarray  # (B, 2) [m], of the rear axle from its plans: rms and worst
+    tracking: np.ndarray  # (B, 2) [m], distance of the rear axle from its plans: rms and worst
     saturation: np.ndarray  # (B, 2), share of the time with drive and steering saturated
     plans: np.ndarray  # (B,) int, number of executed plans
     paths: np.ndarray  # (B, S, M, 2) [m], predicted path of the target from each frame on
@@ -210,10 +210,10 @@ class InterceptFlights(Flights):
     """The result of a batch of interceptions; leaves with a leading axis B."""
 
     flown: Driven
-    miss: np.ndarray  # (B,) [m], from the body's centre to the true target at the end of the plan
+    miss: np.ndarray  # (B,) [m], distance from the body's centre to the true target at the end
     target: np.ndarray  # (B, 2) [m], true position of the target then
-    wall_clearance: np.ndarray  # (B,) [m], least; negative inside
-    mover_clearance: np.ndarray  # (B,) [m]
+    wall_clearance: np.ndarray  # (B,) [m], least clearance from walls; negative inside
+    mover_clearance: np.ndarray  # (B,) [m], least clearance from movers; negative inside
 
     @property
     def touched(self) -> np.ndarray:
@@ -245,9 +245,9 @@ def fly_intercepts(
     Args:
         loop: world and sensing.
         cases: targets, obstacles and observations.
-        seed: of the noise on the car's pose, >= 0.
+        seed: random seed of the noise on the car's pose, >= 0.
         replan: [Hz]; 0 drives the first plan to its end.
-        planner: of all plans, by default `spacetime`.
+        planner: planner of all plans, by default `spacetime`.
         plan: first plan of each drive, instead of a plan that is made here.
         known_target: whether the targets' paths are known instead of predicted.
         predict_movers: whether movers are predicted from observations instead of known.
@@ -298,8 +298,8 @@ def plan_again(
     """Plan again from the cars' estimated poses, and use the plans that satisfy every limit.
 
     Args:
-        loop: of the drives.
-        planner: of the remaining cases.
+        loop: settings of the drives' loop.
+        planner: planner of the remaining cases.
         drive: leaves (B, ...).
         begun: the cases of the current plans, at the start of those plans.
         target: predicted from now on.
@@ -377,7 +377,7 @@ def score(
     """Compare drives with the true targets and obstacles in float64: misses and contacts.
 
     Args:
-        cases: the true ones, leaves (B, ...).
+        cases: the true cases, leaves (B, ...).
         first: the first plans.
         flown: the drives.
         planning_seconds: wall time of planning.

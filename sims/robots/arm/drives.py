@@ -23,10 +23,10 @@ class Drives:
     """
 
     torques: tuple[float, ...] = TORQUES  # [N m], greatest magnitude
-    lag: float = 0.0  # [s], first order, of the torques
+    lag: float = 0.0  # [s], first-order lag of the torques
     latency: float = 0.0  # [s], delay of a plan's start at the joints
-    angle_std: float = 0.0  # [rad], of a measured angle
-    rate_std: float = 0.0  # [rad/s], of a measured rate
+    angle_std: float = 0.0  # [rad], standard deviation of a measured angle
+    rate_std: float = 0.0  # [rad/s], standard deviation of a measured rate
     mass_error: float = 0.0  # relative error of the masses and inertias in the controller's model
 
     def __post_init__(self) -> None:

@@ -33,7 +33,7 @@ from planner_jax.sims.scenery import VISUAL, box_solid, capsule_solid, xml_numbe
 
 _MODELS = importlib.resources.files("planner_jax.robot") / "models"
 _IRB1600 = (_MODELS / "irb1600.xml").read_text("utf-8")
-_THICKNESS = 0.01  # [m], of the shield
+_THICKNESS = 0.01  # [m], thickness of the shield
 
 
 @functools.cache
@@ -128,9 +128,9 @@ class ShieldArm:
         """Return the measurements of the encoders.
 
         Args:
-            state: the true one.
+            state: the true state.
             noise: (2, 6) standard normal.
-            stds: (2,), of an angle [rad] and of a rate [rad/s].
+            stds: (2,), standard deviations of an angle [rad] and of a rate [rad/s].
         """
         errors = jnp.asarray(stds, noise.dtype)[:, None] * noise
         return JointState(angles=state.angles + errors[0], rates=state.rates + errors[1])
@@ -153,7 +153,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return torques (6,) [N m] of a controller whose masses have a relative error."""
+        """Return torques (6,) [N m] of a controller with a relative error in its masses."""
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error

@@ -40,14 +40,14 @@ class CarState:
 
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
     speed: Array  # () [m/s], along the heading
-    steering: Array  # () [rad], of the front wheels
+    steering: Array  # () [rad], angle of the front wheels
 
 
 @struct.dataclass
 class Reference:
     """The reference of the car at one instant."""
 
-    pos: Array  # (2,) [m], of the rear axle's centre
+    pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
     speed: Array  # () [m/s]
     acceleration: Array  # () [m/s^2], planned for one drive lag later

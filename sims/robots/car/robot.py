@@ -21,8 +21,8 @@ from planner_jax.sims.robots.car.tyres import tyre_forces
 from planner_jax.sims.robots.car.vehicle import Vehicle
 from planner_jax.sims.scenery import VISUAL, xml_numbers
 
-_HEIGHT = 0.1  # [m], of the body
-_CLEARANCE = 0.03  # [m], of the body above the ground
+_HEIGHT = 0.1  # [m], height of the body
+_CLEARANCE = 0.03  # [m], clearance of the body above the ground
 
 
 @dataclasses.dataclass(frozen=True)
@@ -138,9 +138,9 @@ class Car:
         """Return the car's estimated state.
 
         Args:
-            state: the true one.
+            state: the true state.
             noise: (3,) standard normal.
-            stds: (2,), of a coordinate [m] and of the heading [rad].
+            stds: (2,), standard deviations of a coordinate [m] and of the heading [rad].
         """
         errors = jnp.asarray(stds, noise.dtype)[np.array([0, 0, 1])] * noise
         return dataclasses.replace(state, pose=state.pose + errors)

@@ -25,7 +25,7 @@ def tyre_forces(
     M^-1 (F + J' f). A tyre of stiffness c at speed u then bears  f = -(c / u) J v_after.
 
     Args:
-        vehicle: with its tyres.
+        vehicle: the car with its tyres.
         pose: (3,) x, y [m] of the rear axle's centre and heading [rad], at the start of the step.
         vel: (3,) [m/s, m/s, rad/s].
         steering: () [rad], the front wheels' angle in the middle of the step.

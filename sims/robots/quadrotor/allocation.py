@@ -15,7 +15,7 @@ def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) ->
     be raised by more than `spare`.
 
     Args:
-        rotors: of the quadrotor.
+        rotors: parameters of the rotors.
         thrust: () [N], along body z.
         torque: (3,) [N m], body frame.
         spare: [N], greatest increase of a rotor's thrust in favour of a torque.

@@ -72,11 +72,11 @@ def control(
     """Return rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
 
     Args:
-        state: of the quadrotor, estimated.
-        reference: to be tracked.
+        state: estimated state of the quadrotor.
+        reference: the reference to track.
         model: parameters of the quadrotor.
-        gains: of the cascade.
-        world: with gravity and time step.
+        gains: gains of the cascade.
+        world: gravity and time step.
     """
     gravity = jnp.asarray(world.gravity, state.pos.dtype)
     R = rotation(state.quat_wxyz)

@@ -104,9 +104,10 @@ class Quadrotor:
         """Return the quadrotor's estimated state.
 
         Args:
-            state: the true one.
+            state: the true state.
             noise: (4, 3) standard normal.
-            stds: of position [m], velocity [m/s], attitude [rad] and body rate [rad/s].
+            stds: standard deviations of position [m], velocity [m/s], attitude [rad] and body rate
+                [rad/s].
         """
         pos, vel, attitude, rate = (std * noise[k] for k, std in enumerate(stds))
         w, v = state.quat_wxyz[0], state.quat_wxyz[1:]
