@@ -13,7 +13,7 @@ import yaml
 
 import planner_jax as pj
 from planner_jax.cli.main import main
-from planner_jax.core.errors import ArgumentError, UnknownName
+from planner_jax.core.errors import ArgumentError, MissingExtra, UnknownName
 from planner_jax.robot.quadrotor_file import UNITS, RobotError, model_of, parse_numbers, to_yaml
 from planner_jax.robot.quadrotor_models import MODELS
 from planner_jax.runs.settings import settings_to_resume
@@ -190,6 +190,16 @@ def test_mjcf_gives_body_and_rotors_about_the_centre_of_mass():
     rotors = robot.rotors
     found = (rotors.min_thrust, rotors.max_thrust, rotors.torque_ratio, rotors.lag)
     np.testing.assert_allclose(found, (0.2, 4.5, 0.02, 0.03))
+
+
+def test_mjcf_without_mujoco_names_the_file_and_the_extra(monkeypatch):
+    def fail(_):
+        raise MissingExtra("a flight", "MuJoCo and MJX", "sims")
+
+    read, path = pj.read_robot, DATA / "quadrotor_of_mjcf.yaml"
+    monkeypatch.setattr("pkgutil.resolve_name", fail)
+    with pytest.raises(MissingExtra, match=r"^\w+\.xml needs MuJoCo and MJX: pip install "):
+        read(path)
 
 
 def test_mjcf_alone_takes_tool_and_limits_from_keywords():

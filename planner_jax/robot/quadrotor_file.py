@@ -225,7 +225,7 @@ def _read_description(path: Path) -> dict[str, Value]:
         try:  # MuJoCo compiles the file
             describe = pkgutil.resolve_name("planner_jax.sims.robots.quadrotor.mjcf:describe_mjcf")
         except MissingExtra as error:
-            raise error.renamed({error.feature: path.name}) from None
+            raise error.with_names({error.feature: path.name}) from None
         return describe(path)
     try:
         fields = yaml.load(text, _Loader)
