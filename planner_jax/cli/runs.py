@@ -11,6 +11,7 @@ from argparse import SUPPRESS
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from planner_jax.baselines.block.library.options import add_commands
 from planner_jax.cli.options import Options, Parser, Unfinished, add_settings, pop_out
 from planner_jax.core.errors import ArgumentError, MissingExtra
 from planner_jax.core.registry import Task
@@ -239,29 +240,13 @@ def add_library(library: Parser) -> None:
     """Add the commands on libraries of stored motions."""
     commands = library.add_subparsers(title="commands", required=True, metavar="command")
 
-    def command(name: str, words: str) -> Parser:
+    def command(name: str, words: str) -> Callable[..., None]:
         added = commands.add_parser(name, help=words, description=words, argument_default=SUPPRESS)
         added.add_argument("path", metavar="FILE", help="of the library")
         added.set_defaults(command=functools.partial(_library, name))
-        return added
+        return added.add
 
-    build = command("build", "plan for every pair of cells; continues an interrupted build")
-    build.add("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")
-    build.add("--regime", metavar="NAME", help="limits of the joints: R1, R2, R3 (default: R2)")
-    build.add("--no-pole", dest="pole", action="store_false", help="the scene without its pole")
-    build.add("--arm", metavar="FILE", help="an MJCF file (default: the IRB 1600)")
-    angles = "six angles [rad] of the arm's home, or six for each of several homes"
-    build.add("--home", type=float, nargs="+", metavar="Q", help=angles)
-    show = command("show", "print coverage, memory and hashes of a library")
-    show.add("--map", metavar="FILE", help="write a picture of the coverage")
-    check = command("check", "referee stored motions for random balls")
-    check.add("--num", type=int, metavar="N", help="balls for each home (default: 2000)")
-    check.add("--seed", type=int, metavar="K", help="of the balls (default: 0)")
-    repair = command("repair", "plan again the motions that touch a pole that has moved")
-    place = "new position of the pole [m]"
-    repair.add("--pole", type=float, nargs=2, metavar="M", help=place, required=True)
-    repair.add("--out", metavar="FILE", help="of the new library", required=True)
-    repair.add("--retry", action="store_true", help="also plan for pairs without a motion")
+    add_commands(command)
 
 
 def _library(name: str, given: Options) -> None:

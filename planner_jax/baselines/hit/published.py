@@ -18,6 +18,7 @@ from planner_jax.task.hit import court
 from planner_jax.task.hit.case import GRAVITY
 from planner_jax.task.hit.court import landing
 from planner_jax.task.hit.spec import DRAG
+from planner_jax.task.hit.suites import Serves
 
 _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
@@ -39,12 +40,8 @@ class Trial(NamedTuple):
     solved: tuple[float, ...]  # by court.PLANNERS: 1 planned, 0 failed, NaN not published
 
 
-def read_trials(folder: str | os.PathLike) -> list[Trial]:
-    """Read every serve of a folder of trial files  S_L_T_M.csv, sorted by line, then scenario.
-
-    Raises:
-        ArgumentError: see `planner_jax.task.hit.suites.read_serves`.
-    """
+def read_serves(folder: str | os.PathLike) -> Serves:
+    """Read the serves of a folder of trial files; see `task.hit.suites.read_serves`."""
     problems: list[str] = []
     trials: list[Trial] = []
     for scenario, paths in _find_trial_files(folder).items():
@@ -58,7 +55,17 @@ def read_trials(folder: str | os.PathLike) -> list[Trial]:
         rest = f"; and {len(problems) - _LISTED} more" if len(problems) > _LISTED else ""
         rule = f"sound, not as in {str(folder)!r}: {listed}{rest}"
         raise ArgumentError("serves", rule, tuple(problems), shown="")
-    return trials
+    numbers = np.array([trial.numbers for trial in trials])
+    return Serves(
+        position=numbers[:, 0:3],
+        velocity=numbers[:, 3:6],
+        target=numbers[:, 9:12],
+        scenario=np.array([trial.scenario for trial in trials]),
+        index=np.arange(len(trials)),
+        published=np.array([trial.solved for trial in trials]),
+        file=np.array([trial.file for trial in trials]),
+        line=np.array([trial.line for trial in trials]),
+    )
 
 
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:

@@ -1,16 +1,40 @@
-"""Columns, counts and findings of runs with a camera or a clock."""
+"""Planner, columns, counts and findings of runs with a camera or a clock."""
 
 import numpy as np
 import pyarrow as pa
 
+from planner_jax.baselines.block.library.planner import LibraryBlock
+from planner_jax.core.choices import require
+from planner_jax.core.planner import Planner
 from planner_jax.runs import columns as known
 from planner_jax.runs.columns import Column, RefereedBatch, leaves_of
 from planner_jax.runs.manifest import Entries
-from planner_jax.studies.block.clock import TimedPlan
+from planner_jax.studies.block.clock import CountedPlanner, TimedPlan
 from planner_jax.studies.block.flight_fit import Sight
-from planner_jax.studies.block.seeing import SeenPlan
+from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
+from planner_jax.studies.block.settings import StudySettings
+from planner_jax.task.block.default_planner import OnlineBlock
 
 _ROOM = 0.1  # [m], tolerance of a contact beside the shield's middle
+
+
+# Settings that are arguments of `SeeingArms`.
+_SEEING = ("observe", "overhead", "replan", "observe_longer", "noise", "frame_rate", "seed")
+
+
+def follow_study(planner: Planner, settings: StudySettings) -> Planner:
+    """Return a planner of blocks behind the camera or the clock of a run, if it has one."""
+    if settings.perception:
+        for name in ("replan", "observe_longer"):
+            value = vars(settings)[name]
+            may = isinstance(planner, OnlineBlock) or value == 0.0
+            require(may, name, "0 for a planner other than online", value)
+        own = not isinstance(planner, LibraryBlock)
+        require(own, "planner", "one that plans for the individual ball", settings.planner)
+        return SeeingArms(planner, **{name: vars(settings)[name] for name in _SEEING})
+    if settings.planning_budget is not None:
+        return CountedPlanner(planner, settings.planning_budget)
+    return planner
 
 
 def _sights(batch: RefereedBatch) -> np.ndarray:

@@ -67,6 +67,11 @@ class StudySettings(SweepSettings):
             require(budget is None, "planning_budget", rule, budget)
 
     @property
+    def is_study(self) -> bool:
+        """Whether the run has a camera or a clock."""
+        return self.perception or self.planning_budget is not None
+
+    @property
     def first_motion(self) -> float:
         """Time [s] from which an arm may start until its first motion starts."""
         if self.perception:

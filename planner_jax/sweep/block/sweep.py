@@ -7,20 +7,23 @@ from jaxtyping import PyTree
 
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
-from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.manifest import Entries, Row
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.studies.block.clock import CountedPlanner
-from planner_jax.studies.block.results import StudyCounts, columns_of, describe_study
+from planner_jax.studies.block.results import (
+    StudyCounts,
+    columns_of,
+    describe_study,
+    follow_study,
+)
 from planner_jax.studies.block.seeing import SeeingArms
 from planner_jax.sweep.block.columns import COLUMNS, FRAME
 from planner_jax.sweep.block.settings import BlockSettings
 from planner_jax.sweep.rows import arm_plan
 from planner_jax.sweep.sweep import Sweep
-from planner_jax.task.block.default_planner import OnlineBlock
 
 
 class BlockTally(Tally):
@@ -54,33 +57,11 @@ class BlockSweep(Sweep[BlockSettings]):
 
     def planner(self, settings: BlockSettings) -> Planner:
         """Return the planner of a run; raise `ArgumentError` if its file is not a library."""
-        planner = super().planner(settings)
-        if settings.perception:
-            for name in ("replan", "observe_longer"):
-                value = vars(settings)[name]
-                may = isinstance(planner, OnlineBlock) or value == 0.0
-                require(may, name, "0 for a planner other than online", value)
-            own = not isinstance(planner, LibraryBlock)
-            require(own, "planner", "one that plans for the individual ball", settings.planner)
-            names = (
-                "observe",
-                "overhead",
-                "replan",
-                "observe_longer",
-                "noise",
-                "frame_rate",
-                "seed",
-            )
-            return SeeingArms(planner, **{name: vars(settings)[name] for name in names})
-        if settings.planning_budget is not None:
-            return CountedPlanner(planner, settings.planning_budget)
-        return planner
+        return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:
         """Return the task's other planners; none with perception or a clock."""
-        if settings.perception or settings.planning_budget is not None:
-            return {}
-        return super().other_planners(settings)
+        return {} if settings.is_study else super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
         """Raise `ArgumentError` unless the planner takes such cases, and its library fits them."""

@@ -76,18 +76,8 @@ def read_serves(folder: str | os.PathLike) -> Serves:
             is not finite, does not land in the hitting half, or differs between the files of a
             scenario. `value` lists all such rows.
     """
-    trials = pkgutil.resolve_name("planner_jax.baselines.hit.published:read_trials")(folder)
-    numbers = np.array([trial.numbers for trial in trials])
-    return Serves(
-        position=numbers[:, 0:3],
-        velocity=numbers[:, 3:6],
-        target=numbers[:, 9:12],
-        scenario=np.array([trial.scenario for trial in trials]),
-        index=np.arange(len(trials)),
-        published=np.array([trial.solved for trial in trials]),
-        file=np.array([trial.file for trial in trials]),
-        line=np.array([trial.line for trial in trials]),
-    )
+    read = pkgutil.resolve_name("planner_jax.baselines.hit.published:read_serves")
+    return read(folder)
 
 
 def generate_serves(
