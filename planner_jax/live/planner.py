@@ -47,6 +47,7 @@ from planner_jax.planning.programs import call_packed
 _PATIENCE = 0.2  # share of the deadline for which an answer waits for a plan
 _ASTRAY = 0.5  # [m], distance between robot and course above which a new course starts
 _JOIN = (0.02, 0.2)  # [m, m/s], greatest difference between a late plan and the course
+_KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
 _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 
@@ -79,7 +80,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         horizon: K, number of setpoints in an answer.
         deadline: [s], from a packet to its answer.
         noise: [m], standard deviation of an observed coordinate of a ball.
-        known: [m/s], standard deviation of the ball's velocity below which planning starts.
     """
 
     def __init__(
@@ -90,7 +90,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         horizon: int = 10,
         deadline: float = 0.01,
         noise: float = 0.005,
-        known: float = 0.3,
     ) -> None:
         if not 1 <= horizon <= MOST_SETPOINTS:
             raise ArgumentError("horizon", f"from 1 to {MOST_SETPOINTS}", horizon)
@@ -98,7 +97,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             if not 0.0 < value < math.inf:
                 raise ArgumentError(name, "finite and > 0", value)
         self.stroke, self.deadline = stroke, deadline
-        self._period, self._num, self._known = 1.0 / rate, horizon, known
+        self._period, self._num = 1.0 / rate, horizon
         self._gravity, self._limits = stroke.case.gravity, stroke.case.limits
         self._sight = Sight(stroke.flight, stroke.drag, float(self._gravity), noise)
         self._worker = concurrent.futures.ThreadPoolExecutor(1, "planning")
@@ -216,7 +215,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return fault
 
     def _is_worth_planning(self, flight: _Flight[PlanT], ball: int, due: float) -> bool:
-        if not self._sight.is_known(self._known):
+        if not self._sight.is_known(_KNOWN):
             return False
         if flight.plan is not None and flight.ball == ball:
             return flight.contact - due >= self.stroke.shortest

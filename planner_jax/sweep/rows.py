@@ -54,16 +54,15 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
     if row is None or not 0 <= row <= last:
         shown = "nothing" if row is None else row
         raise ArgumentError("row", f"from 0 to {last}", shown=str(shown))
-    with folder.reading_rows():
-        (found,) = folder.plans.pick([row])
-        plan = sweep.plan_of_row(found, manifest.get("setting", {}))
-    if plan is None:
+    if sweep.plan_of_row is None:
         rule = "a sweep of a task whose rows are read back as plans"
         raise ArgumentError(folder.name, rule, shown=f"a {sweep.kind}")
-    return PlannedRow(plan, found["sentence"])
+    with folder.reading_rows():
+        (found,) = folder.plans.pick([row])
+        return PlannedRow(sweep.plan_of_row(found, manifest["setting"]), found["sentence"])
 
 
-def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
+def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
     """Return the plan of a row of a quadrotor, with the gravity of the run's setting."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
@@ -74,14 +73,14 @@ def quadrotor_plan(row: Row, setting: Row) -> QuadrotorPlan:
     )
 
 
-def arm_plan(row: Row) -> ArmPlan:
+def arm_plan(row: Row, _: Entries) -> ArmPlan:
     """Return the plan of a row of blocks; it starts at the row's `delay`."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )
 
 
-def car_plan(row: Row) -> CarPlan:
+def car_plan(row: Row, _: Entries) -> CarPlan:
     """Return the plan of a row of interceptions."""
     knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
     return CarPlan(**_outcome(row), time=_numbers(row["meeting_time"]), **knots)

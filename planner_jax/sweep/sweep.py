@@ -55,6 +55,8 @@ class Sweep(Generic[AnySettings]):
     )
     counts: ClassVar[type[Tally]] = Tally  # class of the counts
     single_figures: ClassVar[Sequence[RunFigure]] = ()  # used by the command `plan`
+    # Returns the plan of a row, bit for bit, from the row and the setting of its run.
+    plan_of_row: Callable[[Row, Entries], Plan] | None = None
     failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column of the list of failures
         "case": "index",
         "solver's status": "status",
@@ -112,10 +114,6 @@ class Sweep(Generic[AnySettings]):
     def setting(self, cases: PyTree) -> Entries:
         """Return physics and limits that all cases share, for the manifest."""
         return {}
-
-    def plan_of_row(self, row: Row, setting: Entries) -> Plan | None:
-        """Return the plan of a row; None if the task does not read rows back."""
-        return None
 
     def tally(self, settings: AnySettings) -> Tally:
         """Return a tally without counts."""

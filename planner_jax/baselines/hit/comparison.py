@@ -1,5 +1,6 @@
 """Comparison of runs of hits with the outcomes and rates published with [Yu2023bat]."""
 
+import hashlib
 from collections import Counter
 from typing import cast
 
@@ -12,6 +13,13 @@ from planner_jax.runs.manifest import Entries
 from planner_jax.runs.table import RateTable, rate_cells
 from planner_jax.task.hit import court
 from planner_jax.task.hit.suites import Serves
+
+
+def describe_serves(serves: Serves) -> Entries:
+    """Return the number of distinct balls of serves, and a digest of balls and targets."""
+    balls = np.column_stack([serves.position, serves.velocity])
+    digest = hashlib.sha256(np.column_stack([balls, serves.target]).tobytes()).hexdigest()
+    return {"distinct": len(np.unique(balls, axis=0)), "sha256": digest}
 
 
 def choose_reference(planner: str) -> str:

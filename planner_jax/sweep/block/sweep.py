@@ -8,9 +8,8 @@ from jaxtyping import PyTree
 from planner_jax.baselines.block.library.adapt import AdaptBlock
 from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.core.planner import Planner
-from planner_jax.robot.arm import ArmPlan
 from planner_jax.runs.columns import Column, RefereedBatch
-from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.studies.block.clock import CountedPlanner
 from planner_jax.studies.block.results import (
@@ -50,6 +49,7 @@ class BlockSweep(Sweep[BlockSettings]):
     """Sweeps of arms that block thrown balls."""
 
     frame, counts = FRAME, BlockTally
+    plan_of_row = staticmethod(arm_plan)
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
         """Return the columns of blocks, with columns of perception or planning time."""
@@ -70,10 +70,6 @@ class BlockSweep(Sweep[BlockSettings]):
         super().require_fit(settings, planner, cases)
         if isinstance(planner, LibraryBlock | AdaptBlock):
             planner.check(cases)
-
-    def plan_of_row(self, row: Row, setting: Entries) -> ArmPlan:
-        """Return the plan of a row; it starts when the arm may start, at the row's `delay`."""
-        return arm_plan(row)
 
     def findings(self, manifest: Entries) -> list[str]:
         """Return sentences on execution time, fits of the flight, and planning time."""

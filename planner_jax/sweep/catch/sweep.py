@@ -5,8 +5,7 @@ import pyarrow as pa
 from jaxtyping import PyTree
 
 from planner_jax.baselines.catch.published import SOURCE, make_table
-from planner_jax.robot.quadrotor import QuadrotorPlan
-from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable
 from planner_jax.sweep.catch.columns import COLUMNS, FRAME
@@ -71,6 +70,7 @@ class CatchSweep(Sweep[CatchSettings]):
     """Sweeps of quadrotors that catch flying targets with a net."""
 
     frame, own_columns, single_columns = FRAME, COLUMNS, COLUMNS
+    plan_of_row = staticmethod(quadrotor_plan)
     figures = (
         RunFigure(
             "flight.png",
@@ -88,10 +88,6 @@ class CatchSweep(Sweep[CatchSettings]):
         """Return physics and limits that all cases have in common, for the manifest."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
-
-    def plan_of_row(self, row: Row, setting: Entries) -> QuadrotorPlan:
-        """Return the plan of a row, without order and times of its catches."""
-        return quadrotor_plan(row, setting)
 
     def tally(self, settings: CatchSettings) -> CatchTally:
         """Return an empty count of rows."""

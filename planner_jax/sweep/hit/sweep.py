@@ -1,18 +1,21 @@
 """The sweep of hits: serves, the 36 scenarios of the court, and published success rates."""
 
 import dataclasses
-import hashlib
 
 import jax
 import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
-from planner_jax.baselines.hit.comparison import ScenarioCounts, explain_table, make_table
+from planner_jax.baselines.hit.comparison import (
+    ScenarioCounts,
+    describe_serves,
+    explain_table,
+    make_table,
+)
 from planner_jax.core.choices import require_one_of
 from planner_jax.core.errors import ArgumentError, CaseError
-from planner_jax.robot.quadrotor import QuadrotorPlan
-from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.source import Chunk, Source, fill_in
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.runs.table import RateTable
@@ -65,12 +68,9 @@ class ServeSource(Source):
         """Return source, number of distinct serves and digest of their numbers."""
         if self.folder is None:
             return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
-        used = self.folder[: self.num]
-        balls = np.column_stack([used.position, used.velocity])
-        digest = hashlib.sha256(np.column_stack([balls, used.target]).tobytes()).hexdigest()
-        distinct = len(np.unique(balls, axis=0))
-        known = {"source": self.settings.serves, "distinct": distinct, "sha256": digest}
-        return {"serves": known}
+        return {
+            "serves": {"source": self.settings.serves, **describe_serves(self.folder[: self.num])}
+        }
 
 
 class HitTally(Tally):
@@ -105,6 +105,7 @@ class HitSweep(Sweep[HitSettings]):
     """Sweeps of quadrotors that return served balls with a racket."""
 
     frame, own_columns, counts = FRAME, COLUMNS, HitTally
+    plan_of_row = staticmethod(quadrotor_plan)
     figures = (
         RunFigure(
             "court.png",
@@ -139,10 +140,6 @@ class HitSweep(Sweep[HitSettings]):
         names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
         setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
-
-    def plan_of_row(self, row: Row, setting: Entries) -> QuadrotorPlan:
-        """Return the plan of a row, without its stroke."""
-        return quadrotor_plan(row, setting)
 
     def table(self, manifest: Entries) -> RateTable:
         """Return success per scenario in percent, beside the rates of a published planner."""

@@ -4,8 +4,7 @@ import numpy as np
 import pyarrow as pa
 from jaxtyping import PyTree
 
-from planner_jax.robot.car import CarPlan
-from planner_jax.runs.manifest import Entries, Row
+from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.sweep.figures import CAPTION as MOTION
 from planner_jax.sweep.intercept.columns import COLUMNS, FRAME
@@ -37,6 +36,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
     """Sweeps of cars that meet moving targets among obstacles."""
 
     frame, own_columns, counts = FRAME, COLUMNS, InterceptTally
+    plan_of_row = staticmethod(car_plan)
     figures = (
         RunFigure(
             "plane.png",
@@ -58,10 +58,6 @@ class InterceptSweep(Sweep[InterceptSettings]):
         """Return map, body and limits that all cases share, for the manifest."""
         bounds = first_values(cases, ["lower", "upper"])
         return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
-
-    def plan_of_row(self, row: Row, setting: Entries) -> CarPlan:
-        """Return the plan of a row, without the position of the meeting."""
-        return car_plan(row)
 
     def findings(self, manifest: Entries) -> list[str]:
         """Return a sentence on time, accuracy and acceleration."""
