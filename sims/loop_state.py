@@ -11,6 +11,7 @@ from flax import struct
 from jax import Array
 
 from planner_jax.ball.flight import BallState
+from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.sims.model import World
 from planner_jax.sims.noise import Sensing, require_whole
 from planner_jax.sims.robot import Physics
@@ -58,6 +59,19 @@ class Pilot(Protocol):
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
         """The function that finds the contacts and misses of a step, like `scoring.passage`."""
         ...
+
+
+def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
+    """Return the shapes of plans (B, ...) of cases (B, ...), as leaves `jax.ShapeDtypeStruct`.
+
+    Leaves of the cases may be `jax.ShapeDtypeStruct`, too.
+    """
+
+    def plan(case: Any) -> Any:
+        context = planner.prepare(case)
+        return planner.decode(planner.guesses(context, 1)[0], context)
+
+    return jax.eval_shape(jax.vmap(plan), cases)
 
 
 @dataclasses.dataclass(frozen=True)

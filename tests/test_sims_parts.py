@@ -10,12 +10,13 @@ import mujoco
 import numpy as np
 import pytest
 
+import planner_jax as pj
 from planner_jax.ball.flight import BallState, fly
 from planner_jax.robot.quadrotor import flat_attitude
 from planner_jax.robot.quadrotor_model import FlightLimits
 from planner_jax.sims.launch import await_ball, ready, require_plan, require_world
 from planner_jax.sims.loop import predict_balls
-from planner_jax.sims.loop_state import Loop
+from planner_jax.sims.loop_state import Loop, shapes_of_plans
 from planner_jax.sims.model import BALL_MASS, at_rest, ball_states, mujoco_model, place_balls, step
 from planner_jax.sims.noise import NOISES, Sensing
 from planner_jax.sims.robots.quadrotor.allocation import rotor_thrusts
@@ -380,3 +381,9 @@ def test_the_presets_are_in_rising_order_of_noise():
     stds = [noise.position_std for noise in NOISES.values()]
     assert stds == sorted(stds)
     assert ball_states(CATCH_WORLD, at_rest(CATCH_WORLD, jnp.zeros(3)))[0].shape == (1, 3)
+
+
+def test_shapes_of_plans_are_known_without_planning():
+    planner, cases = pj.hit.planner(), pj.hit.draw(2)
+    found = jax.eval_shape(functools.partial(pj.solve, planner), cases)
+    assert jax.tree.leaves(shapes_of_plans(planner, cases)) == jax.tree.leaves(found)

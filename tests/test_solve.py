@@ -120,12 +120,6 @@ def test_all_chunks_are_computed_in_the_callers_type_of_numbers():
     assert (found != found.astype(np.float32)).all()  # no number has passed through float32
 
 
-def test_a_plans_shapes_are_known_without_planning():
-    shapes = WellPlanner().plan_shapes(jax.eval_shape(lambda: Well(jnp.asarray(GOALS))))
-    found = jax.eval_shape(lambda plans: plans, plan(WellPlanner(), Well(GOALS)))
-    assert jax.tree.leaves(shapes) == jax.tree.leaves(found)
-
-
 @pytest.mark.parametrize("kind", [int, np.int32, np.asarray, jnp.asarray])
 def test_a_status_is_known_from_its_number_of_any_kind(kind):
     assert Status(kind(5)) is Status.OUT_OF_REACH

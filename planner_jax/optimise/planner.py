@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import ClassVar, Self
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
@@ -131,18 +130,6 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     ) -> tuple[Self, PyTree]:
         """Return the planner and the cases: nothing is decided before it minimises."""
         return self, cases
-
-    def plan_shapes(self, cases: PyTree) -> PyTree:
-        """Return the shapes of plans (B, ...) of cases (B, ...), as leaves `jax.ShapeDtypeStruct`.
-
-        Leaves of the cases may be `jax.ShapeDtypeStruct`, too.
-        """
-
-        def plan(case: PyTree) -> PyTree:
-            context = self.prepare(case)
-            return self.decode(self.guesses(context, 1)[0], context)
-
-        return jax.eval_shape(jax.vmap(plan), cases)
 
     def with_settings(self, settings: Settings) -> Self:
         """Return the planner with other values of some fields; its plans keep their shapes."""

@@ -13,7 +13,7 @@ from planner_jax.ball.prediction import PathTable, predict_path
 from planner_jax.core.protocol import is_better
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.replan import Replanning
-from planner_jax.sims.loop_state import Outlook
+from planner_jax.sims.loop_state import Outlook, shapes_of_plans
 from planner_jax.sims.scoring import passage
 from planner_jax.task.arguments import find_decision
 from planner_jax.task.catch.case import CatchCase
@@ -56,7 +56,7 @@ class CatchPilot:
 
     def plan_shapes(self, cases: CatchCase) -> CatchPlan:
         """Return the shapes of the plans of the planner behind the re-planner."""
-        return self.planner.planner.plan_shapes(cases)
+        return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook

@@ -22,7 +22,14 @@ from planner_jax.runs.columns import BOOL, NUMBER, VECTOR, Column
 from planner_jax.runs.summary import percent
 from planner_jax.sims.launch import flight_keys, launch_ball, ready, require_plan, require_world
 from planner_jax.sims.loop import begin_compiling, fly_leg, predict_balls
-from planner_jax.sims.loop_state import FlightState, Flown, Loop, Outlook, collect_flights
+from planner_jax.sims.loop_state import (
+    FlightState,
+    Flown,
+    Loop,
+    Outlook,
+    collect_flights,
+    shapes_of_plans,
+)
 from planner_jax.sims.model import World
 from planner_jax.sims.recording import Launches
 from planner_jax.sims.robots.quadrotor.robot import Quadrotor
@@ -109,7 +116,7 @@ class HitPilot:
 
     def plan_shapes(self, cases: HitCase) -> HitPlan:
         """Return the shapes of the plans of the planner behind the re-planner."""
-        return self.planner.planner.plan_shapes(cases)
+        return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook

@@ -23,19 +23,16 @@ from planner_jax.runs.run_folder import RunFolder, RunRows
 from planner_jax.runs.source import Chunk
 from planner_jax.runs.style import draw
 from planner_jax.runs.table import align
-from planner_jax.sweep.quadrotor import SampledMotion, body_rate, net_thrust, sample_motion
+from planner_jax.sweep.figures import PANELS
+from planner_jax.sweep.quadrotor import SampledMotion, sample_motion
 from planner_jax.sweep.sweep import sweep_of
 
 SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # number of samples of a plan
 
-# Upper bounds of the flight: name, unit, and function of the value at every time.
-_ABOVE = {
-    "speed": ("m/s", lambda motion, gravity: np.linalg.norm(motion.vel, axis=1)),
-    "acceleration": ("m/s^2", lambda motion, gravity: np.linalg.norm(motion.acc, axis=1)),
-    "body_rate": ("rad/s", body_rate),
-}
+# Units of the upper bounds of the flight, by names in `PANELS`.
+_ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,6 +157,7 @@ def _closest(
 
 def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
     limits, gravity = answer.case.limits, float(answer.case.gravity)
+    sizes = {name: values(motion, gravity) for name, (_, _, values) in PANELS.items()}
 
     def closest(
         words: str, values: np.ndarray, allowed: SupportsFloat, *, least: bool = False
@@ -167,12 +165,12 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
         return _closest(words, motion.time, values, allowed, least=least)
 
     found = [
-        closest(f"{name.replace('_', ' ')} [{unit}]", size(motion, gravity), vars(limits)[name])
-        for name, (unit, size) in _ABOVE.items()
+        closest(f"{name.replace('_', ' ')} [{unit}]", sizes[name], vars(limits)[name])
+        for name, unit in _ABOVE.items()
         if vars(limits)[name] is not None
     ]
     if limits.max_thrust is not None:
-        thrust = np.linalg.norm(net_thrust(motion, gravity), axis=1)
+        thrust = sizes["thrust"]
         found.append(closest("thrust, least [m/s^2]", thrust, limits.min_thrust, least=True))
         found.append(closest("thrust, greatest [m/s^2]", thrust, limits.max_thrust))
     height = closest("height, least [m]", motion.pos[:, 2], limits.min_height, least=True)
