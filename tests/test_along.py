@@ -20,14 +20,10 @@ from planner_jax.trajectory.proportional_minco import proportional_minco, sample
 PROPORTIONS, LANES, SEGMENTS = (0.4, 1.0), 32, 2
 
 
-def limits_along(motion, given):
-    return motion_excess(motion, *given)
-
-
 ALONG = Along(
     proportional_minco(2, PROPORTIONS),
     5,
-    limits_along,
+    lambda motion, given: motion_excess(motion, *given),
     margins=(0.1, 0.1, 0.1, 0.05),
     hinge_width=0.2,
 )

@@ -48,10 +48,6 @@ def juggle_plans(cases):
     return plan(JUGGLE, cases)
 
 
-def lane_of(tree, lane):
-    return jax.tree.map(lambda leaf: jnp.asarray(leaf[lane]), tree)
-
-
 def serves_gone_wrong():
     """Return cases in which a paper's equation divides by zero or has no root, then a good one.
 
@@ -197,7 +193,7 @@ position = jax.jit(lambda head, tail, end, t: evaluate(minimum_jerk(head, tail, 
 
 @pytest.mark.parametrize("transition", [True, False])
 def test_first_waypoints_lie_on_the_primitives(cases, transition):
-    case = lane_of(cases, 2)
+    case = jax.tree.map(lambda leaf: jnp.asarray(leaf[2]), cases)
     waypoints, impact, defect, state = jax.jit(first_guess, static_argnums=0)(transition, case)
     head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
     assert defect == 0.0

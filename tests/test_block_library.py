@@ -88,7 +88,9 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 def test_a_point_of_a_cell_is_in_that_cell(name):
     layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), *_no_boxes())
+    # An inner box whose back does not cut the outer box's cells.
+    behind: Any = Box(np.array([3.0, 0.0, 0.0]), np.array([4.0, 1.0, 1.0]))
+    whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), behind, scene.outer)
     sides = (
         (layout.inner, scene.inner, tunnel.inner[: layout.num_inner]),
         (layout.outer, scene.outer, whole.outer),
@@ -100,13 +102,6 @@ def test_a_point_of_a_cell_is_in_that_cell(name):
         cells, found = jax.jit(jax.vmap(lambda p: cell_of(faces, box, tuple(p))))(points)  # noqa: B023
         assert found.all()
         np.testing.assert_array_equal(cells, np.arange(len(corners)))
-
-
-def _no_boxes():
-    """Return boxes such that the inner box's back does not cut the outer box's cells."""
-    outer = paper_scene().outer
-    behind: Any = np.array([3.0, 0.0, 0.0])
-    return Box(behind, behind + 1.0), outer
 
 
 def test_points_on_edges_are_in_exactly_one_cell():
@@ -370,7 +365,8 @@ def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
     monkeypatch.setattr(building, "_is_free", is_free)
     rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # the row length of the stub
     library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
-    monkeypatch.setattr(type(library), "found", property(lambda self: find_stored(self, PIECES)))
+    stored = property(lambda self: np.isfinite(self.table.rows[..., 6 * PIECES]))
+    monkeypatch.setattr(type(library), "found", stored)
     scene = dataclasses.replace(paper_scene(), pole=np.array([0.806, -0.1], np.float32))
     fixed, touched = building.repair(library, scene, progress=False)
     np.testing.assert_array_equal(touched[0], hit)
@@ -382,10 +378,6 @@ def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
     _, touched = building.repair(library, scene, retry=True, progress=False)
     feasible = tunnels_of(LAYOUTS["A"]).is_feasible
     np.testing.assert_array_equal(touched[0], hit | (feasible & ~library.found[0]))
-
-
-def find_stored(library, pieces):
-    return np.isfinite(library.table.rows[..., 6 * pieces])
 
 
 def test_a_repair_needs_the_same_boxes():

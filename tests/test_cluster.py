@@ -106,6 +106,11 @@ def start(out, settings=SETTINGS):
     return start_sweep(TASK, settings, out, progress=False, workers="ray")
 
 
+@pytest.fixture
+def out(tmp_path):
+    return tmp_path / "run"
+
+
 @pytest.fixture(autouse=True, scope="module")
 def quick():
     with quick_sweeps():
@@ -130,8 +135,7 @@ def ray(monkeypatch, request):
     return stand_in
 
 
-def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, tmp_path, ray):
-    out = tmp_path / "run"
+def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, out, ray):
     manifest = start(out)
     assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at the start
     assert rows_of(out) == rows_of(finished[0])
@@ -141,8 +145,8 @@ def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished,
     assert ray.ended == 1
 
 
-def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_path, ray):
-    start(tmp_path / "run")
+def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(out, ray):
+    start(out)
     (how,) = ray.begun
     assert how["address"] == "local" and how["_node_ip_address"] == "127.0.0.1"
     assert how["include_dashboard"] is False
@@ -151,28 +155,27 @@ def test_a_cluster_that_is_begun_is_of_this_machine_alone_and_tells_nobody(tmp_p
     assert os.environ["RAY_USAGE_STATS_ENABLED"] == "0"
 
 
-def test_a_cluster_is_joined_by_its_address_where_something_answers(monkeypatch, tmp_path, ray):
+def test_a_cluster_is_joined_by_its_address_where_something_answers(monkeypatch, out, ray):
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
     with pytest.raises(ArgumentError, match="RAY_ADDRESS must be .* got '127.0.0.1:1'"):
-        start(tmp_path / "run")
-    assert not (tmp_path / "run").exists() and not ray.begun
+        start(out)
+    assert not out.exists() and not ray.begun
     monkeypatch.setenv("RAY_ADDRESS", "auto")
-    start(tmp_path / "run")
+    start(out)
     (how,) = ray.begun
     assert how["address"] == "auto" and "num_cpus" not in how and ray.ended == 1
 
 
-def test_a_worker_that_dies_costs_nothing_but_time(finished, tmp_path, ray):
+def test_a_worker_that_dies_costs_nothing_but_time(finished, out, ray):
     ray.deaths = {1: 1, 4: 2}
-    out = tmp_path / "run"
     start(out)
     assert rows_of(out) == rows_of(finished[0])
 
 
 def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
-    finished, tmp_path, ray, capsys
+    finished, out, ray, capsys
 ):
-    ray.deaths, out = {2: 99}, tmp_path / "run"
+    ray.deaths = {2: 99}
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]
     assert "--workers must live" in said and "chunk 2 in 4 tries (a worker died)" in said
@@ -182,8 +185,7 @@ def test_a_chunk_in_which_every_worker_dies_leaves_a_run_that_can_be_finished(
     assert rows_of(out) == rows_of(finished[0])
 
 
-def test_a_run_begun_alone_is_finished_by_workers(finished, tmp_path, monkeypatch, ray):
-    out = tmp_path / "run"
+def test_a_run_begun_alone_is_finished_by_workers(finished, out, monkeypatch, ray):
     with monkeypatch.context() as patch:
         stop_after(patch, HitSweep, 2)
         with pytest.raises(SweepInterrupted):
@@ -201,8 +203,8 @@ def test_a_run_begun_alone_is_finished_by_workers(finished, tmp_path, monkeypatc
         (lambda made: {"run": "0"}, "workers must have the files"),
     ],
 )
-def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, ray, other, told):
-    out, real = tmp_path / "run", Maker.of
+def test_a_worker_that_would_make_other_rows_is_refused(out, monkeypatch, ray, other, told):
+    real = Maker.of
 
     def change(*given):
         made = real(*given)
@@ -215,16 +217,15 @@ def test_a_worker_that_would_make_other_rows_is_refused(tmp_path, monkeypatch, r
     assert RunFolder(out).read_manifest()["state"] == "interrupted"
 
 
-def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(tmp_path, ray):
+def test_a_serve_drawn_late_by_a_worker_that_breaks_a_rule_leaves_nothing_behind(out, ray):
     late = HitSettings(num=40, batch=4, delay=1.56, seed=0)
     with pytest.raises(ArgumentError, match="delay must be"):
-        start(tmp_path / "run", late)
-    assert not (tmp_path / "run").exists() and ray.ended == 1
+        start(out, late)
+    assert not out.exists() and ray.ended == 1
 
 
-def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsys):
+def test_without_ray_the_extra_is_named_in_one_line(out, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    out = tmp_path / "run"
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 2
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and install_line("cluster") in said
@@ -237,11 +238,11 @@ def test_without_ray_the_extra_is_named_in_one_line(tmp_path, monkeypatch, capsy
     ("seen", "first"), [(None, "0"), ("0,1", "0"), ("3", "3"), ("2,0,1", "2"), ("", "")]
 )
 def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(
-    monkeypatch, tmp_path, ray, seen, first
+    monkeypatch, out, ray, seen, first
 ):
     if seen is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", seen)
-    start(tmp_path / "run")
+    start(out)
     assert os.environ["CUDA_VISIBLE_DEVICES"] == first
 
 
@@ -258,9 +259,9 @@ def gpus(monkeypatch, ray):
     [(32.0, 2.0, 8, "4"), (8.0, 2.0, 2, "4"), (2.0, 4.0, 1, "1"), (16.0, 1.0, 8, "4")],
 )
 def test_workers_share_gpus_their_memory_and_cores(
-    finished, tmp_path, gpus, cores, num, shared, threads
+    finished, out, gpus, cores, num, shared, threads
 ):
-    gpus.resources, out = {"CPU": cores, "GPU": num}, tmp_path / "run"
+    gpus.resources = {"CPU": cores, "GPU": num}
     start(out)
     assert rows_of(out) == rows_of(finished[0])
     assert gpus.options["num_gpus"] == 1.0 / shared and gpus.options["max_calls"] == 0
@@ -269,11 +270,9 @@ def test_workers_share_gpus_their_memory_and_cores(
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
-    monkeypatch, tmp_path, ray, threads
-):
+def test_workers_on_cores_compute_with_as_many_threads_as_the_run(monkeypatch, out, ray, threads):
     monkeypatch.setattr(cluster, "threads_of_a_computation", lambda: threads)
-    start(tmp_path / "run")
+    start(out)
     assert os.environ["NPROC"] == os.environ["PJRT_NPROC"] == str(threads)
     assert ray.options == {"num_cpus": 1, "max_retries": 3}
 
@@ -283,17 +282,17 @@ def test_workers_on_cores_compute_with_as_many_threads_as_the_run(
     [(1, 0.0, "of a cluster with GPUs"), (2, 2.0, "requested before JAX .* got 2")],
 )
 def test_gpus_here_and_not_there_or_several_here_are_refused(
-    tmp_path, monkeypatch, gpus, own, others, rule
+    out, monkeypatch, gpus, own, others, rule
 ):
     gpus.resources = {"CPU": 64.0, "GPU": others}
     monkeypatch.setattr(cluster.jax, "device_count", lambda: own)
     with pytest.raises(ArgumentError, match=f"workers must be {rule}"):
-        start(tmp_path / "run")
-    assert not (tmp_path / "run").exists() and gpus.ended == 1
+        start(out)
+    assert not out.exists() and gpus.ended == 1
 
 
 def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
-    tmp_path, monkeypatch, ray, capsys
+    out, monkeypatch, ray, capsys
 ):
     platforms = iter(["cpu"])
 
@@ -302,7 +301,6 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
             raise ArgumentError("JAX_PLATFORMS", "a platform", verb="name", shown="'x' (no)")
         return platform
 
-    out = tmp_path / "run"
     monkeypatch.setattr(cluster, "require_backend", backend)
     assert main([*COMMAND, "--workers", "ray", "--out", str(out)]) == 1
     said = capsys.readouterr().err.splitlines()[-1]

@@ -140,10 +140,6 @@ def catch(name, suite, gradient, **options):
     return Entry(pj.catch.planner(name, **options), cases, "targets.ball.vel", gradient)
 
 
-def last_time(plan):
-    return plan.times[-1]
-
-
 def path_then_speed(name, **options):
     small = MotionProblem(pieces=12, samples=2, checked=2)
     source = PathSource(problem=small, drawn=2, later=2, points=33)
@@ -168,7 +164,12 @@ ENTRIES = {
     "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
     "hit juggle": hit("juggle", None, nodes=6),
     "catch exact": catch(
-        "exact", "throws", {"of": last_time, "by": "net"}, decide="greedy", nodes=3, **FEW
+        "exact",
+        "throws",
+        {"of": lambda plan: plan.times[-1], "by": "net"},
+        decide="greedy",
+        nodes=3,
+        **FEW,
     ),
     "catch catch": catch(
         "catch", "throws", {"of": "cost", "by": "net.height"}, decide="given", nodes=6, **NONE

@@ -22,10 +22,6 @@ def cube(x):
 cube.defjvp(lambda primals, tangents: (cube(*primals), 7.0 * tangents[0]))  # not its slope
 
 
-def halve_until_small(x):
-    return jax.lax.while_loop(lambda y: jnp.sum(y**2) > 0.1, lambda y: 0.5 * y, x)
-
-
 FUNCTIONS = {
     "matrix from the left": lambda x, k: MATRIX @ x,
     "matrix from the right": lambda x, k: x.T @ MATRIX.T,
@@ -42,7 +38,7 @@ FUNCTIONS = {
     "gather": lambda x, k: x[k],
     "bounds": lambda x, k: jnp.clip(x, -0.5, x[0, 0]),
     "choice": lambda x, k: jnp.where(k > 1, x, 0.0),
-    "loop": lambda x, k: halve_until_small(x),
+    "loop": lambda x, k: jax.lax.while_loop(lambda y: jnp.sum(y**2) > 0.1, lambda y: 0.5 * y, x),
     "branches": lambda x, k: jax.lax.cond(k > 1, jnp.sin, jnp.cos, x),
     "own derivative": lambda x, k: (cube(x), jax.grad(lambda y: jnp.sum(cube(y)))(x)),
     "gradient": lambda x, k: jax.grad(lambda y: jnp.sum(jnp.sin(MATRIX @ y) ** 2) / y[0, 0])(x),

@@ -17,6 +17,7 @@ from planner_jax.referee.hit import HitVerdict, referee_hits
 
 GRAVITY, DRAG, RESTITUTION, RACKET_HEIGHT = 9.8, 0.0616, 0.7, 0.06
 IMPACT_TIME, NUM_PIECES = 1.2, 3
+TIME = Polynomial([0.0, 1.0])
 CONTACT = np.array([-2.0, 0.3, 1.8])
 BALL_VEL = np.array([-5.0, -0.4, -5.5])
 
@@ -84,16 +85,13 @@ assert_good, assert_fails = checks(judge)
 
 
 def dense(leaves, order, num=20001):
-    """Return times (num,) and a derivative (num, 3) of the first lane, by plain powers."""
+    """Return times (num,) and a derivative (num, 3) of the first lane."""
     ends = np.cumsum(leaves["durations"][0])
     times = np.linspace(0.0, ends[-1], num)
     piece = np.minimum(np.searchsorted(ends, times, side="right"), len(ends) - 1)
     local = times - (ends - leaves["durations"][0])[piece]
-    values = np.zeros((num, 3))
-    for k in range(order, leaves["coeffs"].shape[2]):
-        power = math.perm(k, order) * local ** (k - order)
-        values += power[:, None] * leaves["coeffs"][0, piece, k]
-    return times, values
+    derived = np.polynomial.polynomial.polyder(leaves["coeffs"][0, piece], order, axis=1)
+    return times, (derived * local[:, None, None] ** np.arange(derived.shape[1])[:, None]).sum(1)
 
 
 def hopf_rotations(acc):
@@ -209,9 +207,8 @@ def test_limits_are_met_to_a_relative_thousandth():
 
 def test_a_peak_between_samples_is_found_on_the_polynomial():
     lowest = 20.0 * 200.5 / 400.0  # half-way between two of the 401 samples of 20 s
-    coeffs = np.zeros((1, 1, 3, 3))
-    coeffs[0, 0, :, 2] = [0.25 + lowest**2, -2.0 * lowest, 1.0]  # 0.25 + (t - lowest)^2
-    leaves = volley() | {"coeffs": coeffs, "durations": np.array([[20.0]])}
+    path = cut([Polynomial([0.0])] * 2 + [0.25 + (TIME - lowest) ** 2], [20.0])
+    leaves = volley() | {"coeffs": path[None], "durations": np.array([[20.0]])}
     assert judge(leaves).min_height[0] == pytest.approx(0.25, abs=1e-5)
 
 
@@ -219,13 +216,9 @@ def test_a_peak_between_samples_is_found_on_the_polynomial():
 def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishes(centre):
     # tau = (5 t, 0.3, 40 (t - centre)^2 + 0.5): the attitude turns fast near the centre.
     leaves = volley()
-    coeffs = np.zeros((1, 1, 5, 3))
-    coeffs[0, 0, 0, 2] = 1.5
-    coeffs[0, 0, 2, 1] = 0.5 * 0.3
-    coeffs[0, 0, 3, 0] = 5.0 / 6.0
-    coeffs[0, 0, 2, 2] = 0.5 * (40.0 * centre**2 + 0.5 - GRAVITY)
-    coeffs[0, 0, 3:, 2] = [-80.0 * centre / 6.0, 40.0 / 12.0]
-    leaves |= {"coeffs": coeffs, "durations": np.array([[IMPACT_TIME]])}
+    rise = (40.0 * (TIME - centre) ** 2 + 0.5 - GRAVITY).integ(2) + 1.5
+    path = cut([(5.0 * TIME).integ(2), Polynomial([0.3]).integ(2), rise], [IMPACT_TIME])
+    leaves |= {"coeffs": path[None], "durations": np.array([[IMPACT_TIME]])}
     _, rates = body_rates(leaves)
     assert judge(leaves).max_body_rate[0] == pytest.approx(rates.max(), rel=1e-4)
 
@@ -233,19 +226,12 @@ def test_a_narrow_peak_of_the_body_rate_is_found_where_the_thrust_nearly_vanishe
 def test_a_thrust_that_changes_sign_between_samples_turns_the_quadrotor_over():
     # tau_z = 1 - 4 t with almost no horizontal component: the body rate is zero at every sample.
     leaves = volley()
-    coeffs = np.zeros((1, 1, 4, 3))
-    coeffs[0, 0, 0, 2], coeffs[0, 0, 2, 0] = 3.0, 1e-9
-    coeffs[0, 0, 2:, 2] = [0.5 * (1.0 - GRAVITY), -4.0 / 6.0]
-    leaves |= {"coeffs": coeffs, "durations": np.array([[0.33]])}
+    rise = (1.0 - 4.0 * TIME - GRAVITY).integ(2) + 3.0
+    path = cut([Polynomial([2e-9]).integ(2), Polynomial([0.0]), rise], [0.33])
+    leaves |= {"coeffs": path[None], "durations": np.array([[0.33]])}
     verdict = judge(leaves)
     assert verdict.min_thrust[0] < 1e-3
     assert verdict.max_body_rate[0] > 100.0
-
-
-def state_after_impact(leaves):
-    """Return position and velocity of the ball just after the impact of a volley."""
-    after = (leaves["target"][0] - CONTACT) / 1.5 + [0.0, 0.0, 0.5 * GRAVITY * 1.5]
-    return CONTACT, after
 
 
 def test_drag_after_the_impact_shortens_the_return_as_integrated():
@@ -255,7 +241,8 @@ def test_drag_after_the_impact_shortens_the_return_as_integrated():
         return state[2]
 
     height.terminal, height.direction = True, -1.0
-    path = fly(*state_after_impact(leaves), 5.0, events=height, dense_output=True)
+    vel = (leaves["target"][0] - CONTACT) / 1.5 + [0.0, 0.0, 0.5 * GRAVITY * 1.5]
+    path = fly(CONTACT, vel, 5.0, events=height, dense_output=True)
     found = {"time": IMPACT_TIME + path.t[-1], "apart": 1e-7}
     verdict = assert_fails(leaves, "landing", **found, drag_after_impact=True)
     np.testing.assert_allclose(verdict.landing_point[0], path.y[:3, -1], atol=1e-6)
@@ -283,16 +270,6 @@ def test_a_ball_that_never_reaches_the_target_height_does_not_land(drag_after_im
     says = "never comes down to the target's height"
     verdict = assert_fails(leaves, "landing", says=says, drag_after_impact=drag_after_impact)
     assert np.isinf(verdict.landing_error[0]) and np.isnan(verdict.landing_point[0]).all()
-
-
-def test_free_fall_has_no_attitude():
-    coeffs, head = np.zeros((1, 1, 3, 3)), np.zeros((1, 4, 3))
-    coeffs[0, 0, :, 2] = [3.0, 0.0, -0.5 * GRAVITY]
-    head[0, 0, 2], head[0, 2, 2] = 3.0, -GRAVITY
-    leaves = volley() | {"coeffs": coeffs, "head_state": head}
-    leaves |= {"durations": np.array([[0.3]]), "stroke.time": np.array([0.3])}
-    verdict = assert_fails(leaves, "body rate", says="without attitude")
-    assert np.isinf(verdict.max_body_rate[0])
 
 
 def unequal_lanes():
@@ -323,6 +300,14 @@ FAILURES = {
         )
         for k in range(4)
     },
+    "body rate: free fall": failure(
+        volley()
+        | {"coeffs": cut([0.0 * TIME, 0.0 * TIME, 3.0 - 0.5 * GRAVITY * TIME**2], [0.3])[None]}
+        | {"head_state": np.array([[[0, 0, 3.0], [0, 0, 0], [0, 0, -GRAVITY], [0, 0, 0]]])}
+        | {"durations": np.array([[0.3]]), "stroke.time": np.array([0.3])},
+        np.inf,
+        says="without attitude",
+    ),
     "landing: target moved by 20 mm": failure(
         edit(volley(), {("target", (0, 1)): add([0.012, -0.016])}),
         *(0.02, IMPACT_TIME + 1.5, {"landing_tolerance": 0.021}),

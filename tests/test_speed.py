@@ -25,14 +25,11 @@ TRAPEZOID = SPEED_PLANNERS["trapezoid"]
 many = jax.jit(jax.vmap(plan_speed))
 
 
-def with_slow_parts(problems):
-    """Lower the speed limit in the middle third of every second problem."""
-    limit = np.repeat(problems.speed_limit, 3, axis=1)
-    limit[::2, 1] = 0.9
-    return dataclasses.replace(problems, speed_limit=limit)
-
-
-PROBLEMS = with_slow_parts(speed_problems(NUM))
+PROBLEMS = speed_problems(NUM)
+# The speed limit is lower in the middle third of every second problem.
+LIMIT = np.repeat(PROBLEMS.speed_limit, 3, axis=1)
+LIMIT[::2, 1] = 0.9
+PROBLEMS = dataclasses.replace(PROBLEMS, speed_limit=LIMIT)
 
 
 @pytest.fixture(scope="module")
