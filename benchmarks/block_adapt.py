@@ -1,15 +1,17 @@
-"""Measure the planner that warps stored motions to the very ball, one ball at a time on one core.
+"""Measure the planner that adapts stored block motions to the ball, one ball at a time on one core.
 
     taskset -c 0 python -m benchmarks.block_adapt [--library FILE] [--layout full] [--regime R2]
         [--num 1000] [--seed 7] [--out DIR]
 
-Throws of the suite `pole`, straight on and in the middle, no delay. Without --library one is
-built. Beside `adapt` with its first effort alone and with both, on the same throws: the library's
-motions as they are stored, which may meet a ball anywhere on the shield; straight motions alone,
-six and forty-eight of them; and `online`. Each is compiled for one ball by `BallByBall`; times are
-from the ball's arrays to the plan's, and beside them the processor's own, which other work on the
-machine changes less. Success is the referee's; what a planner called solved and the referee refuses
-is counted.
+Throws are drawn from the suite `pole`, balls meet the middle of the shield straight on, and the arm
+may start at once. Without --library a library is built first. All planners get the same throws:
+`adapt` with its first effort alone and with both efforts, straight motions alone (6 and 48 of
+them), and `online`. The library's stored motions without adaptation may meet a ball anywhere on the
+shield. Each planner is compiled for one ball by `BallByBall`.
+
+Wall-clock times are from the ball's arrays to the plan's arrays. The process's CPU time is printed
+beside them, because other load on the machine changes it less. Success is judged by the referee.
+Plans that a planner reports as solved and the referee rejects are counted.
 """
 
 import argparse
@@ -28,11 +30,11 @@ from planner_jax.benchmarks.block_library import library_options
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 
-WARM = 50  # balls before the clock counts
+WARM = 50  # balls planned before the measurement
 
 
-def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
-    """One planner on all throws."""
+def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
+    """Measure one planner on all throws."""
     cases = jax.tree.map(np.asarray, cases)
     lanes = [pj.take(cases, k) for k in range(cases.batch_shape[0])]
     began = time.perf_counter()
@@ -53,9 +55,10 @@ def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
     mean = 1e3 * float(np.mean(seconds))
     own = 1e3 * float(np.median(busy)), 1e3 * float(np.mean(busy))
     bench.say(
-        f"{name}: {100 * success.mean():.1f} % blocked, {100 * claims.mean():.1f} % called solved, "
-        f"{refused} of these refused; p50 {p50:.3f} ms, mean {mean:.3f} ms, p99 {p99:.3f} ms, "
-        f"of the processor's own time p50 {own[0]:.3f} ms, mean {own[1]:.3f} ms; "
+        f"{name}: {100 * success.mean():.1f} % blocked, "
+        f"{100 * claims.mean():.1f} % solved by status, "
+        f"{refused} of these rejected; p50 {p50:.3f} ms, mean {mean:.3f} ms, p99 {p99:.3f} ms, "
+        f"CPU time p50 {own[0]:.3f} ms, mean {own[1]:.3f} ms; "
         f"compiled in {compiling:.1f} s"
     )
     bench.row(
@@ -74,32 +77,34 @@ def measured(bench: Bench, name: str, planner: Any, cases: Any) -> None:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """All planners."""
+    """Measure all planners."""
     path = options.library
     if path is None:
         path = bench.path / "library.bin"
         build_library(str(path), layout=options.layout, regime=options.regime)
     adapt = adapt_planner(path)
 
-    def drawn(**how: Any) -> Any:
+    def draw_cases(**how: Any) -> Any:
         return pj.block.draw(options.num, "pole", options.seed, regime=options.regime, **how)
 
-    cases = drawn()
+    cases = draw_cases()
     adapt.check(cases)
     bench.say(f"{options.num} throws, load average {os.getloadavg()[0]:.1f}")
     few, many = (OnlineBlock(searches=(Search(straight=k, tries=0),)) for k in (6, 48))
-    measured(
+    measure_planner(
         bench, "adapt, first effort", dataclasses.replace(adapt, efforts=adapt.efforts[:1]), cases
     )
-    measured(bench, "adapt, both efforts", adapt, cases)
-    measured(bench, "library, anywhere on the shield", adapt.stored, drawn(anywhere=True))
-    measured(bench, "straight, 6 motions", few, cases)
-    measured(bench, "straight, 48 motions", many, cases)
-    measured(bench, "online", OnlineBlock(), cases)
+    measure_planner(bench, "adapt, both efforts", adapt, cases)
+    measure_planner(
+        bench, "library, anywhere on the shield", adapt.stored, draw_cases(anywhere=True)
+    )
+    measure_planner(bench, "straight, 6 motions", few, cases)
+    measure_planner(bench, "straight, 48 motions", many, cases)
+    measure_planner(bench, "online", OnlineBlock(), cases)
 
 
 def main() -> None:
-    """Measure."""
+    """Parse the arguments and measure."""
     parser = argument_parser("block_adapt", __doc__, num=1000, seed=7)
     options = library_options(parser, layout="full")
     with begin(parser, options) as bench:

@@ -1,12 +1,12 @@
-"""How many hard balls a second all cores plan for: those that no straight motion blocks.
+"""Measure how many hard balls per second all cores plan for: balls that no straight motion blocks.
 
     python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3]
         [--out DIR]
 
-Throws of the suite `pole`. Those that a straight motion blocks, nearly three in four with R2, are
-left out: what remains needs least squares, or cannot be blocked at all. They are planned in one
-call, compiled before; the best of --repeat calls is reported, with what the referee confirms of it
-and how much longer its motions last than those of `brisk`.
+Throws are drawn from the suite `pole`. Throws that a straight motion blocks, nearly three in four
+with R2, are left out. The others need least squares, or cannot be blocked at all. They are planned
+in one call that is already compiled, and the fastest of --repeat calls is reported. Printed are
+also the share that the referee accepts, and how much longer the motions last than `brisk`'s.
 """
 
 import jax
@@ -22,7 +22,7 @@ from planner_jax.sweep.block.settings import REGIMES
 
 
 def main() -> None:
-    """Time one call."""
+    """Measure planning of hard balls."""
     parser = argument_parser("block_hard", __doc__, num=2000, seed=20261, repeat=3)
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
     options = parser.parse_args()
@@ -44,7 +44,7 @@ def main() -> None:
         bench.say(
             f"{hard.size} of {options.num} throws have no straight motion: "
             f"{hard.size / min(seconds):.0f}/s, {100 * success.mean():.1f} % of them blocked, "
-            f"{refused} claims refused."
+            f"{refused} claims rejected."
         )
         median = gap_figures(gaps)["cost_gap_median"]
         if median is not None:

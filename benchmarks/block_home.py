@@ -1,16 +1,17 @@
-"""Where the arm had better wait: homes searched for by the share of balls that they block.
+"""Search for home poses from which the arm blocks the largest share of balls.
 
     python -m benchmarks.block_home [--num 500] [--candidates 48] [--rounds 4] [--out DIR]
 
-A home is six angles. The cross-entropy method draws candidates, first uniformly, then from a normal
-distribution around the best eighth of all so far; poses that touch something, or are within 3 cm of
-the pole, are left out. A candidate is worth the share of throws of its round to which one of 48
-straight motions leads in time and free: that is quick, and the planner's other motions only add to
-it. In the search the arm starts 0.133 s late, so that candidates differ more.
+A home pose consists of six joint angles. The cross-entropy method draws candidates, first
+uniformly, then from a normal distribution around the best eighth of all candidates so far. Poses in
+collision, or within 3 cm of the pole, are left out. The score of a candidate is the share of its
+round's throws that one of 48 straight motions blocks in time without a collision. Straight motions
+are quick to compute, and the planner's other motions can only raise the share. In the search the
+arm starts 0.133 s late, which spreads the scores.
 
-The best of the last round are compared on other throws, and the three best of these are reported on
-`--num` throws that no choice has seen, by the whole planner and the referee, beside the home of the
-paper's authors.
+The best candidates of all rounds are compared on other throws. The three best of these are judged
+on `--num` further throws that no selection used, by the whole planner and the referee, beside the
+home pose of [Natarajan2024].
 """
 
 import dataclasses
@@ -29,39 +30,39 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
-# Of the angles [rad] that are tried first: within what the arm can do, and in front of it.
+# Bounds of the uniform distribution [rad]: reachable by the arm, and in front of it.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])
 HIGHEST = np.array([0.8, 1.5, 0.95, 0.5, 1.9, 0.8])
-MARGIN, POLE_MARGIN = 0.005, 0.03  # [m], that a home keeps from everything, and from the pole
-ELITE = 8  # one candidate in so many is followed
-LATE = 0.133  # [s], when the arm starts in the search
+MARGIN, POLE_MARGIN = 0.005, 0.03  # [m], clearance of a home pose: of all, of the pole
+ELITE = 8  # one candidate in this number is an elite, from which the next round draws
+LATE = 0.133  # [s], start of the arm in the search
 REPORTED = 3
-DELAYS = (0.0, 0.133)  # [s], of what is reported
+DELAYS = (0.0, 0.133)  # [s], starts of the arm in the report
 STRAIGHT = OnlineBlock(searches=(Search(straight=48, tries=0),))
 
 
 def from_home(cases: Any, homes: np.ndarray) -> Any:
-    """The same B throws for each of H homes (H, 6), as H x B cases."""
+    """Return the same B throws for each of H home poses (H, 6), as H x B cases."""
     num = len(homes)
 
-    def repeated(leaf: Any) -> np.ndarray:
+    def repeat(leaf: Any) -> np.ndarray:
         leaf = np.asarray(leaf)
         return np.broadcast_to(leaf, (num, *leaf.shape)).reshape(-1, *leaf.shape[1:])
 
-    all_cases = jax.tree.map(repeated, cases)
+    all_cases = jax.tree.map(repeat, cases)
     angles = np.repeat(homes, cases.batch_shape[0], axis=0).astype(all_cases.angles.dtype)
     arm = dataclasses.replace(all_cases.arm, home=angles)
     return dataclasses.replace(all_cases, angles=angles, arm=arm)
 
 
-def blocked(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
-    """The share of throws for which a plan is claimed, (H,)."""
+def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
+    """Return the share of throws that the planner reports as solved, for each home pose, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
     return pj.solved(plans).reshape(len(homes), -1).mean(axis=1)
 
 
-def drawn(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
-    """Candidates (num, 6) [rad] that touch nothing, uniform or around good ones (E, 6)."""
+def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
+    """Draw collision-free candidates (num, 6) [rad], uniformly or around good ones (E, 6)."""
     arm, scene = irb1600(), paper_scene()
 
     @jax.jit
@@ -83,12 +84,16 @@ def drawn(random: np.random.Generator, num: int, around: np.ndarray | None) -> n
 
 
 def main() -> None:
-    """Search, then report."""
+    """Search for home poses, then report the best."""
     parser = argument_parser(
         "block_home", __doc__, num=500, seed=7, candidates=48, rounds=4, throws=96
     )
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
-    parser.add_argument("--wide", action="store_true", help="balls off the shield's middle, aslant")
+    parser.add_argument(
+        "--wide",
+        action="store_true",
+        help="balls may meet the shield off its middle and at an angle",
+    )
     options = parser.parse_args()
     kind: dict[str, Any] = {"regime": options.regime, "wide": options.wide}
 
@@ -102,8 +107,8 @@ def main() -> None:
         elites = None
         for k in range(options.rounds):
             began = time.perf_counter()
-            new = drawn(random, options.candidates, elites)
-            rates = blocked(STRAIGHT, throws(options.throws, k + 1, LATE), new)
+            new = draw_candidates(random, options.candidates, elites)
+            rates = share_solved(STRAIGHT, throws(options.throws, k + 1, LATE), new)
             homes, worth = np.concatenate([homes, new]), np.concatenate([worth, rates])
             best = np.argsort(-worth)[: max(options.candidates // ELITE, 2)]
             elites = homes[best]
@@ -114,7 +119,9 @@ def main() -> None:
             )
             bench.row(round=k + 1, rates=rates, homes=new)
         finalists = homes[np.argsort(-worth)[: 2 * ELITE]]
-        again = blocked(STRAIGHT, throws(4 * options.throws, options.rounds + 1, LATE), finalists)
+        again = share_solved(
+            STRAIGHT, throws(4 * options.throws, options.rounds + 1, LATE), finalists
+        )
         chosen = finalists[np.argsort(-again)[:REPORTED]]
         authors = np.asarray(irb1600().home, float)[None]
         bench.say(
@@ -122,12 +129,12 @@ def main() -> None:
             f"{options.num} other throws, {options.regime}, "
             f"{'wide' if options.wide else 'strict'}; angles [rad]",
             "",
-            "| home | start after | blocked | straight motions alone | claims refused |",
+            "| home | start after | blocked | straight motions alone | claims rejected |",
             "|---|---|---|---|---|",
         )
-        named = {"the authors'": authors[0]}
-        named |= {f"found, place {k + 1}": home for k, home in enumerate(chosen)}
-        for name, home in named.items():
+        home_poses = {"the authors'": authors[0]}
+        home_poses |= {f"found, rank {k + 1}": home for k, home in enumerate(chosen)}
+        for name, home in home_poses.items():
             for delay in DELAYS:
                 cases = from_home(throws(options.num, 1000, delay), home[None])
                 plans = pj.plan(planner, cases)
@@ -139,7 +146,7 @@ def main() -> None:
                     f"| {100 * success.mean():.1f} % | {100 * straight.mean():.1f} % | {refused} |"
                 )
                 bench.row(home=name, angles=home, delay=delay, blocked=success.mean())
-                if name == "found, place 1" and delay == 0.0:
+                if name == "found, rank 1" and delay == 0.0:
                     bench.count(success)
 
 

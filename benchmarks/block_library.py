@@ -1,17 +1,17 @@
-"""Measure the library of blocks: build, coverage, queries, repair, and how many balls it blocks.
+"""Measure the library of block motions: build, coverage, queries, repair and blocked balls.
 
     python -m benchmarks.block_library [--library FILE] [--layout B] [--regime R2] [--num 2000]
         [--queries 20000] [--batch 1048576] [--shift -0.1] [--skip-repair] [--out DIR]
 
-Without --library one is built, after a few pairs by which everything is compiled. Then
-* coverage, over the pairs that a ball can pass through, and memory;
-* random balls through stored tunnels, by the referee: claims that it refuses;
-* the suites `pole` and `short`, balls that nothing was tuned on (seed 20260), met anywhere on
-  the shield and as `wide`, with no delay and 0.133 s;
-* queries of one ball, from host to host on the CPU, balls of the suite `pole`;
-* queries of a batch on the default device. The table is an argument of what is compiled, so that
-  it cannot be folded into it, and answers stay on the device;
-* the pole moved by --shift along y: a repair, and how many of its motions the referee refuses.
+Without --library a library is built, after a few pairs of cells have compiled everything. Then
+* coverage of the pairs of cells that a ball can pass through, and memory;
+* random balls through stored tunnels, judged by the referee, and the claims that it rejects;
+* balls of the suites `pole` and `short` that no tuning used (seed 20260), met anywhere on the
+  shield and as `wide`, with a delay of 0 and of 0.133 s;
+* queries of one ball, from host to host on the CPU, with balls of the suite `pole`;
+* queries of a batch on the default device. The table is an argument of the compiled program, so
+  that the compiler cannot fold it into the program. Answers stay on the device;
+* the pole moved by --shift along y: a repair, and how many of its motions the referee rejects.
 """
 
 import argparse
@@ -41,26 +41,26 @@ from planner_jax.baselines.block.library.table import (
     lookup,
     unpack_rows,
 )
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.timing import CompileClock
 from planner_jax.task.block.scene import paper_scene
 
 SEED = 20260
-ROUNDS = 20  # of a batch of queries
+ROUNDS = 20  # calls of a batch query that are timed together
 
 
-def timed(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
-    """What a function gives, and how long [s] it takes beside compiling."""
+def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
+    """Return a function's result and its duration [s] without compilation."""
     began = time.perf_counter()
     with CompileClock() as clock:
         found = function(*arguments, **how)
     return found, time.perf_counter() - began - clock.seconds
 
 
-def built(bench: Bench, path: Path, layout: str, regime: str) -> Library:
-    """A library built into a file."""
+def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
+    """Build a library into a file, and report the time."""
     given: Any = REGIMES[regime]
     at_rest: Any = np.asarray(given.ends_at_rest)
     scene = paper_scene()
@@ -68,23 +68,24 @@ def built(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # Spread, so that some of them need least squares, too; as many as calls of every size take.
+    # Spread over all pairs, so that some need least squares too; enough of them to compile every
+    # call size.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
     for size in set(building.portions().lanes):
         building.plan_pairs(setting, np.asarray(home), tunnel, np.resize(few, max(size, len(few))))
     compiling = time.perf_counter() - began
-    library, seconds = timed(building.build, path, setting, home, own)
+    library, seconds = time_call(building.build, path, setting, home, own)
     bench.say(
         f"Build of {own.num_pairs} pairs, {tunnel.is_feasible.sum()} of them feasible: "
-        f"{seconds:.2f} s, after {compiling:.1f} s with the compilation."
+        f"{seconds:.2f} s; the first pairs, with compilation, took {compiling:.1f} s."
     )
     bench.note(build_seconds=seconds, first_pairs_seconds=compiling)
     return library
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Coverage and memory."""
+    """Report coverage and memory."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),
@@ -102,18 +103,18 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Random balls through stored tunnels."""
+    """Judge random balls through stored tunnels."""
     found = check(library, num, SEED)
     wrong = int((found.claimed & ~found.verdict.success).sum())
     bench.say(
         f"{name}: {100 * found.verdict.success.mean():.2f} % of {num} balls through stored tunnels "
-        f"are blocked; of {found.claimed.sum()} claims the referee refuses {wrong}."
+        f"are blocked; of {found.claimed.sum()} claims the referee rejects {wrong}."
     )
     bench.note(**{f"refused_{name}": wrong, f"claims_{name}": int(found.claimed.sum())})
 
 
 def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
-    """Balls of the suites."""
+    """Report the share of balls of the suites that the library blocks."""
     planner = LibraryBlock(library)
     for suite in ("pole", "short"):
         for met in ("anywhere", "wide"):
@@ -135,7 +136,7 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
                 bench.say(
                     f"{suite}, {met}, delay {delay} s: stored for {100 * found.mean():.1f} %, "
                     f"{100 * verdict.success.mean():.1f} % of {num} blocked, "
-                    f"{refused} of {claims.sum()} claims refused"
+                    f"{refused} of {claims.sum()} claims rejected"
                 )
                 bench.row(
                     suite=suite,
@@ -150,14 +151,15 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
 
 
 class OneBall:
-    """Looks up one ball after another at the least latency, by a program compiled for the CPU.
+    """Lookup of one ball after another at the least latency, by a program compiled for the CPU.
 
-    A ball goes in as one vector and its answer comes back as one: every array that crosses into a
-    compiled program, or out of it, costs a microsecond. The motion is left as it is stored.
+    A ball is passed as one vector, and its answer is one vector: every array that enters or leaves
+    a compiled program costs a microsecond. The motion is returned as it is stored, without
+    adaptation.
     """
 
     def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
-        """Compile the lookup of a library, for an arm that waits at one of its homes."""
+        """Compile the lookup of a library, for an arm that waits at one of its home poses."""
         own = library.table
 
         def pack_rows(rows: Array, vector: Array) -> Array:
@@ -178,7 +180,7 @@ class OneBall:
         """Look up a ball; return the answer in NumPy arrays and plain numbers.
 
         Args:
-            pos: (3,) [m], when it is first seen.
+            pos: (3,) [m], position when the ball is first seen.
             vel: (3,) [m/s].
         """
         vector = np.empty(6, np.float32)
@@ -190,7 +192,7 @@ class OneBall:
 
 
 def single_queries(bench: Bench, library: Library, num: int) -> None:
-    """One ball at a time."""
+    """Measure queries of one ball at a time."""
     one, cases = OneBall(library), pj.block.draw(min(num, 2000), "pole", SEED)
     balls = list(zip(np.asarray(cases.ball.pos), np.asarray(cases.ball.vel), strict=True))
     seconds = []
@@ -210,54 +212,54 @@ def single_queries(bench: Bench, library: Library, num: int) -> None:
 
 
 @jax.jit
-def looked_up(table: Table, balls: BallState, gravity: Any) -> Answer:
-    """Answers for a batch."""
+def look_up(table: Table, balls: BallState, gravity: Any) -> Answer:
+    """Look up a batch of balls."""
     return jax.vmap(lookup, (None, 0, None))(table, balls, gravity)
 
 
 def batch_queries(bench: Bench, library: Library, batch: int) -> None:
-    """A batch on the default device."""
+    """Measure queries of a batch on the default device."""
     cases = pj.block.draw(2000, "pole", SEED)
     pick = np.random.default_rng(SEED).integers(0, 2000, batch)
     balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
     table = jax.device_put(library.table)
     gravity = jnp.asarray(9.81, jnp.float32)
-    _, compiling = timed(lambda: jax.block_until_ready(looked_up(table, balls, gravity)))
+    _, compiling = time_call(lambda: jax.block_until_ready(look_up(table, balls, gravity)))
 
     def rounds() -> None:
-        found = looked_up(table, balls, gravity)
+        found = look_up(table, balls, gravity)
         for _ in range(ROUNDS - 1):
-            found = looked_up(table, balls, gravity)
+            found = look_up(table, balls, gravity)
         jax.block_until_ready(found)
 
     rounds()
-    _, seconds = timed(rounds)
+    _, seconds = time_call(rounds)
     rate = batch * ROUNDS / seconds
     device = jax.devices()[0].device_kind
     bench.say(f"Batch of {batch}: {rate:.3g} queries/s on {device}, compiled in {compiling:.1f} s.")
     bench.note(batch_queries_per_second=rate)
 
 
-def repaired(bench: Bench, library: Library, shift: float, num: int) -> None:
-    """The pole moved along y."""
+def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
+    """Move the pole along y, and measure the repair."""
     scene = library.setting.scene
     pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)
     moved = dataclasses.replace(scene, pole=pole)
-    (fixed, touched), seconds = timed(building.repair, library, moved, progress=False)
+    (fixed, touched), seconds = time_call(building.repair, library, moved, progress=False)
     stored = int(library.found.sum())
     bench.say(
-        f"Pole moved by {shift} m: {touched.sum()} of {stored} motions planned anew in "
-        f"{seconds:.2f} s; motions for {fixed.found.sum()} then."
+        f"Pole moved by {shift} m: {touched.sum()} of {stored} motions re-planned in "
+        f"{seconds:.2f} s; motions for {fixed.found.sum()} pairs afterwards."
     )
     bench.note(repair_seconds=seconds, repaired=int(touched.sum()))
     referee(bench, fixed, num, "repaired")
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Everything."""
+    """Measure everything."""
     if options.library is None:
         path = bench.path / "library.bin"
-        library = built(bench, path, options.layout, options.regime)
+        library = build_timed(bench, path, options.layout, options.regime)
     else:
         library = load_library(options.library)
     describe(bench, library)
@@ -266,30 +268,34 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     single_queries(bench, library, options.queries)
     batch_queries(bench, library, options.batch)
     if not options.skip_repair:
-        repaired(bench, library, options.shift, options.num)
+        measure_repair(bench, library, options.shift, options.num)
 
 
 def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Namespace:
-    """What is asked for, with --library, --layout (by default this one) and --regime.
+    """Parse the arguments, after adding --library, --layout (with this default) and --regime.
 
-    An unknown layout or regime ends the program with a line.
+    An unknown layout or regime exits with an error.
     """
-    parser.add_argument("--library", type=Path, help="a file that has been built")
+    parser.add_argument("--library", type=Path, help="file of a built library; default: build one")
     known = ", ".join(LAYOUTS)
-    parser.add_argument("--layout", default=layout, help=f"of {known}; default: {layout}")
-    parser.add_argument("--regime", default="R2", help=f"of {', '.join(REGIMES)}; default: R2")
+    parser.add_argument("--layout", default=layout, help=f"one of {known}; default: {layout}")
+    parser.add_argument(
+        "--regime", default="R2", help=f"joint limits, one of {', '.join(REGIMES)}; default: R2"
+    )
     options = parser.parse_args()
-    chosen(parser, "--layout", options.layout, LAYOUTS)
-    chosen(parser, "--regime", options.regime, REGIMES)
+    parse_names(parser, "--layout", options.layout, LAYOUTS)
+    parse_names(parser, "--regime", options.regime, REGIMES)
     return options
 
 
 def main() -> None:
-    """Measure."""
+    """Parse the arguments and measure."""
     counts = {"num": 2000, "queries": 20000, "batch": 1 << 20}
     parser = argument_parser("block_library", __doc__, **counts)
-    parser.add_argument("--shift", type=float, default=-0.1, help="[m], of the pole; default: -0.1")
-    parser.add_argument("--skip-repair", action="store_true", help="without the repair")
+    parser.add_argument(
+        "--shift", type=float, default=-0.1, help="shift of the pole along y [m]; default: -0.1"
+    )
+    parser.add_argument("--skip-repair", action="store_true", help="skip the repair")
     options = library_options(parser, layout="B")
     with begin(parser, options) as bench:
         measure(bench, options)

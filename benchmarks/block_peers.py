@@ -1,22 +1,24 @@
-"""All block planners on the same throws: Tables I and II of [Natarajan2024] beside our figures.
+"""Compare all block planners on the same throws, beside Tables I and II of [Natarajan2024].
 
     python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
 
-A block is what the referee says, whatever a planner claims; `found` is a motion that touches
-nothing, in time or not. Every throw is planned alone, from NumPy arrays to NumPy arrays, warm, by
-one call on one core; a call in which something is compiled is made again. The second rate of
-blocks counts that time: the motion and the call together have to fit between the moment at which
-the arm may start and the contact. A motion that always lasts until the contact, as those of
-`online` do, is made anew for an arm that may start later, by the 90 % quantile of the times of all
-calls; calls that take longer fail.
+A block counts only if the referee accepts it, whatever the planner reports. `found` counts
+collision-free motions, in time or not. Every throw is planned alone, from NumPy arrays to NumPy
+arrays, by one call on one core. A call that compiles something is repeated.
 
-The execution is how long the arm moves. Torques are root mean squares over that time, by inverse
-dynamics, with the mass that the links have and a shield without any. Both are means over the
+The second block rate counts planning time: planning and motion together must fit between the moment
+at which the arm may start and the contact. Motions of `online` and `brisk` always end at the
+contact, so these planners plan again for an arm that starts later, by the 90 % quantile of all
+planning times. Calls that take longer than this quantile count as failures.
+
+The execution time is how long the arm moves. Torques are root mean squares over that time, by
+inverse dynamics with the masses of the links and a massless shield. Both are averaged over the
 blocks of each planner, and over the throws that all planners of the run block.
 
-The paper's rows are as printed: of 200 throws that it does not give, on a Threadripper Pro 5995WX,
-with limits, poses and torques that it does not tell; its percentages are multiples of 1/209. Hence
-compare rows of one table, and of the paper's numbers their ratios.
+The paper's rows are quoted as printed. They come from 200 throws that are not published, on a
+Threadripper Pro 5995WX, with limits, poses and torques that the paper does not state. Its
+percentages are multiples of 1/209. Therefore compare rows only within one table, and use ratios of
+the paper's numbers.
 """
 
 import dataclasses
@@ -31,7 +33,7 @@ from flax import struct
 from jax import Array
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.referee.block import BlockVerdict
 from planner_jax.robot.arm import Arm
 from planner_jax.runs.timing import measure_plans
@@ -42,8 +44,8 @@ from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
-# By name: the planner and its options. `direct-soonest` looks at one motion; plain ones take
-# the first way that is found as it is, as the paper must have.
+# Row name -> planner and its options. `direct-soonest` tries a single motion. Plain planners take
+# the first path that they find, as the paper's baselines must have done.
 PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "online": ("online", {}),
     "brisk": ("brisk", {}),
@@ -57,10 +59,10 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
-RESERVE = 90.0  # [%], of the times of calls that such a planner is told to keep free
-WARM = 2  # throws of another seed, planned before the others
-# Tables I and II as printed: found, blocked, the same without query time [%], query [ms] and
-# execution [s] with their standard deviations; torques [N m].
+RESERVE = 90.0  # [%], quantile of planning times by which such a planner plans for a later start
+WARM = 2  # throws of another seed, planned before the measurement
+# Tables I and II as printed: found, blocked with and without query time [%]; query [ms] and
+# execution [s], each with its standard deviation; torques [N m].
 TABLE_I = {
     "paper: theirs": (70.33, 68.9, 68.9, (0.109, 0.033), (0.31, 0.2)),
     "paper: RRT-Connect": (59.81, 27.27, 27.27, (17.5, 31.7), (1.3, 0.97)),
@@ -75,7 +77,7 @@ TABLE_II = {
 
 @struct.dataclass
 class Torques:
-    """What the joints exert during a motion."""
+    """Joint torques of a motion."""
 
     rms: Array  # (6,) [N m], root of the mean square over the time
     peak: Array  # (6,) [N m], greatest magnitude
@@ -86,14 +88,15 @@ def motion_torques(
 ) -> Torques:
     """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of [Natarajan2024].
 
-    The integral is that of the midpoint rule, as accelerations may jump at the ends. The paper
-    does not say whether gravity counts, nor how it samples; without gravity ask for 0.
+    The midpoint rule approximates the integral, because accelerations may jump at the ends. The
+    paper states neither whether gravity is included nor how torques are sampled. Pass gravity 0 to
+    leave it out.
 
     Args:
         arm: one arm.
-        motion: of its joints, longer than 0 s.
+        motion: joint trajectory, longer than 0 s.
         gravity: () [m/s^2], magnitude, along -z of the base frame.
-        samples: equal steps of the motion; 256 are below 4 ms up to a second.
+        samples: number of equal time steps; 256 give steps below 4 ms for motions up to a second.
     """
     shares = (np.arange(samples) + 0.5) / samples
     duration = total_duration(motion)
@@ -110,19 +113,19 @@ def motion_torques(
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of all throws with one planner; B of them."""
+    """Results of one planner on B throws."""
 
     verdict: BlockVerdict
     found: np.ndarray  # (B,) bool
-    counted: np.ndarray  # (B,) bool, blocked although the time of the call counts
+    counted: np.ndarray  # (B,) bool, blocked although planning time counts
     query: np.ndarray  # (B,) [s]
     execution: np.ndarray  # (B,) [s]
     with_gravity: Torques  # leaves (B, 6) [N m]
     without: Torques
 
 
-def moving(motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Motions (B, ...) without the pieces in which the arm waits."""
+def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
+    """Return motions (B, ...) without the pieces in which the arm waits."""
     coeffs = np.asarray(motion.coeffs)
     moves = np.any(coeffs[:, :, 1:] != 0.0, axis=(2, 3))
     durations: Any = np.where(moves, motion.durations, 0.0)
@@ -130,20 +133,24 @@ def moving(motion: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
-    """Which plans (B,) touch nothing, in time or not."""
+    """Return which plans (B,) are free of collision, in time or not."""
     claims = pj.solved(plans)
     late = np.isfinite(plans.violation) & (verdict.failed_limit == "time")
     return (claims & verdict.success) | (late & ~claims)
 
 
-def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
-    """Plan throws one by one and have them judged; `lasts`: whether motions end at the contact."""
-    # Once each: RRT-Connect draws on where it left off, so that further calls change its ways.
+def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
+    """Plan throws one by one and judge the plans.
+
+    With `lasts`, motions always end at the contact, so that planning time is counted by planning
+    again for a later start.
+    """
+    # Once each: RRT-Connect continues its random sequence, so that more calls change its paths.
     for k in range(WARM):
         pj.plan(planner, pj.take(warm, k))
     plans, query = measure_plans(planner, cases)
     verdict = pj.block.judge(cases, plans)
-    motion = moving(plans.motion)
+    motion = remove_waits(plans.motion)
     execution = np.asarray(motion.durations).sum(axis=1)
     if lasts:
         reserve = np.float32(np.percentile(query, RESERVE))
@@ -161,17 +168,17 @@ def outcome_of(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
 
 
 def with_spread(values: np.ndarray, digits: int) -> str:
-    """Mean and standard deviation; a dash of none."""
+    """Format the mean and standard deviation; a dash if there are no values."""
     if not len(values):
         return "-"
     return f"{values.mean():.{digits}f} ± {values.std():.{digits}f}"
 
 
 def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Table I."""
+    """Print Table I."""
     bench.say(
         "| Table I | found | blocked | with query time | query [ms] | p50 | p99 | execution [s] "
-        f"| on the {common.sum()} common |",
+        f"| execution on the {common.sum()} common |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     for name, (found, counted, blocked, query, execution) in TABLE_I.items():
@@ -201,7 +208,7 @@ def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarra
 
 
 def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Table II: over each planner's own blocks and over the common ones."""
+    """Print Table II: over each planner's own blocks, and over the common blocks."""
     bench.say(
         "",
         "| Table II, RMS [N m] | throws | 1 | 2 | 3 | 4 | 5 | 6 | peak 1 | peak 2 | peak 3 |",
@@ -235,11 +242,19 @@ def main() -> None:
     parser = argument_parser("block_peers", __doc__, num=100, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="pole", help="default: pole")
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
-    parser.add_argument("--wide", action="store_true", help="balls off the shield's middle, aslant")
-    parser.add_argument("--delay", type=float, default=0.0, help="[s]; default: 0")
-    parser.add_argument("--planners", default=",".join(PLANNERS), help="by name; default: all")
+    parser.add_argument(
+        "--wide",
+        action="store_true",
+        help="balls may meet the shield off its middle and at an angle",
+    )
+    parser.add_argument(
+        "--delay", type=float, default=0.0, help="time [s] before the arm may start; default: 0"
+    )
+    parser.add_argument(
+        "--planners", default=",".join(PLANNERS), help="names, comma-separated; default: all"
+    )
     options = parser.parse_args()
-    names = chosen(parser, "--planners", options.planners, PLANNERS)
+    names = parse_names(parser, "--planners", options.planners, PLANNERS)
     if not 0.0 <= options.delay < np.inf:
         parser.error(f"argument --delay: must be finite and >= 0, got {options.delay:g}")
     if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
@@ -263,7 +278,9 @@ def main() -> None:
         for name in names:
             kind, changes = PLANNERS[name]
             lasts = kind in LASTS_UNTIL_CONTACT
-            outcomes[name] = outcome_of(pj.block.planner(kind, **changes), cases, warm, lasts=lasts)
+            outcomes[name] = run_planner(
+                pj.block.planner(kind, **changes), cases, warm, lasts=lasts
+            )
         common = np.all([one.verdict.success for one in outcomes.values()], axis=0)
         table_of_rates(bench, outcomes, common)
         table_of_torques(bench, outcomes, common)

@@ -1,30 +1,31 @@
-"""How well thrown balls are seen: errors where shields meet them, and times of frames and fits.
+"""Measure how accurately arms locate thrown balls, and how many balls they then block.
 
     python -m benchmarks.block_perception [--num 2000] [--throws 1000] [--timed 50]
                                           [--rendered 12] [--seed 7] [--out DIR]
                                           [--parts errors,images,pipeline,planning]
 
-Balls are watched from the first frame, at time 0, until some moment, and their flight is fitted
-once, with gravity known [Natarajan2024, eqs 5 to 8]. The error is that of the ball's position
-across its flight in the middle of its way between the two boxes; a shield that may meet the ball
-0.1 m off its middle has so much room. Round noise is as large in every direction; the stereo camera
-has the noise of `stereo_noise`, and its observations are weighted by it, or all alike as in the
-paper's eq. 8. The summary's success is that of the suite `short`, 60 Hz, 2 cm, 0.25 s: within 0.1
-m.
+Part `errors`: balls are observed from the first frame, at time 0, up to some moment. Their flight
+is fitted once, with gravity known [Natarajan2024, eqs 5 to 8]. The error is the distance of the
+fitted position from the true one, perpendicular to the flight, when the ball is midway between the
+two boxes. A shield that may meet the ball 0.1 m off its middle tolerates an error of 0.1 m.
+Isotropic noise is equally large in every direction. The stereo camera has the noise of
+`stereo_noise`; its observations are weighted by this noise, or equally as in the paper's eq. 8. The
+summary's success is the share of errors below 0.1 m for the suite `short`, 60 Hz, 2 cm, 0.25 s.
 
-Then images: throws of `short` are rendered at 60 Hz, and go through depth noise, colour mask,
-outlier rejection, centroid, the frame of a simulated calibration and the fit, beside the stereo
-camera's model without images on the same throws. Frames are timed from the image and depth on the
-host to the centroid, fits from observations to the flight, on one core, warm; the noise is not part
-of it, nor is what a real camera needs to compute depth.
+Part `images`: throws of `short` are rendered at 60 Hz. The images pass depth noise, colour mask,
+outlier rejection, centroid, the frame of a simulated calibration, and the fit. The same throws with
+the stereo camera's noise model, without images, stand beside them. Frames are timed from image and
+depth on the host to the centroid, fits from observations to the flight, on one core, compiled
+before. The times contain neither the simulated noise nor a real camera's depth computation.
 
-Then the whole pipeline: throws of `short` with the limits R1, wide (0.1 m off the middle, 30
-degrees), seen, fitted, planned for and judged against the true ball. An arm decides once at a fixed
-moment; or once, at the first frame after which it could not wait for another; or again and again.
-Its motion begins 50 ms after the frame, and what is behind `on it` are balls that meet the shield
-anywhere on its face. Beside it is [Natarajan2024, eq. 1]: sensing, overhead and motion have to be
-over when the ball is there. The planning in between is timed one throw at a time, and is to be
-shorter than the overhead.
+Part `pipeline`: throws of `short` with the limits R1, wide (up to 0.1 m off the middle and 30
+degrees aslant), are observed, fitted, planned for, and judged against the true ball. An arm decides
+once at a fixed moment; or once, at the last frame after which a motion is still in time; or
+repeatedly. Its motion starts 50 ms after the frame. The column `on the shield` counts balls that
+meet the shield anywhere on its face. The times stand beside [Natarajan2024, eq. 1]: sensing,
+overhead and motion must end before the ball arrives.
+
+Part `planning`: planning is timed one throw at a time. It should take less than the overhead.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.ball.flight import BallState, drag_free_flight
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.runs.timing import measure_warm
@@ -66,15 +67,15 @@ from planner_jax.task.block.replan import ReplanBlock
 
 RATES = (30.0, 60.0, 120.0)  # [Hz]
 STDS = (0.01, 0.02, 0.03)  # [m]
-MOMENTS = (0.08, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # [s], at which flights are fitted
+MOMENTS = (0.08, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # [s], moments at which flights are fitted
 ROOM = 0.1  # [m]
 BAR = ("short", 60.0, 0.02, 0.25)
 RENDERED_RATE = 60.0  # [Hz]
-TIMED = 200  # frames and fits
+TIMED = 200  # number of frames, and of fits, that are timed
 OVERHEAD = 0.05  # [s]
 PARTS = ("errors", "images", "pipeline", "planning")
-# Row -> noise [m] of each coordinate, None for the stereo camera's; the moments of fits from, to
-# [s] and their rate [Hz]; options of `decide`.
+# Row -> noise [m] of each coordinate (None: the stereo camera's noise); first and last moment of
+# fits [s] and their rate [Hz]; options of `decide`.
 PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
@@ -90,7 +91,10 @@ PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, A
 def errors_after(
     cases: Any, eye: Eye, times: Array, places: Array, moments: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Errors (B, M) [m] across the flight of fits at moments (M,) [s], and their believed size."""
+    """Return the errors of fits at moments (M,) [s], and their estimated standard deviations.
+
+    Both are (B, M) [m], perpendicular to the flight.
+    """
 
     def one(ball: BallState, gravity: Array, places: Array, middle: Array) -> Any:
         truth = drag_free_flight(ball, middle, gravity)
@@ -107,13 +111,13 @@ def errors_after(
 
 @jax.jit
 def middle_of(cases: Any) -> Array:
-    """When balls (B,) are in the middle between the boxes [s]."""
+    """Return the times (B,) [s] at which balls are midway between the boxes."""
     flights = jax.vmap(flight_of)(cases)
     return 0.5 * (flights.earliest + flights.latest)
 
 
 class Table:
-    """Lines of medians and shares within `ROOM`, a column a moment."""
+    """Printed table of median errors and shares within `ROOM`, with a column for each moment."""
 
     def __init__(self, bench: Bench):
         self.bench = bench
@@ -122,8 +126,11 @@ class Table:
         bench.say("|---|---|---|" + "---|" * len(heads))
 
     def line(self, suite: str, rate: float, noise: str, errors: np.ndarray, stds: Any) -> None:
-        """A line from errors (B, M) and what was believed of them; NaN of a ball not seen."""
-        within = np.mean(errors < ROOM, axis=0)  # what was not seen is not within
+        """Print a row from errors (B, M) and their stated standard deviations.
+
+        The error of a ball that was not seen is NaN.
+        """
+        within = np.mean(errors < ROOM, axis=0)  # false for NaN: a ball that was not seen
         medians = np.nanmedian(errors, axis=0)
         cells = [
             f"{median:.3f} m, {100 * share:.1f} %"
@@ -144,8 +151,8 @@ class Table:
             )
 
 
-def modelled(bench: Bench, num: int, seed: int) -> None:
-    """The tables of the models without images."""
+def report_models(bench: Bench, num: int, seed: int) -> None:
+    """Print the tables of the noise models without images."""
     bench.say(f"Median error, and share of {num} throws within {ROOM:g} m", "")
     table, moments = Table(bench), jnp.asarray(MOMENTS)
     for suite in ("short", "pole"):
@@ -164,13 +171,13 @@ def modelled(bench: Bench, num: int, seed: int) -> None:
                 if (suite, rate, std, BAR[3]) == BAR:
                     bench.count(found[0][:, MOMENTS.index(BAR[3])] < ROOM)
                 if std is None and rate == RENDERED_RATE:
-                    alike = eye(rate=rate, std=1.0)  # weighs all alike
+                    alike = eye(rate=rate, std=1.0)  # constant noise: equal weights
                     found = errors_after(cases, alike, times, places, moments, middle)
                     table.line(suite, rate, "stereo, unweighted", np.asarray(found[0]), found[1])
 
 
-def rendered(bench: Bench, num: int, seed: int) -> None:
-    """The same of images, beside the model on the same throws; and times of frames and fits."""
+def report_images(bench: Bench, num: int, seed: int) -> None:
+    """Print the table of rendered images, beside the noise model, and the times."""
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
@@ -214,7 +221,10 @@ def rendered(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_frames(bench: Bench, seer: Eye, truth: np.ndarray, places: np.ndarray) -> None:
-    """How far balls in images are off, in pixels and in what depths were expected to be."""
+    """Report the errors of balls in images.
+
+    Pixel errors are in pixels. Depth errors are in units of the noise model's standard deviation.
+    """
     camera: Any = seer.camera
     noise: Any = seer.noise
     seen = np.asarray(np.isfinite(places).all(axis=-1))
@@ -227,7 +237,7 @@ def report_frames(bench: Bench, seer: Eye, truth: np.ndarray, places: np.ndarray
     bench.say(
         f"Seen in {100 * seen.mean():.1f} % of {seen.size} frames; off by {across.std():.3f} px "
         f"(mean {across.mean(axis=0)[0]:.3f}, {across.mean(axis=0)[1]:.3f}; the model has "
-        f"{float(noise.pixel_std):g}), depths by {along.std():.2f} of the model's deviation "
+        f"{float(noise.pixel_std):g}), depths by {along.std():.2f} deviations of the model "
         f"(mean {along.mean():.2f})"
     )
     bench.note(pixel_std=across.std(), depth_over_model=along.std(), seen=seen.mean())
@@ -236,7 +246,7 @@ def report_frames(bench: Bench, seer: Eye, truth: np.ndarray, places: np.ndarray
 def report_times(
     bench: Bench, seer: Eye, times: Array, places: np.ndarray, frame_seconds: list[float]
 ) -> None:
-    """What a frame and what a fit takes."""
+    """Report the duration of a frame and of a fit."""
     camera, noise = seer.camera, seer.noise
 
     @jax.jit
@@ -244,7 +254,7 @@ def report_times(
         weights = information(camera, noise, places)
         return belief_at(fit_flight(times, places, weights, gravity), times[0], gravity)
 
-    # Places one by one as a camera gives them: on the host, in a buffer of constant size.
+    # As a camera provides positions: one by one on the host, in a buffer of constant size.
     until, gravity = np.asarray(times), np.float32(9.81)
     jax.block_until_ready(fit(until, places, gravity))
     fit_seconds = []
@@ -267,15 +277,15 @@ def report_times(
 
 
 def moments_of(first: float, last: float, rate: float) -> list[float]:
-    """Moments [s] of fits at a rate [Hz]."""
+    """Return the moments [s] of fits at a rate [Hz]."""
     return [first + k / rate for k in range(int(np.floor((last - first) * rate + 1e-6)) + 1)]
 
 
 def pipeline(bench: Bench, num: int, seed: int) -> None:
-    """What arms block that see the balls."""
+    """Report the share of balls blocked by arms that observe the balls."""
     bench.say("", f"{num} throws of short, R1 wide, seed {seed}: the whole pipeline", "")
     bench.say(
-        "| decided | noise | success % (95 %) | on it, % | without a plan, % | motions | "
+        "| decided | noise | success % (95 %) | on the shield, % | without a plan, % | motions | "
         "first fit within 0.1 m, % | sensing + overhead + motion = contact, s (medians) | s |",
         "|" + "---|" * 9,
     )
@@ -295,7 +305,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
         )
         good, on_it = verdict.success & some, pj.block.judge(anywhere, met).success & some
         errors, _ = fit_errors(done.cases, pj.take(done.fits, 0))
-        start = np.median(np.asarray(done.begun)[good])
+        start = np.median(np.asarray(done.start)[good])
         contact = np.median(np.asarray(met.contact_time)[good])
         low, high = (100.0 * end for end in wilson_interval(int(good.sum()), num))
         spent = time.perf_counter() - began
@@ -323,15 +333,15 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
 
 
 def planning(bench: Bench, num: int, seed: int) -> None:
-    """What planning takes for one throw: the first motion, and the next ones."""
+    """Report planning times for one throw: for the first motion, and for the next ones."""
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
     planner, seer = pj.block.planner(), eye(std=0.02)
     known = [see(cases, seer, moment, overhead=OVERHEAD, seed=seed).cases for moment in (0.25, 0.3)]
     first, later = (jax.tree.map(np.asarray, each) for each in known)
-    plans, seconds = timed_with_aims(planner, first)
+    plans, seconds = time_with_aims(planner, first)
     tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)
     moving = pj.take(tasks, np.flatnonzero(pj.solved(plans)))
-    again, more = timed_with_aims(ReplanBlock(), moving)
+    again, more = time_with_aims(ReplanBlock(), moving)
     rows = (("first", seconds, plans), ("next", more, again))
     for name, spent, found in rows:
         some = pj.solved(found)
@@ -347,8 +357,11 @@ def planning(bench: Bench, num: int, seed: int) -> None:
         bench.note(**{f"{name}_planning_p50_ms": quick, f"{name}_planning_p99_ms": slow})
 
 
-def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
-    """As `plan_with_aims`, one entry after another, and the seconds (B,) of its planning alone."""
+def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
+    """Plan entries one by one for the aims in turn until one is solved, as `plan_with_aims` does.
+
+    Returns the plans, and the seconds (B,) spent on planning alone.
+    """
     (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
     aimed = []
     for aim in AIMS:
@@ -369,17 +382,21 @@ def timed_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
 
 
 def main() -> None:
-    """Measure the models, then images, then what comes of it."""
+    """Measure the noise models, then images, the pipeline, and planning."""
     counts = {"num": 2000, "throws": 1000, "timed": 50, "rendered": 12, "seed": 7}
     parser = argument_parser("block_perception", __doc__, **counts)
-    parser.add_argument("--parts", default=",".join(PARTS), help=f"out of {', '.join(PARTS)}")
+    parser.add_argument(
+        "--parts",
+        default=",".join(PARTS),
+        help=f"parts to run, of {', '.join(PARTS)}; default: all",
+    )
     options = parser.parse_args()
-    parts = chosen(parser, "--parts", options.parts, PARTS)
+    parts = parse_names(parser, "--parts", options.parts, PARTS)
     with begin(parser, options) as bench:
         if "errors" in parts:
-            modelled(bench, options.num, options.seed)
+            report_models(bench, options.num, options.seed)
         if "images" in parts:
-            rendered(bench, options.rendered, options.seed)
+            report_images(bench, options.rendered, options.seed)
         if "pipeline" in parts:
             pipeline(bench, options.throws, options.seed)
         if "planning" in parts:

@@ -1,22 +1,22 @@
-"""Every row of the blocks' protocol, and beside each what other methods make of the same throws.
+"""Measure the planner on every row of the block protocol, beside other methods on the same throws.
 
     python -m benchmarks.block_rows [--num 2000] [--seed 7] [--rows "R2,R2 late"] [--starts 192]
         [--lanes N] [--planner online] [--write] [--out DIR]
 
-Planning time is not taken off. Of each row, in percent of all throws:
-* end pose: a pose of the shield that meets the ball, touches nothing and, by the limits of the
-  joints, can be reached in time by a straight motion, whatever it would run into: nearly an upper
-  bound, as far as the poses that are looked at go;
-* straight: the same motion, if it touches nothing;
-* planner: what is measured here;
-* long: of those that none of these blocks, least squares from --starts random starts of 40 steps
-  each, none given up;
-* union: by any of the last three. The share is the planner's of it.
+Planning time is not subtracted. Each row has these columns, in percent of all throws:
+* end pose: there is a pose of the shield that meets the ball, is free of collision and, by the
+  joints' limits, can be reached in time by a straight motion. Collisions on the way are ignored.
+  This is nearly an upper bound, limited by the set of poses that is searched;
+* straight: this straight motion is free of collision too;
+* planner: the planner that is measured;
+* long: throws that neither of the two blocks, by least squares from --starts random starts of 40
+  steps each, none abandoned early;
+* union: blocked by any of the last three. The next column is the planner's share of the union.
 
-All but the end poses are what the referee says. --write keeps the throws with these columns in
-`block_throws.csv` beside this file, a line a throw: of each method a digit for every row of the
-throw's suite, in the order that the head of the file gives, 1 where it blocks the throw. Read these
-as text: they begin with zeros.
+All columns but the end poses are judged by the referee. --write stores the throws with these
+columns in `block_throws.csv` beside this file, one line a throw. Each method's column has one digit
+for every row of the throw's suite, in the order given at the head of the file; 1 means blocked.
+Read these columns as text, because they begin with zeros.
 """
 
 import csv
@@ -30,13 +30,13 @@ from jax import Array
 
 import planner_jax as pj
 from planner_jax.benchmarks.block_starts import follow, random_starts
-from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.end_poses import end_poses, flight_of
 
-# Suite and settings of a row; late: 0.133 s until the arm may start.
+# Suite and settings of each row; in late rows the arm may start after 0.133 s.
 LATE = 0.133
 ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "R1": ("pole", {"regime": "R1"}),
@@ -52,14 +52,14 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "open R2 late": ("open", {"delay": LATE}),
 }
 METHODS = ("end pose", "straight", "planner", "long", "union")
-STEPS = 40  # of least squares, of the long search
+STEPS = 40  # of least squares in the long search
 STRAIGHT = OnlineBlock(searches=(Search(tries=0),))
 
 
 @jax.jit
 @jax.vmap
 def has_end_pose(case: pj.block.BlockCase) -> Array:
-    """Whether there is a pose in time that touches nothing, () bool."""
+    """Return whether some collision-free end pose can be reached in time, () bool."""
     poses = end_poses(case, flight_of(case), STRAIGHT.points, STRAIGHT.pieces)
     gaps = least_clearances(case.arm, case.scene, poses.angles)
     inside = (poses.angles >= case.arm.lower) & (poses.angles <= case.arm.upper)
@@ -68,7 +68,7 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 
 @jax.jit
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
-    """The best plan of each case (B,) from starts with bumps (N, 6) [rad] and ranks (N,)."""
+    """Return the best plan of each case (B,) from starts with bumps (N, 6) [rad] and ranks (N,)."""
     online = OnlineBlock()
 
     def of_case(case: pj.block.BlockCase) -> pj.block.BlockPlan:
@@ -82,8 +82,15 @@ def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.blo
     return jax.vmap(of_case)(cases)
 
 
-def blocked_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
-    """Which of the cases with an index (N,) a long search blocks, by the referee, (N,) bool."""
+def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
+    """Return which cases a long search blocks, by the referee, (N,) bool.
+
+    Args:
+        cases: batch of cases.
+        index: (N,) int, indices of the cases to search.
+        starts: number of random starts for each case.
+        lanes: number of starts that are optimised in one call.
+    """
     bumps, ranks = random_starts(np.random.default_rng(2), starts)
     given = jnp.asarray(bumps, jnp.float32), jnp.asarray(ranks)
     size, found = max(1, lanes // starts), []
@@ -96,24 +103,24 @@ def blocked_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lane
     return np.concatenate([np.zeros(0, bool), *found])
 
 
-def blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
-    """Which cases (B,) a planner blocks, by the referee."""
+def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
+    """Return which cases (B,) a planner blocks, by the referee."""
     plans = pj.plan(planner, cases)
     return np.asarray(pj.block.judge(cases, plans).success & pj.solved(plans))
 
 
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
-    """One row: which throws each method blocks, (N,) bool each."""
+    """Measure one row: which throws each method blocks, (N,) bool each."""
     suite, settings = ROWS[name]
     cases = pj.block.draw(options.num, suite, options.seed, **settings)
     found = {
         "end pose": np.asarray(has_end_pose(cases)),
-        "straight": blocked(cases, STRAIGHT),
-        "planner": blocked(cases, pj.block.planner(options.planner)),
+        "straight": find_blocked(cases, STRAIGHT),
+        "planner": find_blocked(cases, pj.block.planner(options.planner)),
     }
     left = np.flatnonzero(~(found["straight"] | found["planner"]))
     found["long"] = np.zeros(options.num, bool)
-    found["long"][left] = blocked_long(cases, left, options.starts, options.lanes)
+    found["long"][left] = search_long(cases, left, options.starts, options.lanes)
     found["union"] = found["straight"] | found["planner"] | found["long"]
     share = found["planner"].sum() / max(1, found["union"].sum())
     low, high = wilson_interval(int(found["planner"].sum()), options.num)
@@ -124,8 +131,8 @@ def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
     return found
 
 
-def keep(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
-    """Write the throws, and which method blocks each in which rows."""
+def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
+    """Write the throws, and which method blocks each of them in which rows."""
     suites = {ROWS[name][0]: [] for name in results}
     for name in results:
         suites[ROWS[name][0]].append(name)
@@ -148,23 +155,29 @@ def keep(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) ->
 
 
 def main() -> None:
-    """Print the rows asked for."""
+    """Print the requested rows."""
     parser = argument_parser("block_rows", __doc__, num=2000, seed=7, starts=192)
-    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
-    parser.add_argument("--lanes", type=at_least(1), default=192, help="starts tried at once")
-    parser.add_argument("--planner", default="online", help="default: online")
-    parser.add_argument("--write", action="store_true", help="keep throws and columns in a file")
+    parser.add_argument(
+        "--rows", default=",".join(ROWS), help=f"rows to print, of {', '.join(ROWS)}; default: all"
+    )
+    parser.add_argument(
+        "--lanes", type=at_least(1), default=192, help="starts optimised in one call"
+    )
+    parser.add_argument("--planner", default="online", help="planner to measure; default: online")
+    parser.add_argument(
+        "--write", action="store_true", help="write throws and columns to block_throws.csv"
+    )
     options = parser.parse_args()
-    names = chosen(parser, "--rows", options.rows, ROWS)
+    names = parse_names(parser, "--rows", options.rows, ROWS)
     with begin(parser, options) as bench:
         bench.say(
-            f"| row | {' | '.join(METHODS)} | of the union | 95 % |",
+            f"| row | {' | '.join(METHODS)} | planner of union | planner, 95 % |",
             "|---" * (len(METHODS) + 3) + "|",
         )
         results = {name: measure(bench, name, options) for name in names}
         if options.write:
             path = Path(__file__).with_name("block_throws.csv")
-            keep(path, results, options)
+            write_throws(path, results, options)
             bench.say(f"Written: {path.name}.")
 
 

@@ -1,13 +1,14 @@
-"""Learn where the block planner's least squares begin, beside straight motions.
+"""Select the starting points of the block planner's least squares, beside straight motions.
 
     python -m benchmarks.block_starts [--num 60] [--tries 24] [--lanes 512] [--write] [--out DIR]
 
-Throws of the suite `pole`, seed 1001, in regime R2, straight on, with a delay of 0.05 s; no figure
-of the results is of them. Those that no straight motion blocks are tried from random starts: an end
-pose, by its rank in the planner's order, and a bump of the joints to one side. How far the plans
-that are found lie beside straight motions, and the bumps that led to them, are candidates. Each is
-tried at the first ranks on all throws that were blocked; the starts are then chosen one by one,
-each the one that blocks most of what is left. --write makes the shipped file anew. That was learned
+Throws are drawn from the suite `pole`, seed 1001, in regime R2, met straight on, with a delay of
+0.05 s. No reported result uses these throws. Throws that no straight motion blocks are tried from
+random starts. A start is an end pose, by its rank in the planner's order, and a bump that bends the
+straight motion of the joints to one side. Candidates are the bumps that led to plans, and the
+deviations of the plans from straight motions. Each candidate is tried at the first ranks on all
+throws that some start solved. The starts are then selected greedily: the next start is the one that
+blocks most of the remaining throws. --write replaces the shipped file. The shipped file was learned
 with --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
 """
 
@@ -34,27 +35,27 @@ from planner_jax.task.block.motion import angles_at, bump_steps
 from planner_jax.task.block.plan import BlockPlan
 
 SEED, DELAY = 1001, 0.05
-STRAIGHT = 32  # straight motions that are looked at
-SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad], of random bumps
-RANKS, LATER_RANKS = 10, 24  # of end poses: of candidates, of random starts
-KINDS = 48  # candidates of either kind
-MOST = 16  # starts that are kept
+STRAIGHT = 32  # number of straight motions that are tried
+SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad], standard deviation of random bumps
+RANKS, LATER_RANKS = 10, 24  # numbers of end poses: for candidates, for random starts
+KINDS = 48  # number of candidates of either kind
+MOST = 16  # maximum number of selected starts
 SHARES = tuple(np.arange(1, 33) / 32)
 
 
 def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Bumps (num, 6) [rad] of all sizes, and then as many ranks (num,) of end poses."""
+    """Return random bumps (num, 6) [rad] of all sizes, and random ranks (num,) of end poses."""
     bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
     return bumps, rng.integers(0, LATER_RANKS, num)
 
 
 @struct.dataclass
 class Followed:
-    """Where least squares came to from one start."""
+    """Result of least squares from one start."""
 
     plan: BlockPlan
     point: Array  # (n,), the unknowns
-    profile: Array  # () int, of the straight motion that was bent, as `all_profiles` has them
+    profile: Array  # () int, of the bent straight motion, an index of `all_profiles`
 
 
 def follow(
@@ -64,14 +65,14 @@ def follow(
     rank: Array,
     steps: int | Array,
 ) -> Followed:
-    """Least squares of one case from a bent straight motion, never given up.
+    """Run least squares for one case from a bent straight motion, without abandoning it early.
 
     Args:
-        planner: whose unknowns and residuals these are.
+        planner: defines the unknowns and residuals.
         case: one case.
         bump: (6,) [rad], of the joints.
         rank: () int < `LATER_RANKS`, of the end pose, in the planner's order.
-        steps: of least squares at most; a number, or () int.
+        steps: maximum number of least-squares steps; a number, or () int.
     """
     flight = flight_of(case)
     poses = end_poses(case, flight, planner.points, planner.pieces)
@@ -85,15 +86,15 @@ def follow(
 
 
 @jax.jit
-def tried(
+def try_starts(
     planner: online.OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
 ) -> tuple[Array, Array]:
-    """Least squares from starts (B,) of cases (B,).
+    """Run least squares from starts (B,) of cases (B,).
 
     Returns:
-        is_good: (B,) bool.
-        found: (B, 6) [rad], how far the motion that was found lies beside the straight one to its
-            own end: the height of a bump that fits it best.
+        is_good: (B,) bool, whether the plan is solved.
+        found: (B, 6) [rad], height of the bump that best fits the deviation of the resulting motion
+            from the straight motion to the same end.
     """
 
     def one(case: pj.block.BlockCase, bump: Array, rank: Array) -> tuple[Array, Array]:
@@ -111,10 +112,10 @@ def tried(
     return jax.vmap(one)(cases, bumps, ranks)
 
 
-def tried_in_parts(
+def try_in_parts(
     cases: Any, index: np.ndarray, bumps: np.ndarray, ranks: np.ndarray, steps: int, lanes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The same of starts (N,) of the cases with an index (N,), so many at once."""
+    """Run `try_starts` for starts (N,) of the cases with indices (N,), `lanes` at a time."""
 
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for first in range(0, len(index), lanes):
@@ -122,15 +123,18 @@ def tried_in_parts(
             full = np.resize(here, lanes)
             given = (jnp.asarray(bumps[full], jnp.float32), jnp.asarray(ranks[full]))
             some = pj.take(cases, index[full])
-            good, beside = tried(online.OnlineBlock(), some, *given, jnp.asarray(steps))
+            good, beside = try_starts(online.OnlineBlock(), some, *given, jnp.asarray(steps))
             yield np.asarray(good)[: len(here)], np.asarray(beside)[: len(here)]
 
     good, beside = zip(*parts(), strict=True)
     return np.concatenate(good), np.concatenate(beside)
 
 
-def chosen_starts(solves: np.ndarray) -> list[int]:
-    """Columns of a table (throws, starts) bool: each the one that solves most of what is left."""
+def select_starts(solves: np.ndarray) -> list[int]:
+    """Select columns of a table (throws, starts) bool greedily.
+
+    Each selected column solves most of the throws that the columns before it do not solve.
+    """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:
         gain = solves[left].sum(axis=0)
@@ -143,18 +147,18 @@ def chosen_starts(solves: np.ndarray) -> list[int]:
 
 
 def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]]:
-    """The starts, in the order in which they are tried."""
+    """Return the selected starts, in the order in which the planner tries them."""
     rng = np.random.default_rng(0)
     cases = pj.block.draw(num, "pole", SEED, regime="R2", delay=DELAY)
     places, none = np.repeat(np.arange(num), STRAIGHT), np.zeros((num * STRAIGHT, 6))
     ranks = np.tile(np.arange(STRAIGHT), num)
-    straight = tried_in_parts(cases, places, none, ranks, -1, lanes)[0].reshape(num, -1).any(axis=1)
+    straight = try_in_parts(cases, places, none, ranks, -1, lanes)[0].reshape(num, -1).any(axis=1)
     hard = np.flatnonzero(~straight)
     bench.say(f"{100 * straight.mean():.1f} % of {num} throws by straight motions")
 
     bumps, ranks = random_starts(rng, len(hard) * tries)
     places = np.repeat(hard, tries)
-    good, beside = tried_in_parts(cases, places, bumps, ranks, 20, lanes)
+    good, beside = try_in_parts(cases, places, bumps, ranks, 20, lanes)
     solvable = hard[good.reshape(-1, tries).any(axis=1)]
     bench.say(
         f"{len(solvable)} of the {len(hard)} others from one of {tries} random starts; one start "
@@ -164,21 +168,21 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # As many of each throw, so that easy ones do not outvote the others.
+    # At most 8 starts of each throw, so that easy throws do not outvote the others.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    # Drawn here, because SciPy gives up the argument `seed`, and its `rng` draws others.
+    # Drawn here, because SciPy deprecates `seed` in `kmeans2`, and its `rng` draws other numbers.
     first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
     middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])
     throw, kind, rank = np.meshgrid(
         solvable, np.arange(len(candidates)), np.arange(RANKS), indexing="ij"
     )
-    solves, _ = tried_in_parts(
+    solves, _ = try_in_parts(
         cases, throw.ravel(), candidates[kind.ravel()], rank.ravel(), 16, lanes
     )
     solves = solves.reshape(len(solvable), -1)
-    chosen = chosen_starts(solves)
+    chosen = select_starts(solves)
     for count in range(1, len(chosen) + 1):
         share = solves[:, chosen[:count]].any(axis=1).mean()
         bench.say(f"{count} starts: {100 * share:.1f} % of these")
@@ -190,10 +194,12 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
 
 
 def main() -> None:
-    """Learn the starts, and ship them if asked."""
+    """Learn the starts, and write the shipped file if requested."""
     parser = argument_parser("block_starts", __doc__, num=60, tries=24)
-    parser.add_argument("--lanes", type=at_least(1), default=512, help="starts tried at once")
-    parser.add_argument("--write", action="store_true", help="make the shipped file anew")
+    parser.add_argument(
+        "--lanes", type=at_least(1), default=512, help="starts optimised in one call"
+    )
+    parser.add_argument("--write", action="store_true", help="replace the shipped file")
     options = parser.parse_args()
     with begin(parser, options) as bench:
         starts = learn(bench, options.num, options.tries, options.lanes)

@@ -1,16 +1,17 @@
-"""Table III of [Yu2023catch] by decision: what order and times are worth, and what they cost.
+"""Compare ways to choose catching order and times, as in Table III of [Yu2023catch].
 
     python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
         [--policy FILE] [--timed 200] [--out DIR]
 
-The planner is `exact`, and every plan is refereed. Decisions: `best` plans the six most promising
-of all orders, `greedy` one, `random` any; `policy` is the shipped one or that of --policy, by its
-mean, and by six proposals of which the earliest stays. Of suites whose targets may be left,
-"caught" is what counts: targets a case, of successes. Last catches are means of what the referee
-accepts. The optimal time ratio (OTR) is that of the decision's own times; "at 25" has the planner
-stop after 25 iterations of one start. A decision is timed alone, compiled before, for one case at a
-time: from the case's numbers in one NumPy vector to order and times in another. No policy was
-trained on the seed, which is not that of `draw`'s default either.
+The planner is `exact`, and every plan is judged by the referee. Decisions: `best` plans the six
+most promising of all orders, `greedy` plans one order, and `random` a random one. `policy` is the
+shipped policy or the one in --policy: its mean action, or six proposals, from which the plan with
+the earliest last catch is used. In suites with optional targets, "caught" is the mean number of
+targets caught by successful plans. Last catches are means over accepted plans. The optimal time
+ratio (OTR) is computed for the decision's own times. "At 25" is the success rate if the planner
+stops after 25 iterations of one start. A decision is timed for one case at a time, compiled before,
+from one NumPy vector with the case's numbers to another with order and times. No policy was trained
+with this seed, and `draw` does not use it by default.
 """
 
 import argparse
@@ -22,7 +23,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.core.errors import ArgumentError
 from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.planning.decided import DecidedPlanner
@@ -37,7 +38,7 @@ SHORT = ExactCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=25)),))
 
 
 def decision_time(decision: Any, cases: Any, num: int) -> float:
-    """Median seconds of a decision about one case, from one vector to one."""
+    """Return the median time [s] to decide on one case, from a NumPy vector to another."""
     cpu = jax.local_devices(backend="cpu")[0]
     lanes = [pj.take(cases, k % cases.batch_shape[0]) for k in range(num)]
     with jax.default_device(cpu):
@@ -54,14 +55,14 @@ def decision_time(decision: Any, cases: Any, num: int) -> float:
 
 
 def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) -> dict[str, Any]:
-    """The figures of one decision on one suite, counted."""
+    """Return the figures of one decision on one suite, and count its successes."""
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
     verdict = pj.catch.judge(cases, plans)
     success = verdict.success
     short = pj.plan(DecidedPlanner(SHORT, decision), cases)
     bench.count(success)
-    # Of cases that may leave targets, 25 iterations count where as many are caught.
+    # With optional targets, 25 iterations count only if they catch no fewer targets.
     at_25 = pj.catch.judge(cases, short)
     at_25 = at_25.success & (at_25.num_caught >= verdict.num_caught)
     return {
@@ -77,7 +78,7 @@ def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) ->
 
 
 def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> None:
-    """All rows."""
+    """Print all rows."""
     decisions = {
         "best": pj.catch.Best(),
         "greedy": pj.catch.Greedy(),
@@ -87,7 +88,8 @@ def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> Non
     }
     bench.say(
         f"{options.num} cases each, seed {options.seed}, {jax.devices()[0]}",
-        "| suite | decision | success | caught | last catch | of best's | OTR | at 25 | decision |",
+        "| suite | decision | success | caught | last catch | ratio to best | OTR | at 25 "
+        "| decision |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     for suite in suites:
@@ -105,14 +107,17 @@ def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> Non
 
 
 def main() -> None:
-    """Print the table."""
+    """Parse the arguments and print the table."""
     parser = argument_parser("catch_decisions", __doc__, num=1000, seed=777, timed=200)
-    parser.add_argument("--suites", default=",".join(TRAINED_ON), help="comma-separated")
+    parser.add_argument("--suites", default=",".join(TRAINED_ON), help="suites, comma-separated")
     parser.add_argument(
-        "--policy", metavar="FILE", default="catch", help="or one that is shipped (default: catch)"
+        "--policy",
+        metavar="FILE",
+        default="catch",
+        help="policy file, or name of a shipped policy (default: catch)",
     )
     options = parser.parse_args()
-    suites = chosen(parser, "--suites", options.suites, SUITES)
+    suites = parse_names(parser, "--suites", options.suites, SUITES)
     with begin(parser, options) as bench:
         try:
             measure(bench, suites, options)

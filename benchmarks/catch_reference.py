@@ -1,16 +1,17 @@
-"""Both catch planners on the 240 throws whose optimum a C++ program has published.
+"""Measure both catch planners on the 240 throws with published optima of a C++ program.
 
     python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
-The published C++ program is the same problem on the reference MINCO and L-BFGS headers: one thread,
-double, 2.96 ms a plan and 320 plans/s on a core on the easy set (220 iterations), 4.40 ms on
-the hard one, 98 % of which it solves; better settings of its search make 582 and 453 plans/s.
-Printed here: the cost of the guess against its J0 (float64), the cost gap of `catch` to its
-optimum (float64 and float32), `exact`'s refereed success and mean catching time (float32), and the
-speed of both, one by one and in a batch. Beside them stands a C++ program of our own
-(`benchmarks.catch_peer`), quicker than the published one. The summary of the run folder is of
-`exact`.
-Run it on an idle machine; `taskset -c 0` holds it to one core.
+The published C++ program solves the same problem with the reference MINCO and L-BFGS headers, with
+one thread, in double precision. On the easy set it takes 2.96 ms a plan and makes 320 plans/s on a
+core (220 iterations). On the hard set it takes 4.40 ms and solves 98 %. With better settings of its
+search it makes 582 and 453 plans/s.
+
+Printed are the cost of the initial guess against the published J0 (float64), the cost gap of
+`catch` to the published optimum (float64 and float32), `exact`'s refereed success and mean catching
+time (float32), and the speed of both, one by one and in a batch. The project's own C++ program
+(`benchmarks.catch_peer`), faster than the published one, stands beside them. The summary of the run
+folder is about `exact`. Run this benchmark on an idle machine; `taskset -c 0` binds it to one core.
 """
 
 import csv
@@ -37,7 +38,7 @@ _QUICK, _QUICK_COARSE = 45, 60  # iterations of the quick `catch`
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
-    """The cases of a file and its published columns."""
+    """Return the cases of a file and its published columns."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -60,13 +61,13 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
 
 
 def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
-    """The published cost of a planner's first guess."""
+    """Return the published cost function at a planner's initial guess."""
     context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
 
 
 def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
-    """Percentiles of one plan at a time."""
+    """Return percentiles of the planning time, one plan at a time."""
     host = jax.tree.map(np.asarray, cases)
     num = host.batch_shape[0]
     lanes = [pj.take(host, k) for k in range(num)]
@@ -82,7 +83,7 @@ def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
 
 
 def throughput(planner, cases: pj.catch.CatchCase) -> str:
-    """Best of five warm batches, by the clock and by the time of all cores."""
+    """Return the best rates of five warm batches, by wall-clock time and by CPU time."""
     many = jax.tree.map(lambda leaf: np.tile(leaf, (BATCH_COPIES,) + (1,) * (leaf.ndim - 1)),
                         jax.tree.map(np.asarray, cases))  # fmt: skip
     pj.plan(planner, many)
@@ -96,7 +97,7 @@ def throughput(planner, cases: pj.catch.CatchCase) -> str:
 
 
 def report_paper_planner(bench: Bench, data: Path) -> None:
-    """Cost of the guess and of the optimum in float64."""
+    """Report the cost of the guess and of the optimum in float64."""
     with jax.enable_x64(True):
         for name in SETS:
             cases, known = read_set(data / f"catch_{name}.csv", jnp.float64)
@@ -104,7 +105,7 @@ def report_paper_planner(bench: Bench, data: Path) -> None:
                 chosen = PaperCatch(num_pieces=pieces, scale=(1.0,) * (3 * (pieces - 1) + 13))
                 cost = jax.jit(jax.vmap(lambda s, p=chosen: guess_cost(p, s)))(cases)
                 error = np.abs(np.asarray(cost) / known[f"J0_M{pieces}"] - 1.0).max()
-                bench.say(f"{name}: cost of the guess, M = {pieces}: off by {error:.1e} at most")
+                bench.say(f"{name}: cost of the guess, M = {pieces}: largest error {error:.1e}")
             plans = pj.plan(PaperCatch(), cases)
             bench.say(f"{name}: catch, float64: {_gap(plans, known)}")
 
@@ -118,10 +119,10 @@ def _gap(plans, known: dict[str, np.ndarray]) -> str:
 
 
 def quick_paper_catch() -> PaperCatch:
-    """`PaperCatch` with as many iterations as a gap of 1e-3 mostly takes on the hard set.
+    """Return `PaperCatch` with enough iterations for a gap of 1e-3 on most of the hard set.
 
-    It takes the published penalties from the first guess on, without softer stages: at first with
-    a quarter of the samples, then with all of them.
+    It uses the published penalties from the first iteration, without softer stages: first with a
+    quarter of the samples, then with all samples.
     """
     chosen = PaperCatch()
     (full,) = chosen.rounds
@@ -132,7 +133,7 @@ def quick_paper_catch() -> PaperCatch:
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
-    """Both planners on one set, in float32."""
+    """Report both planners on one set, in float32."""
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
     quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
     bench.say(
@@ -153,7 +154,7 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
 
 
 def report_peer(bench: Bench, data: Path) -> None:
-    """The C++ program of `catch_peer` on both sets, with the quickest settings of each search."""
+    """Report the C++ program of `catch_peer` on both sets, with its fastest settings."""
     with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
         program = peer.build(Path(folder))
         if program is None:
@@ -166,9 +167,9 @@ def report_peer(bench: Bench, data: Path) -> None:
 
 
 def main() -> None:
-    """Print everything."""
+    """Print all results."""
     parser = argument_parser("catch_reference", __doc__, repeats=5)
-    parser.add_argument("--data", type=Path, default=Path("tests/data"))
+    parser.add_argument("--data", type=Path, default=Path("tests/data"), help="folder of the sets")
     options = parser.parse_args()
     with begin(parser, options) as bench:
         bench.say(

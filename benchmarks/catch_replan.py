@@ -1,21 +1,21 @@
-"""Catches re-planned while the ball flies: its path estimated from noisy sight, look by look.
+"""Measure catches that are re-planned while the ball flies, from noisy observations of the ball.
 
     python -m benchmarks.catch_replan [--num 1000] [--rate 100] [--noise 0.005] [--out DIR]
     taskset -c 1 python -m benchmarks.catch_replan --alone
 
-The balls are those of the suite `throws`. A camera sees each one at the rate, with noise on its
-position, for a tenth of a second before planning begins and until it is caught. At each look
-the Kalman filter says where the ball will be at the next look, and from there the catch is
-planned: what is planned within one period takes effect at its end, and what takes longer is a
-missed deadline, and dropped. The filter knows the drag. A plan that breaks a limit is dropped
-too; the last 0.05 s are flown as they were planned.
+Balls are drawn from the suite `throws`. A camera observes each ball at the rate, with noise on its
+position, from a tenth of a second before planning starts until the catch. At each observation the
+Kalman filter predicts the ball one period ahead, and the catch is planned from there. A plan that
+is ready within one period takes effect at the period's end. A plan that takes longer counts as a
+missed deadline and is dropped. The filter knows the drag. A plan that violates a limit is dropped
+too. The last 0.05 s are not re-planned.
 
-What was flown, from the first plan to the catch, is refereed against the ball's true path, by
-the shared protocol of [Yu2023catch] (5 %, net test "ball"). Beside it stands what the first plan
-alone would have caught. With --alone re-plans are only timed, beside plans from scratch of the
-same throws. The summary of the run folder is of what was flown, or of the re-plans alone; its cost
-gap is that of the first re-plans. Everything is computed in the thread that calls, as in the live
-loop: to hand a program of 0.1 ms over to a thread of JAX takes half as long again. Run it on an
+The flown trajectory, from the first plan to the catch, is judged against the ball's true path by
+the protocol of [Yu2023catch] (5 %, net test "ball"). The result of the first plan alone stands
+beside it. With --alone, re-plans are only timed, beside plans from scratch for the same throws. The
+summary of the run folder is about the flown trajectories, or about the timed re-plans with --alone;
+its cost gap is about the first re-plans. Everything is computed in the calling thread, as in the
+live loop, because passing a program of 0.1 ms to a JAX thread adds half of that time. Run it on an
 idle machine; the load average is printed.
 """
 
@@ -41,13 +41,13 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-SEEN = 0.1  # [s], how long the ball has been in sight when planning begins
-WARM_UP = 5  # throws that are not counted
+SEEN = 0.1  # [s], time of observation before planning starts
+WARM_UP = 5  # throws flown before the measurement
 SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
-    """The Kalman filter of one ball; its belief stays one vector between the calls."""
+    """Kalman filter of one ball, whose belief is stored as one vector between calls."""
 
     def __init__(self, period: float, noise: float, drag: Any, gravity: Any) -> None:
         model = EkfModel(
@@ -62,7 +62,7 @@ class Estimator:
         first, unravel = ravel_pytree(unknown)
 
         def look(vector: jax.Array) -> jax.Array:
-            """Belief and observation to belief, and the ball one period ahead, as vectors."""
+            """Update the belief with an observation and predict one period ahead, as vectors."""
             state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
             return ravel_pytree(ahead)[0]
@@ -71,12 +71,12 @@ class Estimator:
         self._first = self._belief = np.asarray(first)
 
     def begin(self, observation: np.ndarray) -> None:
-        """Forget, and expect the ball where it is first seen."""
+        """Reset the filter, with the first observation as the expected position."""
         self._belief = self._first.copy()
         self._belief[:3] = observation
 
     def see(self, observation: np.ndarray) -> BallState:
-        """The ball one period after this observation (3,), leaves (1, 3)."""
+        """Return the predicted ball one period after this observation (3,), leaves (1, 3)."""
         belief: Any = np.asarray(self._look(np.concatenate([self._belief, observation])))
         self._belief = belief
         return BallState(pos=belief[None, :3], vel=belief[None, 3:6])
@@ -84,41 +84,41 @@ class Estimator:
 
 @dataclasses.dataclass
 class Times:
-    """Seconds of every call."""
+    """Durations [s] of all calls, and counts of failures."""
 
     estimate: list[float] = dataclasses.field(default_factory=list)
     first: list[float] = dataclasses.field(default_factory=list)
     again: list[float] = dataclasses.field(default_factory=list)
-    missed: int = 0  # deadlines
-    broken: int = 0  # re-plans that exceed a limit
-    # What the first of them were asked for, and what came back.
+    missed: int = 0  # number of missed deadlines
+    broken: int = 0  # number of re-plans that violate a limit
+    # The first re-planning problems, with their plans.
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
-        """Remember a re-plan if it is one of the first."""
+        """Store a re-plan if it is one of the first."""
         if len(self.replans) < COMPARED:
             self.replans.append((left, found))
 
     def gaps(self) -> np.ndarray | None:
-        """By how much the first re-plans cost more than a long search from the same guess."""
+        """Return the excess costs of the first re-plans over a long search from the same guess."""
         if not self.replans:
             return None
-        return cost_gaps(AGAIN, *stacked(self.replans))
+        return cost_gaps(AGAIN, *stack(self.replans))
 
 
-def stacked(trees: list) -> Any:
-    """A batch of what is alone."""
+def stack(trees: list) -> Any:
+    """Stack pytrees into a batch."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def balls_of(case: CatchCase) -> pj.BallPath:
-    """The targets of a case of `throws`."""
+    """Return the targets of a case of `throws`."""
     assert isinstance(case.targets, pj.BallPath)
     return case.targets
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
-    """When to catch, and the plan."""
+    """Decide when to catch, and plan from scratch."""
     case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
 
@@ -127,7 +127,7 @@ _propose = jax.jit(pj.catch.Greedy().propose)
 
 
 def warm_up(case: CatchCase) -> None:
-    """Compile every round: a quadrotor that must not move leaves none of them out."""
+    """Compile every round: a quadrotor that must not move needs all of them."""
     stuck = dataclasses.replace(
         case, limits=dataclasses.replace(case.limits, speed=np.float32(1e-3))
     )
@@ -138,14 +138,17 @@ def warm_up(case: CatchCase) -> None:
 def fly(
     case: CatchCase, looks: np.ndarray, estimator: Estimator, period: float, out: Times
 ) -> tuple[CatchPlan, CatchPlan]:
-    """One throw from its first sight to the catch: what was flown, and the first plan.
+    """Fly one throw from its first observation to the catch.
 
     Args:
-        case: begins one period after the look at which planning begins.
-        looks: (K, 3) [m], one a period.
-        estimator: of the ball.
+        case: starts one period after the observation at which planning starts.
+        looks: (K, 3) [m], observations, one a period.
+        estimator: filter of the ball.
         period: [s].
-        out: gets the times.
+        out: receives the times.
+
+    Returns:
+        The flown trajectory as a plan, and the first plan.
     """
     before = round(SEEN / period)
     estimator.begin(looks[0])
@@ -175,35 +178,35 @@ def fly(
         out.missed += late
         out.broken += broken
         if not (late or broken):
-            flown.append(begun(current.trajectory, elapsed))
+            flown.append(cut_trajectory(current.trajectory, elapsed))
             task, current, elapsed = left.case, found, 0.0
-    path = joined([*flown, current.trajectory])
+    path = join_trajectories([*flown, current.trajectory])
     times = path.durations.sum(keepdims=True)
     return dataclasses.replace(current, trajectory=path, times=times), first
 
 
-def begun(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolynomial:
-    """The first `elapsed` seconds of a trajectory."""
+def cut_trajectory(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolynomial:
+    """Return the first `elapsed` seconds of a trajectory."""
     ends = path.durations.cumsum()
     durations = path.durations - np.maximum(ends - elapsed, 0.0)
     flown = durations > 0.0
     return PiecewisePolynomial(path.coeffs[flown], durations[flown])
 
 
-def joined(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """One trajectory after the other."""
+def join_trajectories(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
+    """Concatenate trajectories in time."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *paths)
 
 
-def judged(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
-    """What the referee says by the shared protocol, in the order of the plans."""
+def judge(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
+    """Return the referee's verdicts by the protocol, in the order of the plans."""
     lengths = np.array([flown.trajectory.durations.size for flown in plans])
     found: dict[str, np.ndarray] = {}
-    for length in np.unique(lengths):  # he judges plans of as many pieces together
+    for length in np.unique(lengths):  # plans of equal size form a batch
         lanes = np.flatnonzero(lengths == length)
         verdict = pj.catch.judge(
             pj.take(cases, lanes),
-            stacked([plans[k] for k in lanes]),
+            stack([plans[k] for k in lanes]),
             tolerance=0.05,
             net_test="ball",
         )
@@ -216,7 +219,7 @@ def judged(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
 
 
 def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
-    """One line of percentiles."""
+    """Print one line of percentiles."""
     p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
     bench.row(name=name, num=len(seconds), p50_ms=p50, p90_ms=p90, p99_ms=p99)
     bench.say(
@@ -226,7 +229,7 @@ def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
 
 
 def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> None:
-    """One line of success."""
+    """Print one line of success."""
     p50, p90, p99 = 100.0 * np.percentile(verdict["net_distance"], [50, 90, 99])
     limits = np.unique([limit for limit in verdict["failed_limit"] if limit], return_counts=True)
     failures = ", ".join(f"{limit} {count}" for limit, count in zip(*limits, strict=True))
@@ -238,7 +241,10 @@ def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> N
 
 
 def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray]:
-    """True cases from one period after the planning on, and looks (num, K, 3) [m]."""
+    """Return the true cases and noisy observations (num, K, 3) [m] of their balls.
+
+    The cases start one period after planning starts.
+    """
     suite = pj.catch.draw(num)
     times = jnp.arange(-round(SEEN / period), int(suite.horizon.max() / period)) * period
     paths = jax.tree.map(lambda leaf: leaf[:, 0], suite.targets)
@@ -256,8 +262,8 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
     return jax.tree.map(np.asarray, begins), looks.astype(np.float32)
 
 
-def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
-    """Time re-plans one after the other, each once, on paths that have moved a little."""
+def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
+    """Measure re-plans one after the other, once each, for balls that moved slightly."""
     random = np.random.default_rng(0)
     tasks = []
     for case in lanes:
@@ -285,20 +291,27 @@ def alone(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> 
         scratch.append(time.perf_counter() - ended)
         seconds.append(ended - began)
         replans.append((left, found))
-    report_times(bench, "from scratch, its order and time given", scratch)
+    report_times(bench, "from scratch, with order and time fixed", scratch)
     report_times(bench, "re-plan alone", seconds)
-    cases, plans = stacked(replans)
+    cases, plans = stack(replans)
     bench.say(f"solved {100.0 * pj.solved(plans).mean():.2f} %")
-    success = judged(cases.case, [found for _, found in replans])["success"]
+    success = judge(cases.case, [found for _, found in replans])["success"]
     bench.count(success, cost_gaps(AGAIN, cases, plans))
 
 
 def main() -> None:
     """Fly the throws, or time re-plans alone."""
     parser = argument_parser("catch_replan", __doc__, num=1000)
-    parser.add_argument("--rate", type=float, default=100.0, help="looks and plans a second [Hz]")
-    parser.add_argument("--noise", type=float, default=0.005, help="of a look, a coordinate [m]")
-    parser.add_argument("--alone", action="store_true", help="only time re-plans")
+    parser.add_argument(
+        "--rate", type=float, default=100.0, help="observations and plans per second [Hz]"
+    )
+    parser.add_argument(
+        "--noise",
+        type=float,
+        default=0.005,
+        help="standard deviation of each observed coordinate [m]",
+    )
+    parser.add_argument("--alone", action="store_true", help="only time re-plans, without flights")
     options = parser.parse_args()
     period = 1.0 / options.rate
     compute_in_place()
@@ -313,13 +326,13 @@ def main() -> None:
             f"{time.perf_counter() - began:.1f} s"
         )
         if options.alone:
-            alone(bench, lanes, period, options.noise)
+            time_replans(bench, lanes, period, options.noise)
         else:
             fly_all(bench, cases, looks, period, options.noise)
 
 
 def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, noise: float) -> None:
-    """Fly every throw, warm, and report."""
+    """Fly every throw, with everything compiled, and report."""
     lanes = [pj.take(cases, k) for k in range(len(looks))]
     path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
@@ -327,7 +340,7 @@ def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, no
         fly(lane, seen, estimator, period, Times())
     times = Times()
     gc.collect()
-    gc.disable()  # what a loop with deadlines does: a collection takes milliseconds
+    gc.disable()  # as in any loop with deadlines: a garbage collection takes milliseconds
     flights = [
         fly(lane, seen, estimator, period, times) for lane, seen in zip(lanes, looks, strict=True)
     ]
@@ -338,11 +351,11 @@ def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, no
     report_times(bench, "estimate and re-plan", np.add(times.estimate, times.again).tolist())
     bench.say(
         f"deadlines of {1e3 * period:.1f} ms missed: {times.missed} of {len(times.again)}; "
-        f"re-plans that broke a limit: {times.broken}; load average {os.getloadavg()[0]:.1f}"
+        f"re-plans that violate a limit: {times.broken}; load average {os.getloadavg()[0]:.1f}"
     )
-    verdict = judged(cases, flown)
+    verdict = judge(cases, flown)
     report_catches(bench, "re-planned", verdict)
-    report_catches(bench, "first plan alone", judged(cases, first))
+    report_catches(bench, "first plan alone", judge(cases, first))
     bench.count(verdict["success"], times.gaps())
     bench.note(missed=times.missed, replans=len(times.again), broken=times.broken)
 

@@ -1,11 +1,11 @@
-"""Refereed success of the catch planners on every suite, beside the paper's rates.
+"""Measure the catch planners' refereed success on every suite, beside the paper's rates.
 
     python -m benchmarks.catch_rows [--suites throws,hard] [--planners exact,catch,mpp]
         [--decide best] [--num 1000] [--seed 0] [--out DIR]
 
-Every plan is judged with a tolerance of 1e-3. The paper's `catch` has soft penalties, so it is
-judged a second time by the protocol of the published C++ program: limits to 5 %, the ball
-within the net's radius of its centre.
+Every plan is judged with a tolerance of 1e-3. The paper's `catch` has soft penalties. Every plan is
+therefore judged a second time by the protocol of the published C++ program: limits to 5 %, and the
+ball within the net's radius of its centre.
 """
 
 import argparse
@@ -17,13 +17,13 @@ import jax
 import planner_jax as pj
 from planner_jax.baselines.catch.published import RATES, PublishedRates
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """One suite's figures with one planner, counted."""
+    """Return the figures of one planner on one suite, and count its successes."""
     num, seed = options.num, options.seed
     planner, cases = pj.catch.planner(name, decide=options.decide), pj.catch.draw(num, suite, seed)
     began = time.perf_counter()
@@ -57,14 +57,20 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
 
 
 def main() -> None:
-    """Run the rows asked for."""
+    """Print the requested rows."""
     parser = argument_parser("catch_rows", __doc__, num=1000, seed=0)
-    parser.add_argument("--suites", default=",".join(SUITES), help="comma-separated; default all")
-    parser.add_argument("--planners", default="exact", help=f"of {', '.join(TASK.planners)}")
-    parser.add_argument("--decide", choices=DECISIONS, default="best")
+    parser.add_argument(
+        "--suites", default=",".join(SUITES), help="suites, comma-separated; default: all"
+    )
+    parser.add_argument(
+        "--planners",
+        default="exact",
+        help=f"planners, of {', '.join(TASK.planners)}; default: exact",
+    )
+    parser.add_argument("--decide", choices=DECISIONS, default="best", help="default: best")
     options = parser.parse_args()
-    suites = chosen(parser, "--suites", options.suites, SUITES)
-    names = chosen(parser, "--planners", options.planners, TASK.planners)
+    suites = parse_names(parser, "--suites", options.suites, SUITES)
+    names = parse_names(parser, "--planners", options.planners, TASK.planners)
     with begin(parser, options) as bench:
         bench.say(
             f"{options.num} cases each, seed {options.seed}, decide {options.decide}, "

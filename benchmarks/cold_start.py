@@ -1,8 +1,9 @@
-"""Seconds from the start of a process to its first plans, with empty and with warm caches.
+"""Measure the time from process start to the first plans, with empty and with warm caches.
 
     python -m benchmarks.cold_start [--num 1024] [--out DIR]
 
-Two fresh processes plan a batch of hits each, the second with what the first compiled.
+Two fresh processes plan one batch of hits each. The second process uses the programs that the first
+process compiled.
 """
 
 import os
@@ -25,7 +26,7 @@ plans.save({path!r})
 
 
 def first_plans(num: int, path: str, caches: str) -> tuple[float, str]:
-    """Seconds that a fresh process takes, and what it says; its plans are in a file."""
+    """Plan in a fresh process, save the plans to `path`, and return duration [s] and output."""
     began = time.perf_counter()
     found = subprocess.run(
         [sys.executable, "-c", FIRST_PLANS.format(num=num, path=path)],
@@ -51,7 +52,7 @@ def main() -> None:
                 f"load average {os.getloadavg()[0]:.1f}"
             )
             rows.append((caches, seconds, pj.hit.HitPlan.load(path)))
-    # A device may have room for one process only, so that this one uses none until here.
+    # A device may have memory for one process only, so this process uses no device until here.
     with bench:
         planner, cases = pj.hit.planner("exact"), pj.hit.draw(options.num)
         for caches, seconds, plans in rows:

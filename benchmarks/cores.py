@@ -1,12 +1,12 @@
-"""How much quicker a batch is planned on every core than on one, on this machine, now.
+"""Measure the speed-up of planning a batch on all cores over one core, on this machine.
 
     python -m benchmarks.cores [--num 36000] [--turns 8] [--out DIR]
 
-Three kinds of processes stay alive and take turns, so that a slow minute of the machine meets
-all of them: one process on one core; one on every core; and a process for each core, bound to
-it, all at the same time. The last says how much the cores of this machine give at most: they
-may share caches, memory or a clock. Printed are plans a second, warm, and the ratio to the one
-core of the same turn. Linux, because processes are bound to cores.
+Three groups of processes stay alive and take turns, so that a slow minute of the machine affects
+all of them: one process on one core; one process on all cores; and one process on each core, all at
+the same time. The last group shows the greatest speed-up that this machine allows, because cores
+may share caches, memory or a clock. Printed are warm plans per second, and their ratio to the one
+core in the same turn. Linux only, because processes are bound to cores.
 """
 
 import functools
@@ -22,28 +22,28 @@ import numpy as np
 
 import planner_jax as pj
 
-# The processes import this module: what starts or measures nothing there is imported in `main`.
+# The processes import this module, so `main` imports what only the main process uses.
 
 
-def _on(cores: Sequence[int]) -> ProcessPoolExecutor:
-    """A process on some cores, to which it is bound before JAX starts its threads."""
+def _start_process(cores: Sequence[int]) -> ProcessPoolExecutor:
+    """Create a process that is bound to some cores before JAX starts its threads."""
     spawn = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, spawn, initializer=os.sched_setaffinity, initargs=(0, cores))
 
 
 @functools.cache
 def _cases(num: int) -> tuple[Any, Any]:
-    """A planner and hits for it."""
+    """Return a planner and hits for it."""
     return pj.hit.planner("exact"), pj.hit.draw(num)
 
 
-def _first(num: int) -> Any:
-    """The plans, with what had to be compiled for them."""
+def _plan_first(num: int) -> Any:
+    """Plan once, including compilation."""
     return pj.plan(*_cases(num))
 
 
-def _seconds(num: int) -> float:
-    """How long planning takes, warm."""
+def _time_plan(num: int) -> float:
+    """Return the duration [s] of a call that is already compiled."""
     planner, cases = _cases(num)
     began = time.perf_counter()
     pj.plan(planner, cases)
@@ -60,24 +60,24 @@ def main() -> None:
     bench, num = begin(parser, options), options.num
     cores = sorted(os.sched_getaffinity(0))
     groups = {
-        "one core": [_on(cores[-1:])],
-        f"all {len(cores)} cores": [_on(cores)],
-        "a process for each core": [_on([core]) for core in cores],
+        "one core": [_start_process(cores[-1:])],
+        f"all {len(cores)} cores": [_start_process(cores)],
+        "a process for each core": [_start_process([core]) for core in cores],
     }
     plans = {
-        name: [child.submit(_first, num).result() for child in children][0]
+        name: [child.submit(_plan_first, num).result() for child in children][0]
         for name, children in groups.items()
     }
     rates: dict[str, list[float]] = {name: [] for name in groups}
     for _ in range(options.turns):
         for name, children in groups.items():
-            begun = [child.submit(_seconds, num) for child in children]
+            begun = [child.submit(_time_plan, num) for child in children]
             rates[name].append(sum(num / one.result() for one in begun))
     load = os.getloadavg()[0]
     for children in groups.values():
         for child in children:
             child.shutdown()
-    with bench:  # from here on JAX runs in this process too
+    with bench:  # from here on JAX runs in the main process too
         bench.say(
             f"load average {load:.1f}; {options.turns} turns",
             "| process | plans/s, median | lowest | highest | times one core | success |",

@@ -1,4 +1,4 @@
-"""How much plans cost beside the optimum that a long search finds."""
+"""Compare the costs of plans with the optimum that a long search finds."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,8 +13,9 @@ from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stag
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 
-COMPARED = 1024  # plans of a batch that are looked at, at most
-# One long search from the first guess: Newton's method ends it, which follows valleys to their end.
+COMPARED = 1024  # maximum number of plans of a batch that are compared
+# One long search from the first guess: L-BFGS, then Newton's method, which converges along
+# ill-conditioned directions too.
 TO_THE_OPTIMUM = Round(
     solver=NewtonConfig(max_steps=100, tolerance=1e-8, patience=10),
     stages=(Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)),),
@@ -29,26 +30,28 @@ def cost_gaps(
     *,
     card: Task | None = None,
 ) -> np.ndarray | None:
-    """By how much plans cost more than those of a long search.
+    """Return the relative excess of plans' costs over the costs of a long search.
 
-    That is `TO_THE_OPTIMUM` for a planner that minimises by rounds; for others the planner that
-    their task's card names as a yardstick, with its own options.
+    The long search is `TO_THE_OPTIMUM` for a planner that minimises by rounds. For any other
+    planner it is the planner that the task specification names as a yardstick, with that planner's
+    defaults.
 
     Args:
-        planner: that made the plans; what it decided on first is kept.
-        cases: a batch, of which the first `COMPARED` are looked at.
-        plans: of them.
+        planner: the planner that made the plans. If it also decides (`DecidedPlanner`), the long
+            search uses the same decisions.
+        cases: a batch; only the first `COMPARED` cases are compared.
+        plans: one plan for each case.
         devices: as for `plan`.
-        card: of the planner's task, for its yardstick.
+        card: specification of the planner's task, for its yardstick.
 
     Returns:
-        (K,), relative, of the cases that both solve: 0.33 is 33 %. None where the planner has no
-        rounds, and its task no yardstick for such cases.
+        (K,), relative (0.33 is 33 %), for the cases that both planners solve. None if the planner
+        has no rounds and the task has no yardstick for such cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
         cases, planner = cases.with_choice(plans.choice), planner.planner
-    longer = _longer(planner, cases, card)
+    longer = _reference_planner(planner, cases, card)
     if longer is None:
         return None
     best = plan(longer, cases, devices=devices)
@@ -56,24 +59,24 @@ def cost_gaps(
     return plans.cost[both] / best.cost[both] - 1.0
 
 
-def _longer(planner: Any, cases: Any, card: Task | None) -> Any:
-    """The planner with whose costs those of a planner are compared, None if there is none."""
+def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
+    """Return the planner that provides the reference costs, or None if there is none."""
     if isinstance(planner, OptimisedPlanner):
-        return to_the_optimum(planner)
+        return with_long_search(planner)
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # A task's groups, and what is planned again, are cases of other classes.
+    # Groups of a task and re-planning problems are cases of other classes.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
-def to_the_optimum(planner: OptimisedPlanner) -> OptimisedPlanner:
-    """The planner with the long search in the place of its rounds."""
+def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
+    """Return a copy of the planner whose rounds are replaced by the long search."""
     return planner.with_settings((("rounds", (TO_THE_OPTIMUM,)),))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:
-    """Median, 90 and 99 % quantile of `cost_gaps`, None where there are none."""
+    """Return the median, 90 % and 99 % quantile of `cost_gaps`; None if there are no gaps."""
     together = np.concatenate([np.zeros(0), *(each for each in gaps if each is not None)])
     names = ("cost_gap_median", "cost_gap_p90", "cost_gap_p99")
     if not together.size:

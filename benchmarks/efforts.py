@@ -1,10 +1,11 @@
-"""What a planner's effort buys: the cost above the optimum's, and the time.
+"""Measure the cost above the optimum, and the time, for each of a planner's efforts.
 
     python -m benchmarks.efforts [--num 1000] [--seed 0] [--repeat 3] [--out DIR]
 
-Hits of the suite `court`, and catches of one and of two balls in the greedy order, by `exact`. The
-optimum is that of a long search from the same guess, which Newton's method ends. The time is the
-fastest call, warm; beside it stand the plans that the referee accepts.
+The planner is `exact`, on hits of the suite `court`, and on catches of one and of two balls in
+greedy order. The optimum is found by a long search from the same guess, with Newton's method at the
+end. The time is the fastest call, compiled before. The share of plans that the referee accepts
+stands beside it.
 """
 
 import argparse
@@ -23,10 +24,10 @@ SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """A row an effort and suite."""
+    """Print a row for each effort and suite."""
     bench.say(
         f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
-        "| task | suite | effort | refereed | cost above the optimum's (median, p90, p99) | "
+        "| task | suite | effort | refereed | cost above the optimum (median, p90, p99) | "
         "fastest [s] |",
         "|---|---|---|---|---|---|",
     )
@@ -36,7 +37,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
         cases: Any = jax.tree.map(np.asarray, task.draw(options.num, suite, options.seed))
         for effort in EFFORTS:
             planner = task.planner("exact", effort=effort, **task.bench)
-            plans, seconds = _fastest(planner, cases, options.repeat)
+            plans, seconds = _time_fastest(planner, cases, options.repeat)
             success = task.judge(cases, plans).success
             gap = cost_gaps(planner, cases, plans, card=task)
             accepted.append(success)
@@ -59,8 +60,8 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     bench.note(**gap_figures(*gaps))
 
 
-def _fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
-    """Plans, and how long the fastest of some calls took, warm [s]."""
+def _time_fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
+    """Return plans, and the duration [s] of the fastest of `repeat` warm calls."""
     plans, seconds = pj.plan(planner, cases), []
     for _ in range(repeat):
         began = time.perf_counter()

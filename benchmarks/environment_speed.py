@@ -1,13 +1,13 @@
-"""How many decisions a second the training environment plans.
+"""Measure how many steps per second the training environment takes.
 
     python -m benchmarks.environment_speed [--suite triangle3] [--iterations 25] [--lanes 16384]
         [--steps 20] [--out DIR]
 
-A step is that of `CatchEnv`: an action for each lane, the plan that follows from it, its reward,
-the next cases and what is seen of them. Actions are random, a tenth of their range wide, as those
-of a policy that learns are. The time is that of --steps steps in one compiled loop, the best of
-three, after one that compiles; beside it the share of plans that succeed within the iterations,
-by the planner's own check, since a step leaves no plans for the referee.
+A step of `CatchEnv` takes one action for each batch element, plans with it, and returns the reward,
+the next cases and their observations. Actions are random with a standard deviation of a tenth of
+the range, as for a policy in training. The time is for --steps steps in one compiled loop, the best
+of three runs after a first one. The share of plans that succeed within the iterations stands beside
+it. The planner's own check decides on success, because a step stores no plans for the referee.
 """
 
 import argparse
@@ -23,7 +23,7 @@ from planner_jax.task.catch.spec import SUITES
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """The row."""
+    """Print the row."""
     env = CatchEnv((options.suite,), (options.iterations,))
     keys = jax.random.split(jax.random.key_data(jax.random.key(options.seed)), options.lanes)
 

@@ -1,15 +1,14 @@
-"""Every row of the blocks' protocol: which share of balls is blocked in simulation, and by what.
+"""Measure the share of balls that the simulated arm blocks, for each row of drive errors.
 
     python -m benchmarks.fly_block_rows [--num 200] [--seed 0] [--suite pole]
                                         [--regimes R1,R2] [--rows ideal,drives,...] [--by-clock]
 
-Plans are made once for each regime, one at a time, and carried out in every row; a ball is blocked
-when it comes down on the face of the shield before its centre is in the inner box, and a block
-counts if the arm touched nothing until then. The arm may start 163 ms after a ball is first seen:
-83 ms of perception and 50 ms of overheads [Natarajan2024, Section VI-B], and 30 ms for planning. A
-plan that took longer counts as there in time, since the clock is that of the machine at hand,
-unless `--by-clock` is set. The share of plans that the referee accepts is what an ideal arm
-reaches.
+Plans are made once for each regime, one at a time, and executed in every row. A ball is blocked if
+it hits the face of the shield before its centre enters the inner box. A block counts if the arm
+touched nothing until then. The arm may start 163 ms after a ball is first seen: 83 ms of perception
+and 50 ms of overheads [Natarajan2024, Section VI-B], and 30 ms for planning. Planning times depend
+on the machine, so a plan that takes longer still counts as in time unless `--by-clock` is set. The
+share of plans that the referee accepts is what an ideal arm reaches.
 """
 
 import dataclasses
@@ -18,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.block.settings import REGIMES
 
-# Row -> fields of `Drives` that differ from ideal ones, with "share" of the torques.
+# Row -> fields of `Drives` that differ from ideal drives; "share" scales the torque limits.
 ROWS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "lag 5 ms": {"lag": 0.005},
@@ -37,7 +36,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "torques quartered": {"share": 0.25},
 }
 HEADER = (
-    "| regime | row | success % (95 %) | blocked, % | touched / after it, % | "
+    "| regime | row | success % (95 %) | blocked, % | collision before / after, % | "
     "miss of blocked p50 / worst, cm | tracking p50 / worst, cm | "
     "error rms of joints 1 to 6, mrad | torque rms of joints 1 to 3, N m | worst, N m | "
     "at the limit, % of the time | s |"
@@ -45,7 +44,7 @@ HEADER = (
 
 
 def line(regime: str, name: str, flights: Any, seconds: float) -> str:
-    """One row of the table; joints, tracking and contacts are those of arms with a plan."""
+    """Format one row of the table; joints, tracking and contacts are of arms with a plan."""
     from planner_jax.sims.tasks.block_flights import TOUCH
 
     number, good, some = len(flights.miss), flights.success, flights.planned
@@ -62,21 +61,21 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
 
     missed = f"{np.median(miss):.2f} / {miss.max():.1f}" if miss.size else "-"
 
-    def joined(values: np.ndarray, form: str) -> str:
+    def join(values: np.ndarray, form: str) -> str:
         return " / ".join(format(value, form) for value in values)
 
     return (
         f"| {regime} | {name} | {percent(int(good.sum()), number)} ({low:.1f} to {high:.1f}) | "
         f"{percent(int(flights.blocked.sum()), number)} | {touched} / {after} | "
         f"{missed} | "
-        f"{np.median(tracking[:, 0]):.2f} / {tracking[:, 1].max():.1f} | {joined(error, '.2f')} | "
-        f"{joined(torque, '.0f')} | {joined(most, '.0f')} | {joined(100.0 * share, '.1f')} | "
+        f"{np.median(tracking[:, 0]):.2f} / {tracking[:, 1].max():.1f} | {join(error, '.2f')} | "
+        f"{join(torque, '.0f')} | {join(most, '.0f')} | {join(100.0 * share, '.1f')} | "
         f"{seconds:.1f} |"
     )
 
 
 def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
-    """Plan once, and carry the plans out in every row."""
+    """Plan once, and execute the plans in every row."""
     from planner_jax.core.protocol import is_solved
     from planner_jax.runs.timing import measure_plans
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
@@ -130,20 +129,30 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
 
 
 def main() -> None:
-    """Print the rows asked for."""
+    """Print the requested rows."""
     known = ", ".join(ROWS).replace("%", "%%")
     parser = argument_parser("fly_block_rows", __doc__, num=200, seed=0)
-    parser.add_argument("--suite", default="pole", choices=("pole", "open", "short"))
-    parser.add_argument("--planner", default="online")
-    parser.add_argument("--regimes", default="R1,R2", help=f"out of {', '.join(REGIMES)}")
-    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {known}")
-    parser.add_argument("--wide", action="store_true", help="balls met off the middle and aslant")
     parser.add_argument(
-        "--by-clock", action="store_true", help="plans that take too long come late"
+        "--suite", default="pole", choices=("pole", "open", "short"), help="default: pole"
+    )
+    parser.add_argument("--planner", default="online", help="default: online")
+    parser.add_argument(
+        "--regimes", default="R1,R2", help=f"joint limits, of {', '.join(REGIMES)}; default: R1,R2"
+    )
+    parser.add_argument(
+        "--rows", default=",".join(ROWS), help=f"rows to print, of {known}; default: all"
+    )
+    parser.add_argument(
+        "--wide",
+        action="store_true",
+        help="balls may meet the shield off its middle and at an angle",
+    )
+    parser.add_argument(
+        "--by-clock", action="store_true", help="plans that take longer than 30 ms start late"
     )
     options = parser.parse_args()
-    regimes = chosen(parser, "--regimes", options.regimes, REGIMES)
-    rows = chosen(parser, "--rows", options.rows, ROWS)
+    regimes = parse_names(parser, "--regimes", options.regimes, REGIMES)
+    rows = parse_names(parser, "--rows", options.rows, ROWS)
     with begin(parser, options) as bench:
         bench.say(HEADER, "|---" * HEADER.count(" | ") + "|---|")
         for regime in regimes:

@@ -1,13 +1,14 @@
-"""Every row of the drives' protocol: which share of targets is met in closed loop, and by what.
+"""Measure the share of targets that the simulated car meets, for each row of drive errors.
 
     python -m benchmarks.fly_intercept_rows [--suite hard] [--num 50] [--seed 0]
                                             [--rows sensing,replan,latency,slip]
 
-Misses are those of the body's middle from the TRUE target when the plan ends; a meeting counts
-within 0.3 m if the car touched nothing, by exact polygons every 20 ms. Targets are seen 15 times
-before the start and then once a second with 0.1 m of noise, the car's pose with 1 cm and 0.01 rad,
-everything 50 ms late, and plans are made anew once a second, unless a row says otherwise. The
-command of a row flies the same drives into a run folder.
+A miss is the distance of the body's middle from the TRUE target when the plan ends. A meeting
+counts if the miss is at most 0.3 m and the car touched nothing, by exact polygons every 20 ms.
+Unless a row differs, targets are observed 15 times before the start and then once a second with 0.1
+m of noise, the car's pose has noise of 1 cm and 0.01 rad, all observations are 50 ms old, and the
+car re-plans once a second. The printed command of a row runs the same drives and writes a run
+folder.
 """
 
 import argparse
@@ -24,22 +25,22 @@ from planner_jax.sims.tasks.intercept import SUCCESS, TOUCH, InterceptFlights, f
 from planner_jax.sims.tasks.intercept_flights import FAR, NEAR
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# Row -> settings that differ from the task's own.
+# Row -> settings that differ from the defaults of the task.
 ROWS: dict[str, dict[str, dict[str, Any]]] = {
     "sensing": {
         "everything known": {"known_target": True, "noise": "none", "latency": 0.0, "replan": 0.0},
-        "everything known, planned anew": {"known_target": True, "noise": "none", "latency": 0.0},
+        "everything known, re-planned": {"known_target": True, "noise": "none", "latency": 0.0},
         "target known, noise and latency": {"known_target": True},
         "target predicted": {},
-        "target predicted, never planned anew": {"replan": 0.0},
-        "ten looks a second": {"observation_rate": 10.0},
-        "movers seen as well": {"predict_movers": True},
+        "target predicted, never re-planned": {"replan": 0.0},
+        "ten observations a second": {"observation_rate": 10.0},
+        "movers predicted as well": {"predict_movers": True},
     },
-    "replan": {f"planned anew at {rate:g} Hz": {"replan": rate} for rate in (0.0, 1.0, 2.0, 10.0)},
+    "replan": {f"re-planned at {rate:g} Hz": {"replan": rate} for rate in (0.0, 1.0, 2.0, 10.0)},
     "latency": {f"latency {1e3 * age:g} ms": {"latency": age} for age in (0.0, 0.05, 0.1)},
     "slip": {
         "tyres that slip": {"slip": True},
-        "tyres that slip, never planned anew": {"slip": True, "replan": 0.0},
+        "tyres that slip, never re-planned": {"slip": True, "replan": 0.0},
     },
 }
 HEADER = (
@@ -49,7 +50,7 @@ HEADER = (
 
 
 def line(name: str, flights: InterceptFlights, seconds: float) -> str:
-    """One row of the table."""
+    """Format one row of the table."""
     good, miss, number = flights.success, flights.miss, len(flights.miss)
     low, high = wilson_interval(int(good.sum()), number)
     within = " / ".join(percent(int((miss <= d).sum()), number) for d in (NEAR, SUCCESS, FAR))
@@ -68,7 +69,7 @@ def line(name: str, flights: InterceptFlights, seconds: float) -> str:
 
 
 def command(settings: InterceptFly) -> str:
-    """What flies a row into a run folder."""
+    """Return the command that runs the drives of a row and writes a run folder."""
     own = InterceptFly(suite=settings.suite, num=settings.num, seed=settings.seed)
     words = [f"--suite {settings.suite} --num {settings.num} --seed {settings.seed}"]
     for field in dataclasses.fields(settings):
@@ -80,12 +81,13 @@ def command(settings: InterceptFly) -> str:
     return " ".join(["planner-jax fly intercept", *words])
 
 
-def flown(
+def drive(
     settings: InterceptFly, first_plans: dict[tuple, InterceptPlan]
 ) -> tuple[InterceptFlights, float]:
-    """The drives of a row, and the seconds that they took.
+    """Run the drives of a row; return them with their duration [s].
 
-    First plans depend on what was seen before the start alone: they are made once for all rows.
+    First plans depend only on observations before the start, so rows with the same observations
+    share them.
     """
     task, key = settings.flight(), (settings.known_target, settings.predict_movers, settings.noise)
     began = time.perf_counter()
@@ -103,12 +105,14 @@ def flown(
 
 
 def main() -> None:
-    """Print the rows asked for, and the command of each."""
+    """Print the requested rows, and the command of each."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--suite", default="hard")
-    parser.add_argument("--num", type=int, default=50, help="drives a row")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
+    parser.add_argument("--suite", default="hard", help="default: hard")
+    parser.add_argument("--num", type=int, default=50, help="drives a row; default: 50")
+    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument(
+        "--rows", default=",".join(ROWS), help=f"groups of rows, of {', '.join(ROWS)}; default: all"
+    )
     args = parser.parse_args()
     names = args.rows.split(",")
     if unknown := [name for name in names if name not in ROWS]:
@@ -122,7 +126,7 @@ def main() -> None:
             settings = InterceptFly(suite=args.suite, num=args.num, seed=args.seed, **options)
             commands.append(f"{row}: {command(settings)}")
             if settings not in lines:
-                lines[settings] = flown(settings, first_plans)
+                lines[settings] = drive(settings, first_plans)
             print(line(row, *lines[settings]), flush=True)
     print("\n".join(["", *commands]))
 

@@ -1,9 +1,10 @@
-"""The pictures of the documentation: three balls caught in one flight, and a serve hit back.
+"""Draw the documentation's pictures of two simulated flights: a catch of three balls, and a hit.
 
     python -m benchmarks.fly_pictures [--out docs]
 
-Noise `lab`, latency 20 ms, drag believed 15 % wrong; planned anew at 100 and 50 Hz. A picture
-shows the first of a few flights that succeeds.
+The flights have noise `lab`, a latency of 20 ms, and a drag estimate that is 15 % wrong. Catches
+are re-planned at 100 Hz, hits at 50 Hz. Each picture shows the first successful one of a few
+flights.
 """
 
 import argparse
@@ -29,7 +30,9 @@ PICTURES = {
 def main() -> None:
     """Fly and draw."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("docs"), metavar="DIR")
+    parser.add_argument(
+        "--out", type=Path, default=Path("docs"), metavar="DIR", help="default: docs"
+    )
     args = parser.parse_args()
     for name, (settings, look) in PICTURES.items():
         task = settings.flight()

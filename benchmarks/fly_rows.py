@@ -1,14 +1,15 @@
-"""Every row of the flight protocol: what is caught and hit in closed loop, with noise.
+"""Measure catches and hits in closed-loop simulation, on every row of the flight protocol.
 
     python -m benchmarks.fly_rows [--num 1000] [--seed 0] [--rows exact,catch,hit,ablate]
                                   [--limit 300]
 
-Noise `lab` with a latency of 20 ms; the drag is believed 15 % wrong, either way. Catches are
-planned anew at 100 Hz, hits at 50 Hz and, as in [Yu2023bat], not at all. A flight of several balls
-counts if all are caught. Every line has its share with the 95 % Wilson interval, where there is
-one the share that it must reach, and the seconds of a second run in which nothing is compiled,
-planning from scratch apart. A line that takes longer than the limit is given up as soon as the
-program that runs comes back. Prediction errors stand beside the paper's greatest, (15, 5, 25) cm.
+The noise is `lab` with a latency of 20 ms. The initial drag estimate is 15 % too large or too
+small. Catches are re-planned at 100 Hz. Hits are re-planned at 50 Hz and, as in [Yu2023bat], not at
+all. A flight of several balls succeeds if all are caught. Each line prints the success rate with
+its 95 % Wilson interval, the required rate if there is one, and the duration of a second run, which
+compiles nothing, separated into flight and planning from scratch. A line that exceeds the time
+limit is abandoned when the running program returns. Prediction errors can be compared with the
+largest errors of [Yu2023bat], (15, 5, 25) cm.
 """
 
 import argparse
@@ -32,22 +33,22 @@ from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
 DRAG_ERROR = 0.15
-CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz], of planning anew
+CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz], re-planning rates
 LAB = NOISES["lab"]
-CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # share of flights of as many balls, to be reached
-LANDING = 0.05  # [m] from the target, to be reached without noise
+CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # required success rate, by number of balls
+LANDING = 0.05  # [m] from the target, required without noise
 HORIZONS = ((0.9, 1.1), (0.7, 0.9), (0.5, 0.7), (0.3, 0.5), (0.1, 0.3))  # [s]
 
 
-def share(good: np.ndarray) -> str:
-    """A rate with its interval."""
+def format_rate(good: np.ndarray) -> str:
+    """Format a rate with its interval."""
     low, high = wilson_interval(int(good.sum()), good.size)
     rate = percent(int(good.sum()), good.size)
     return f"{rate} % ({100 * low:.1f} to {100 * high:.1f}, {good.size} flights)"
 
 
-def quantiles(values: np.ndarray, scale: float, unit: str) -> str:
-    """Median, 90 % and greatest of what is finite."""
+def format_quantiles(values: np.ndarray, scale: float, unit: str) -> str:
+    """Format median, 90 % quantile and maximum of the finite values."""
     kept = values[np.isfinite(values)]
     if not kept.size:
         return "none"
@@ -56,8 +57,8 @@ def quantiles(values: np.ndarray, scale: float, unit: str) -> str:
 
 
 @contextlib.contextmanager
-def limited(name: str, seconds: int) -> Iterator[None]:
-    """Give up a line, and say so, when its seconds are over."""
+def limit_time(name: str, seconds: int) -> Iterator[None]:
+    """Abandon a line with a message when its time limit is exceeded."""
 
     def stop(*_: Any) -> None:
         raise TimeoutError
@@ -67,14 +68,14 @@ def limited(name: str, seconds: int) -> Iterator[None]:
     try:
         yield
     except TimeoutError:
-        print(f"{name}: given up after {seconds} s", flush=True)
+        print(f"{name}: abandoned after {seconds} s", flush=True)
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
 
 
-def twice(fly: Callable[[], Any]) -> tuple[Any, str]:
-    """What a flight gives, and the seconds of the second time and of the first."""
+def run_twice(fly: Callable[[], Any]) -> tuple[Any, str]:
+    """Run a simulation twice; return its result, and the durations as text."""
     began = time.perf_counter()
     fly()
     between = time.perf_counter()
@@ -87,21 +88,21 @@ def twice(fly: Callable[[], Any]) -> tuple[Any, str]:
     )
 
 
-def reached(good: np.ndarray, bar: float | None) -> str:
-    """Whether a share is what it must be."""
+def check_rate(good: np.ndarray, bar: float | None) -> str:
+    """Return text on whether a rate reaches its required value."""
     if bar is None:
         return ""
     return f", must reach {100 * bar:g} %: {'yes' if good.mean() >= bar else 'NO'}"
 
 
-def tracking(flown: Flown) -> str:
-    """One phrase on the tracking error."""
-    worst = quantiles(flown.tracking[:, 1], 100.0, "cm")
+def format_tracking(flown: Flown) -> str:
+    """Format the tracking error."""
+    worst = format_quantiles(flown.tracking[:, 1], 100.0, "cm")
     return f"tracking rms {100.0 * np.median(flown.tracking[:, 0]):.2f} cm, worst {worst}"
 
 
 def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
-    """Planned less flown contact of the first ball: distance [m] and time [s], (B,) each."""
+    """Return errors of the first ball's flown contact against the plan: [m] and [s], (B,) each."""
     planned = flown.contact.planned_time[:, 0]
     places = np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, planned - flown.began))
     away = np.linalg.norm(places - flown.contact.robot_pos[:, 0], axis=1)
@@ -109,7 +110,7 @@ def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prediction_errors(flown: Flown) -> None:
-    """Errors of where the ball is expected to be met, by the time until then."""
+    """Print errors of the predicted contact position, by the time until the contact."""
     assert flown.record is not None
     horizon, error = flown.record.horizon[:, :, 0], np.abs(flown.record.error[:, :, 0])
     for low, high in HORIZONS:
@@ -127,14 +128,16 @@ def prediction_errors(flown: Flown) -> None:
 def catches(
     name: str, loop: Loop, args: Any, drag_error: float, bar: float | None = None, **options: Any
 ) -> CatchFlights | None:
-    """One line for catches."""
+    """Print one line for catches."""
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
-    with limited(name, args.limit):
-        flights, seconds = twice(lambda: fly_catches(loop, cases, args.seed, **options))
+    with limit_time(name, args.limit):
+        flights, seconds = run_twice(lambda: fly_catches(loop, cases, args.seed, **options))
         good = flights.success
         print(
-            f"{name}: all caught {share(good)}{reached(good, bar)}; ball from the net's centre "
-            f"{quantiles(flights.flown.contact.offset, 100.0, 'cm')}; {tracking(flights.flown)}; "
+            f"{name}: all caught {format_rate(good)}{check_rate(good, bar)}; "
+            "ball from the net's centre "
+            f"{format_quantiles(flights.flown.contact.offset, 100.0, 'cm')}; "
+            f"{format_tracking(flights.flown)}; "
             f"{seconds}",
             flush=True,
         )
@@ -144,23 +147,23 @@ def catches(
 def hits(
     name: str, loop: Loop, regions: Any, args: Any, drag_error: float, **options: Any
 ) -> HitFlights | None:
-    """One line for hits."""
+    """Print one line for hits."""
     cases = volleys(args.num, regions, args.seed, drag_error=drag_error)
-    with limited(name, args.limit):
-        flights, seconds = twice(lambda: fly_hits(loop, cases, args.seed, **options))
+    with limit_time(name, args.limit):
+        flights, seconds = run_twice(lambda: fly_hits(loop, cases, args.seed, **options))
         near, met = flights.miss <= 1.0, flights.flown.contact.met
         print(
-            f"{name}: within 0.5 m {share(flights.miss <= 0.5)}, within 1 m "
+            f"{name}: within 0.5 m {format_rate(flights.miss <= 0.5)}, within 1 m "
             f"{percent(int(near.sum()), args.num)} %, hit {percent(int(met.sum()), args.num)} %; "
-            f"landing from the target {quantiles(flights.miss, 100.0, 'cm')}; "
-            f"{tracking(flights.flown)}; {seconds}",
+            f"landing from the target {format_quantiles(flights.miss, 100.0, 'cm')}; "
+            f"{format_tracking(flights.flown)}; {seconds}",
             flush=True,
         )
         return flights
 
 
 def exact_rows(args: Any) -> None:
-    """Without noise: planned and flown contact, and the landing."""
+    """Print rows without noise: planned and flown contact, and the landing."""
     for rate in (0.0, CATCH_RATE):
         name = f"no noise, catch, re-planned {rate:g} Hz"
         if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):
@@ -171,23 +174,26 @@ def exact_rows(args: Any) -> None:
         if volley := hits(name, Loop(HIT_WORLD, replan=rate), regions, args, 0.0):
             report_contact(volley.flown)
             good = volley.miss <= LANDING
-            print(f"  landing within {100 * LANDING:g} cm {share(good)}{reached(good, 1.0)}")
+            print(
+                f"  landing within {100 * LANDING:g} cm {format_rate(good)}{check_rate(good, 1.0)}"
+            )
 
 
 def report_contact(flown: Flown) -> None:
-    """One line on planned and flown contact."""
+    """Print one line on planned and flown contact."""
     places, times = contact_errors(flown)
     met = flown.contact.met[:, 0]
     good = (places <= 0.02) & (times <= 0.002) & met
     print(
-        f"  contact: {quantiles(places[met], 100.0, 'cm')}; {quantiles(times[met], 1e3, 'ms')}; "
-        f"within 2 cm and 2 ms {share(good)}{reached(good, 1.0)}",
+        f"  contact: {format_quantiles(places[met], 100.0, 'cm')}; "
+        f"{format_quantiles(times[met], 1e3, 'ms')}; "
+        f"within 2 cm and 2 ms {format_rate(good)}{check_rate(good, 1.0)}",
         flush=True,
     )
 
 
 def catch_rows(args: Any) -> None:
-    """One, two and three balls 0.8 s apart, with noise."""
+    """Print rows with noise for one, two and three balls that are 0.8 s apart."""
     for number in (1, 2, 3):
         world = dataclasses.replace(CATCH_WORLD, num_balls=number)
         loop = Loop(world, LAB, replan=CATCH_RATE)
@@ -198,7 +204,7 @@ def catch_rows(args: Any) -> None:
 
 
 def hit_rows(args: Any) -> None:
-    """The six scenarios, with noise, re-planned and not."""
+    """Print rows with noise for the six scenarios, re-planned and not."""
     for rate in (HIT_RATE, 0.0):
         for name, regions in REAL_SCENARIOS.items():
             loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")
@@ -208,8 +214,8 @@ def hit_rows(args: Any) -> None:
                 prediction_errors(flights.flown)
 
 
-def ablated(whole: Loop) -> dict[str, Loop]:
-    """A loop, and the same without one part each, by what is missing."""
+def make_ablations(whole: Loop) -> dict[str, Loop]:
+    """Return a loop and copies that each lack one part, keyed by the missing part."""
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),
@@ -219,15 +225,15 @@ def ablated(whole: Loop) -> dict[str, Loop]:
 
 
 def ablation_rows(args: Any) -> None:
-    """What each part is worth."""
-    for name, loop in ablated(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
+    """Print the rows that show the effect of each part."""
+    for name, loop in make_ablations(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
     loop = Loop(CATCH_WORLD, LAB)
     for name in ("catch", "mpp"):
         title = f"lab, one ball, planner {name}, no re-planning"
         catches(title, loop, args, DRAG_ERROR, planner=catch.planner(name, decide="greedy"))
     regions = REAL_SCENARIOS["S.1"]
-    for name, loop in ablated(Loop(HIT_WORLD, LAB, replan=HIT_RATE)).items():
+    for name, loop in make_ablations(Loop(HIT_WORLD, LAB, replan=HIT_RATE)).items():
         hits(f"lab, S.1, {name}", loop, regions, args, DRAG_ERROR)
     loop = Loop(HIT_WORLD, LAB)
     for name in ("bat", "bat-lite", "juggle"):
@@ -239,12 +245,18 @@ ROWS = {"exact": exact_rows, "catch": catch_rows, "hit": hit_rows, "ablate": abl
 
 
 def main() -> None:
-    """Print the rows asked for."""
+    """Print the requested rows."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--num", type=int, default=1000, help="flights a row")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--limit", type=int, default=300, help="seconds a line (default: 300)")
-    parser.add_argument("--rows", default=",".join(ROWS), help=f"out of {', '.join(ROWS)}")
+    parser.add_argument("--num", type=int, default=1000, help="flights a row (default: 1000)")
+    parser.add_argument("--seed", type=int, default=0, help="default: 0")
+    parser.add_argument(
+        "--limit", type=int, default=300, help="time limit of a line [s] (default: 300)"
+    )
+    parser.add_argument(
+        "--rows",
+        default=",".join(ROWS),
+        help=f"groups of rows, of {', '.join(ROWS)} (default: all)",
+    )
     args = parser.parse_args()
     names = args.rows.split(",")
     if unknown := [name for name in names if name not in ROWS]:

@@ -1,11 +1,11 @@
-"""How fast MJX flies: steps a second of one quadrotor and one ball, batches of worlds.
+"""Measure simulated physics steps per second in MJX, for batches of one quadrotor and one ball.
 
     python -m benchmarks.fly_steps [--worlds 4096,65536] [--seconds 0.4]
 
-Open loop steps the physics with constant rotor thrusts. Closed loop is a whole flight without
-re-planning: observations, filter, reference, control, physics, contact. A step is a physics and
-a control step of 2 ms. Where the package crazyflow is installed, its first-principles quadrotor
-steps beside ours, without a ball. Compilation is apart.
+The open loop steps the physics with constant rotor thrusts. The closed loop is a whole flight
+without re-planning: observations, Kalman filter, reference, control, physics, contact. A step
+covers 2 ms of physics and control. If the package crazyflow is installed, the steps of its
+first-principles quadrotor, without a ball, stand beside these. Compilation is reported separately.
 """
 
 import argparse
@@ -35,8 +35,8 @@ from planner_jax.task.catch.case import START
 RUNS = 3
 
 
-def timed(name: str, steps: int, run: Callable[[], Any]) -> None:
-    """One line: compilation, and steps a second of the best of a few runs."""
+def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
+    """Print one line: compile time, and steps per second of the fastest of a few runs."""
     began = time.perf_counter()
     jax.block_until_ready(run())
     first = time.perf_counter() - began
@@ -52,8 +52,8 @@ def timed(name: str, steps: int, run: Callable[[], Any]) -> None:
     )
 
 
-def open_loop(world: World, worlds: int, steps: int) -> None:
-    """Physics alone."""
+def measure_open_loop(world: World, worlds: int, steps: int) -> None:
+    """Measure the physics alone."""
     start = at_rest(world, jnp.array(START))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (worlds, *leaf.shape)), start)
     drag = jnp.zeros(1)
@@ -65,11 +65,11 @@ def open_loop(world: World, worlds: int, steps: int) -> None:
         advance = lambda state, _: (step(world, state, rotors, drag), None)  # noqa: E731
         return jax.lax.scan(advance, physics, None, length=steps)[0]
 
-    timed(f"open loop, {worlds} worlds", worlds * steps, lambda: run(start))
+    report_speed(f"open loop, {worlds} worlds", worlds * steps, lambda: run(start))
 
 
-def closed_loop(world: World, worlds: int, seconds: float) -> None:
-    """Flights without re-planning; their plans, from scratch, are not in the time."""
+def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
+    """Measure flights without re-planning; initial plans are not part of the time."""
     loop = Loop(world, NOISES["lab"])
     few = min(worlds, 256)  # different throws, repeated to fill the batch
     cases = throws(few)
@@ -89,11 +89,11 @@ def closed_loop(world: World, worlds: int, seconds: float) -> None:
     periods = loop.num_periods(seconds)
     steps = worlds * periods * loop.observations_per_plan * loop.steps_per_observation
     run = lambda: fly_leg(loop, CatchPilot(), flight, known, drag, num_periods=periods)  # noqa: E731
-    timed(f"closed loop, {worlds} worlds", steps, lambda: run()[0].physics)
+    report_speed(f"closed loop, {worlds} worlds", steps, lambda: run()[0].physics)
 
 
-def crazyflow(worlds: int, steps: int) -> None:
-    """The peer's steps, where it is installed."""
+def measure_crazyflow(worlds: int, steps: int) -> None:
+    """Measure the steps of crazyflow, if it is installed."""
     os.environ.setdefault("SCIPY_ARRAY_API", "1")
     try:
         peer: Any = importlib.import_module("crazyflow.sim")
@@ -107,23 +107,25 @@ def crazyflow(worlds: int, steps: int) -> None:
         sim.step(steps)
         return sim.data.states.pos
 
-    timed(f"crazyflow, {worlds} worlds, no ball", worlds * steps, run)
+    report_speed(f"crazyflow, {worlds} worlds, no ball", worlds * steps, run)
 
 
 def main() -> None:
     """Print all lines."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     default = "256" if jax.default_backend() == "cpu" else "4096,65536"
-    parser.add_argument("--worlds", default=default)
-    parser.add_argument("--seconds", type=float, default=0.4, help="of each flight")
+    parser.add_argument("--worlds", default=default, help=f"batch sizes; default: {default}")
+    parser.add_argument(
+        "--seconds", type=float, default=0.4, help="simulated time of each flight [s]; default: 0.4"
+    )
     args = parser.parse_args()
     world = CATCH_WORLD
     steps = round(args.seconds / world.timestep)
     print(f"{jax.devices()[0].device_kind}, jax {jax.__version__}, {steps} steps of 2 ms a world")
     for worlds in [int(number) for number in args.worlds.split(",")]:
-        open_loop(world, worlds, steps)
-        closed_loop(world, worlds, args.seconds)
-        crazyflow(worlds, steps)
+        measure_open_loop(world, worlds, steps)
+        measure_closed_loop(world, worlds, args.seconds)
+        measure_crazyflow(worlds, steps)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""What the gradient of a plan costs beside the plan, and how good it is.
+"""Measure the cost and the accuracy of the gradient of a plan.
 
     python -m benchmarks.gradients [--task hit] [--num 4096] [--steps N] [--accuracy 64] [--out DIR]
 
-Gradients are those of optima, so that three calls take turns: plans by the planner's own rounds,
-plans that go on to the optimum, and those with the gradient. Times are of whole calls from arrays
-on the device to arrays on the device, warm, the fastest and the median of `--repeat`. The first
-calls, which compile, stand apart. Accuracy: the relative difference, over all leaves that are
-differentiated by, from the gradient of optima in float64, by the whole Hessian, on lanes that
-this search solves.
+Gradients are defined at optima, so three calls take turns: plans by the planner's own rounds, plans
+refined to the optimum, and refined plans with their gradient. Times are of whole calls from arrays
+on the device to arrays on the device, compiled before: the fastest and the median of `--repeat`
+calls. The first calls, which compile, are listed separately. Accuracy is the relative difference
+from a reference, over all leaves with respect to which the plan is differentiated. The reference is
+the gradient of float64 optima with the whole Hessian, for cases that the float64 search solves.
 """
 
 import argparse
@@ -40,7 +40,7 @@ def _last_catch(plan: Any) -> jax.Array:
 
 
 def _case(task: str, num: int) -> tuple[Any, Any, Any]:
-    """Planner that minimises, cases with NumPy leaves, quantity."""
+    """Return a minimising planner, cases with NumPy leaves, and the quantity to differentiate."""
     if task == "hit":
         found = pj.hit.planner("exact"), pj.hit.draw(num, seed=_SEED), "stroke.time"
     else:
@@ -49,8 +49,8 @@ def _case(task: str, num: int) -> tuple[Any, Any, Any]:
     return found[0], jax.tree.map(np.asarray, found[1]), found[2]
 
 
-def _timed(calls: dict[str, Any], repeat: int) -> dict[str, tuple[float, float, float]]:
-    """First call, fastest and median of the others [s], by name."""
+def _time_calls(calls: dict[str, Any], repeat: int) -> dict[str, tuple[float, float, float]]:
+    """Return the durations [s] by name: first call, fastest and median of the others."""
     first, later = {}, {name: [] for name in calls}
     for turn in range(1 + repeat):
         for name, call in calls.items():
@@ -79,23 +79,28 @@ def _double(tree: Any) -> Any:
 
 
 def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
-    """Quantiles of the relative difference, every column in units of its median size."""
+    """Format quantiles of the relative difference, each column in units of its median size."""
     has_none = ~np.isfinite(found[lanes]).all(axis=1)
     none, lanes = has_none.mean(), lanes[~has_none]
     unit = np.median(np.abs(best[lanes]), axis=0)
     weight = np.where(unit > 1e-9 * unit.max(), 1.0 / np.maximum(unit, 1e-12), 0.0)
     size = np.linalg.norm(best[lanes] * weight, axis=1)
     error = np.linalg.norm((found[lanes] - best[lanes]) * weight, axis=1) / size
-    told = ", ".join(f"{100.0 * each:.2f} %" for each in np.quantile(error, (0.5, 0.9, 0.99)))
-    return f"{told}, beside {100 * none:.1f} % of the lanes without one"
+    text = ", ".join(f"{100.0 * each:.2f} %" for each in np.quantile(error, (0.5, 0.9, 0.99)))
+    return f"{text}; {100 * none:.1f} % of the cases have no gradient"
 
 
 def main() -> None:
     """Print the times, then the accuracy."""
     parser = argument_parser("gradients", __doc__, num=4096, repeat=10)
-    parser.add_argument("--task", choices=_BY, default="hit")
-    parser.add_argument("--steps", type=at_least(0), help="of the adjoint")
-    parser.add_argument("--accuracy", type=at_least(0), default=64, help="compared; 0 for none")
+    parser.add_argument("--task", choices=_BY, default="hit", help="default: hit")
+    parser.add_argument("--steps", type=at_least(0), help="steps of the adjoint solver")
+    parser.add_argument(
+        "--accuracy",
+        type=at_least(0),
+        default=64,
+        help="number of gradients to compare; 0 for none",
+    )
     options = parser.parse_args()
     planner, cases, quantity = _case(options.task, options.num)
     with begin(parser, options) as bench:
@@ -105,15 +110,15 @@ def main() -> None:
 def _measure(
     bench: Bench, options: argparse.Namespace, planner: Any, cases: Any, quantity: Any
 ) -> None:
-    def differentiated(where: Any, **more: Any) -> Any:
+    def differentiate(where: Any, **more: Any) -> Any:
         return pj.gradient(planner, where, of=quantity, by=_BY[options.task], **more)
 
     resident, optimal = jax.device_put(jax.tree.map(jnp.asarray, cases)), planner.with_polish()
-    seconds = _timed(
+    seconds = _time_calls(
         {
             "plan": lambda: pj.plan(planner, resident),
             "plan to the optimum": lambda: pj.plan(optimal, resident),
-            "gradient": lambda: differentiated(resident, steps=options.steps),
+            "gradient": lambda: differentiate(resident, steps=options.steps),
         },
         options.repeat,
     )
@@ -129,30 +134,31 @@ def _measure(
     _, (_, *plain), (_, *both) = seconds.values()
     ratio = [100.0 * (b / a - 1.0) for a, b in zip(plain, both, strict=True)]
     bench.say(
-        f"gradient: {ratio[0]:.0f} % on top of plans at the optimum (fastest), {ratio[1]:.0f} % "
+        f"gradient: {ratio[0]:.0f} % more than plans at the optimum (fastest), {ratio[1]:.0f} % "
         "(median)"
     )
     plans = jax.device_get(pj.plan(optimal, resident))
     success = task_named(options.task).judge(cases, plans).success
     bench.count(success, cost_gaps(planner, cases, plans))
     if options.accuracy:
-        _compare(bench, options, differentiated, pj.take(cases, slice(options.accuracy)))
+        _compare(bench, options, differentiate, pj.take(cases, slice(options.accuracy)))
 
 
-def _compare(bench: Bench, options: argparse.Namespace, differentiated: Any, few: Any) -> None:
-    """Say how far gradients are from those of the optimum."""
-    found = differentiated(few, steps=options.steps)
+def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few: Any) -> None:
+    """Print the difference of gradients from the gradients of float64 optima."""
+    found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
-        best = differentiated(_double(few), curvature="whole", solver=_LONG)
+        best = differentiate(_double(few), curvature="whole", solver=_LONG)
     num, lanes = len(found.value), np.flatnonzero(pj.solved(best.plans))
     gradient = [_flat(each, num) for each in (found, best)]
     residual = np.nanquantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
     late = np.abs(np.asarray(found.value) - np.asarray(best.value))[lanes]
     bench.say(
-        f"{lanes.size} of {num} lanes compared",
-        f"- from the optimum's (median, p90, p99): {_errors(gradient[0], gradient[1], lanes)}",
-        f"- residual of the adjoint: {residual[0]:.2g}, {residual[1]:.2g}",
-        f"- of the quantity itself: {np.median(late):.3f}, {np.quantile(late, 0.9):.3f}",
+        f"{lanes.size} of {num} cases compared",
+        f"- error of the gradient (median, p90, p99): {_errors(gradient[0], gradient[1], lanes)}",
+        f"- residual of the adjoint (median, p90): {residual[0]:.2g}, {residual[1]:.2g}",
+        f"- error of the quantity (median, p90): {np.median(late):.3f}, "
+        f"{np.quantile(late, 0.9):.3f}",
     )
 
 

@@ -1,12 +1,12 @@
-"""Refereed success of a hit planner on every row of the published protocol.
+"""Measure refereed success of a hit planner on every row of the published protocol.
 
     python -m benchmarks.hit_rows --serves DIR [--rows base,late-0.5] [--num N] [--out DIR]
 
-Without --serves the serves are drawn by the generator (seed 0). Rows: the base start, a start
-drawn over the half court, planning that begins late, weaker limits, and drag after the impact. One
-row is not of the protocol: `tight` has limits of 2.5 m/s, 10 m/s^2 and 3 rad/s, and every hundredth
-ball flies away from the quadrotor, so that no plan can reach it.
-Prints a table; the run folder also holds the indices of each row's failures.
+Without --serves the serves are drawn by the generator (seed 0). The rows are the base start, starts
+drawn over the half court, planning that starts late, weaker limits, and drag after the impact. The
+row `tight` is not part of the protocol: its limits are 2.5 m/s, 10 m/s^2 and 3 rad/s, and in every
+hundredth case the ball flies away from the quadrotor, so that no plan can reach it. Prints a table.
+The run folder also holds the indices of each row's failures.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.hit.suites import Serves
 
@@ -34,7 +34,7 @@ _TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
 
 
 def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
-    """The cases of a row."""
+    """Return the cases of a row."""
     cases = pj.hit.to_cases(serves, **ROWS[name])
     if name != "tight":
         return cases
@@ -49,7 +49,7 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
 
 
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
-    """One row's figures, counted."""
+    """Return the figures of one row, and count its successes."""
     drag_after = name == "drag-after-impact"
     planner = pj.hit.planner("exact", drag_after_impact=drag_after)
     cases = cases_of(name, serves)
@@ -80,12 +80,16 @@ def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Run the rows asked for."""
+    """Print the requested rows."""
     parser = argument_parser("hit_rows", __doc__, num=9000)
-    parser.add_argument("--serves", type=Path, help="folder of published trial files")
-    parser.add_argument("--rows", default=",".join(ROWS), help="comma-separated; default all")
+    parser.add_argument(
+        "--serves", type=Path, help="folder of published trial files; default: draw serves"
+    )
+    parser.add_argument(
+        "--rows", default=",".join(ROWS), help="rows, comma-separated; default: all"
+    )
     options = parser.parse_args()
-    names = chosen(parser, "--rows", options.rows, ROWS)
+    names = parse_names(parser, "--rows", options.rows, ROWS)
     read, num = options.serves, options.num
     serves = (pj.hit.read_serves(read) if read else pj.hit.generate_serves(num, 0))[:num]
     with begin(parser, options) as bench:

@@ -1,14 +1,14 @@
-"""Whether a car gets away from its start at all: every motion of its first seconds, by sampling.
+"""Check by sampling whether a car can leave its start without a collision at all.
 
-A car that sets out at speed cannot turn on the spot, nor go back. Where something stands or comes
-close ahead, all of its ways may end in it, although a lattice, whose cars turn at once and whose
-places are rounded, finds one. Here states keep their exact numbers, and only those in the same
-small cell count as one. Nothing is shared with the planners. World frame in the plane, SI units.
+A car that starts at speed can neither turn on the spot nor reverse. With an obstacle close ahead,
+all of its motions may collide, although a lattice finds one, because lattice cars turn instantly
+and lattice positions are rounded. Here states have exact values, and only states in the same small
+cell are merged. Nothing is shared with the planners. World frame in the plane, SI units.
 
 In a step the steering angle changes at one of five rates and the speed at one of three, up to the
-greatest. What would exceed a limit of curvature or lateral acceleration is held at it, even where
-the wheels could not be turned back in time, which errs on the side of a way; what a cell and a
-thinned set leave out errs on the other. Obstacles are looked at every 0.02 s, as by the referee.
+limits. Steering that would exceed a limit of curvature or lateral acceleration is clipped, even if
+the wheels could not be turned back in time, which may accept an infeasible motion. Merged and
+discarded states may miss a feasible motion. Obstacles are checked every 0.02 s, as by the referee.
 """
 
 import numpy as np
@@ -16,18 +16,18 @@ import numpy as np
 from planner_jax.benchmarks.intercept_lattice import Scene
 
 STEP = 0.1  # [s]
-_PARTS = 5  # of a step, after each of which obstacles are looked at
+_PARTS = 5  # of a step; obstacles are checked after each part
 _CELL = np.array([0.015, 0.015, 0.03, 0.08, 0.15])  # x, y [m], heading [rad], speed, steering
-_MOST = 20_000  # states that are followed; more are thinned at random
-_RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # of the greatest steering rate
-_PEDALS = np.array([-1.0, 0.0, 1.0])  # of the greatest acceleration
+_MOST = 20_000  # maximum number of states; more are thinned at random
+_RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # of the steering rate limit
+_PEDALS = np.array([-1.0, 0.0, 1.0])  # of the acceleration limit
 
 
 def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2.0) -> bool:
-    """Whether some motion that touches nothing gets `far` [m] from the start in `until` [s].
+    """Return whether some collision-free motion gets `far` [m] from the start in `until` [s].
 
-    Where the target is to be met nearer or sooner than that, it is enough to touch nothing for
-    `alive` [s], or until the meeting.
+    If the target is to be met nearer or sooner, it is enough to be collision-free for `alive` [s],
+    or until the meeting.
     """
     random = np.random.default_rng(0)
     steering = np.arctan(scene.wheelbase * scene.initial_curvature)
@@ -36,7 +36,7 @@ def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2
     must_leave = np.linalg.norm(scene.target[-1] - scene.start[:2]) >= far + scene.length
     must_leave &= end >= until
     for number in range(int((until if must_leave else min(alive, end)) / STEP + 1e-6)):
-        states = _advanced(scene, states, number * STEP)
+        states = _advance(scene, states, number * STEP)
         if not len(states):
             return False
         if must_leave and np.linalg.norm(states[:, :2] - scene.start[:2], axis=1).max() >= far:
@@ -48,8 +48,8 @@ def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2
     return not must_leave
 
 
-def _advanced(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
-    """All states (M, 5) one step after states (N, 5) at a time [s] that touch nothing."""
+def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
+    """Return all collision-free states (M, 5) one step after states (N, 5) at a time [s]."""
     x, y, heading, speed, steering = (
         np.repeat(column, len(_RATES) * len(_PEDALS)) for column in states.T
     )
@@ -77,7 +77,7 @@ def _advanced(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
 def is_free(
     scene: Scene, x: np.ndarray, y: np.ndarray, heading: np.ndarray, time: float
 ) -> np.ndarray:
-    """Whether cars at (N,) poses touch nothing at a time [s] and are on the map, (N,) bool."""
+    """Return which cars at (N,) poses are collision-free and on the map at a time [s]."""
     cos, sin = np.cos(heading), np.sin(heading)
     x, y = x + scene.middle * cos, y + scene.middle * sin
     free = (x >= scene.lower[0]) & (x <= scene.upper[0])
@@ -98,7 +98,7 @@ def is_free(
 
 
 def _is_apart(scene: Scene, corners, x, y, cos, sin) -> np.ndarray:
-    """Whether bodies with middles (N,) do not overlap a polygon (V, 2): by separating axes."""
+    """Return which bodies with middles (N,) do not overlap a polygon (V, 2), by separating axes."""
     half = 0.5 * np.array([scene.length, scene.width])
     from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N)
     along, across = cos * from_x + sin * from_y, cos * from_y - sin * from_x

@@ -1,21 +1,21 @@
-"""Groups of three targets, one car: what deciding the order is worth, beside a bound.
+"""Compare ways to order three targets for one car, beside a lower bound on the time.
 
     python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
 
-The first three targets of groups of the suite `group` are met in the best of all six orders, each
-planned; in the best of the three orders that the estimate has in front; in greedy order, next
-whatever can be met earliest as estimated; and in the order in which they were drawn, which is
-random. Success is the referee's; times of the last meeting are those of groups that all four solve.
+The first three targets of groups of the suite `group` are met in four orders: the best of all six
+orders, each planned; the best of the three orders with the lowest estimates; the greedy order,
+which continues with the target of the earliest estimated meeting; and the order in which the
+targets were drawn, which is random. Success is judged by the referee. Times of the last meeting are
+over groups that all four solve.
 
-No plan meets all targets earlier than the bound, the least over all orders: a point that goes
-straight on in any direction at once, no faster than the middle of the body of a car that gives all
-it has from the start, and through everything. It meets targets within the case's tolerance and
-begins the next leg as far off again. Meeting as early as it can is best for it, since it is faster
-than its targets and can stay with them.
+No plan meets all targets earlier than the bound, the minimum over all orders for a point that moves
+straight in any direction at once, through obstacles. Its speed is at most the middle's speed
+at full acceleration from the start. It meets targets within the case's tolerance, and may start the
+next leg this tolerance away on the other side. Early meetings are optimal for this point, because
+it is faster than its targets and can stay with them.
 
-Times of planning are those of a second call, warm, of all groups at once; ways to decide share
-compiled programs, and the first one compiles most of them. The summary's success is
-that of the best of all orders.
+Planning times are of a second call for all groups at once. The first listed decision compiles most
+programs, and the others share them. The summary's success is for the best of all orders.
 """
 
 import argparse
@@ -41,11 +41,11 @@ DECISIONS = {
     "greedy": "greedy",
     "random": "given",
 }
-STEP = 0.005  # [s], of the bound
+STEP = 0.005  # [s], time step of the bound
 
 
 def draw(num: int, seed: int) -> InterceptGroup:
-    """Groups of three, NumPy leaves."""
+    """Draw groups of three targets, with NumPy leaves."""
     groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
@@ -54,13 +54,13 @@ def draw(num: int, seed: int) -> InterceptGroup:
 @jax.jit
 @jax.vmap
 def _places(paths: PlanePath, times: jax.Array) -> jax.Array:
-    """Where targets with a leading axis N are at times (T,) [s], (N, T, 2) [m]."""
+    """Return positions (N, T, 2) [m] of targets with a leading axis N at times (T,) [s]."""
     at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
     return jax.vmap(at, (0, None))(paths, times)
 
 
-def bound(groups: InterceptGroup) -> np.ndarray:
-    """Earliest time (B,) [s] at which the last of the first three targets can be met; or inf."""
+def limit_times(groups: InterceptGroup) -> np.ndarray:
+    """Return lower bounds (B,) [s] on the time of the last of three meetings; inf if impossible."""
     shared = groups.shared
     num = int(np.ceil(shared.time.max() / STEP)) + 1
     times = np.broadcast_to(
@@ -68,8 +68,9 @@ def bound(groups: InterceptGroup) -> np.ndarray:
     )
     places = np.asarray(_places(shared.target, times), float)
     limits, ahead = shared.limits, np.asarray(shared.body.middle)
-    # The middle's speed is sqrt(v^2 + (ahead v kappa)^2), and (v kappa)^2 the product of kappa and
-    # v^2 kappa, both of which have limits. It never falls: at the end of a step it is greatest.
+    # The middle's speed is sqrt(v^2 + (ahead v kappa)^2), and (v kappa)^2 is the product of kappa
+    # and v^2 kappa, and both have limits. It never decreases, so it is greatest at the end of
+    # a step.
     v = np.minimum(
         limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
     )
@@ -79,10 +80,12 @@ def bound(groups: InterceptGroup) -> np.ndarray:
     heading = start[:, 2]
     middle = start[:, :2] + ahead[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
     orders = itertools.permutations(range(TARGETS))
-    return np.min([_met(order, middle, way, times, places, tolerance) for order in orders], axis=0)
+    return np.min(
+        [_meet_in_order(order, middle, way, times, places, tolerance) for order in orders], axis=0
+    )
 
 
-def _met(
+def _meet_in_order(
     order: tuple[int, ...],
     place: np.ndarray,
     way: np.ndarray,
@@ -90,14 +93,14 @@ def _met(
     places: np.ndarray,
     tolerance: np.ndarray,
 ) -> np.ndarray:
-    """When (B,) [s] the bound's point meets the last target of an order; or inf.
+    """Return when (B,) [s] the bound's point meets the last target of an order; inf if never.
 
     Args:
-        order: places of targets.
-        place: (B, 2) [m], where it is at time 0.
-        way: (B, T) [m], how far it comes up to each time at most.
+        order: indices of the targets.
+        place: (B, 2) [m], position of the point at time 0.
+        way: (B, T) [m], greatest distance covered up to each time.
         times: (B, T) [s].
-        places: (B, N, T, 2) [m], of the targets.
+        places: (B, N, T, 2) [m], positions of the targets.
         tolerance: (B,) [m].
     """
     lanes, at, slack = np.arange(len(way)), np.zeros(len(way), int), tolerance
@@ -107,14 +110,14 @@ def _met(
         meets = far <= way - way[lanes, at, None] + slack[:, None]
         meets &= np.arange(way.shape[1]) >= at[:, None]
         met &= meets.any(axis=1)
-        # Between two of the times it may meet earlier than at the later one.
+        # It may meet the target between the time step before and this one.
         at = np.maximum(meets.argmax(axis=1) - 1, at)
         place, slack = places[lanes, target, at], 2.0 * tolerance
     return np.where(met, times[lanes, at], np.inf)
 
 
-def timed(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
-    """Plans, and the seconds of the first call and of another one."""
+def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
+    """Return plans, and the durations [s] of the first and the second call."""
     planner, began = pj.group.planner(decide=decide), time.perf_counter()
     pj.plan(planner, groups)
     between = time.perf_counter()
@@ -123,11 +126,11 @@ def timed(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float,
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan the groups in all four ways, and print a row of each."""
+    """Plan the groups with all four decisions, and print a row for each."""
     groups = draw(options.num, options.seed)
-    least, found = bound(groups), {}
+    least, found = limit_times(groups), {}
     for name, decide in DECISIONS.items():
-        plans, cold, warm = timed(groups, decide)
+        plans, cold, warm = time_planning(groups, decide)
         success = pj.group.judge(groups, plans).success
         found[name] = np.asarray(plans.cost), success, max(cold - warm, 0.0), warm
     common = np.all([success for _, success, _, _ in found.values()], axis=0)
@@ -135,8 +138,8 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
         f"{options.num} groups of {TARGETS}, seed {options.seed}; times of the {common.sum()} that "
         f"all solve; load average {os.getloadavg()[0]:.1f}",
         "",
-        "| order | refereed success | last meeting, median | p90 | over the bound, median "
-        "| earliest of all six | ms a group, warm | compiling |",
+        "| order | refereed success | last meeting, median | p90 | above the bound, median "
+        "| as early as the best | ms a group, warm | compiling |",
         "|---|---|---|---|---|---|---|---|",
     )
     best, *_ = found["best of all six orders"]
@@ -166,7 +169,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Print a row of every way to decide, and the bound."""
+    """Print a row for every decision, and the bound."""
     parser = argument_parser("intercept_group", __doc__, num=20, seed=1)
     options = parser.parse_args()
     with begin(parser, options) as bench:

@@ -1,15 +1,15 @@
-"""What a car can reach in space and time: a lattice of pose and speed, layer by layer.
+"""Compute what a car can reach in space and time: a lattice of pose and speed, layer by layer.
 
 A state is the rear axle's cell, one of 64 headings and a speed. All cells of one heading and speed
-are the bits of one Python integer, so that a move is a shift of it, and what is in the way a mask.
-Nothing is shared with the planners. World frame in the plane, SI units.
+are the bits of one Python integer, so a motion is a bit shift, and obstacles are masks. Nothing is
+shared with the planners. World frame in the plane, SI units.
 
-In a layer of `dt` a car moves for half of it, changes speed by at most one level (the greatest
-acceleration) and turns by at most as many headings as curvature and lateral acceleration allow at
-its new speed, and moves for the other half. How far a state moves along its heading is rounded
-from what it adds up to since time 0, so that slow and slanted motion is not lost. A cell is just
-at the case's start, its heading and its speed are the nearest ones, and obstacles are held against
-the cells to 1/8 of their side, after every half layer.
+In a layer of `dt` a car first moves for half of it. Then its speed changes by at most one level
+(the acceleration limit), and its heading by at most as many steps as curvature and lateral
+acceleration allow at the new speed. Then it moves for the other half. The distance along a heading
+is rounded from its total since time 0, so that slow and oblique motion is not lost. The start is
+exactly a cell, its heading is one of the headings, and its speed is the nearest level. Obstacles
+are checked after every half layer, with positions rounded to 1/8 of a cell's side.
 """
 
 import dataclasses
@@ -21,24 +21,24 @@ import numpy as np
 CELL = 0.05  # [m], side of a cell
 HEADINGS = 64
 LAYER = 0.25  # [s], longest layer
-FINER = 4  # in how many parts a cell's side is cut where obstacles are drawn
+FINER = 4  # number of parts of a cell's side, for drawing obstacles
 _FINE = CELL / FINER
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One interception as plain numbers, with the target's places at the layers."""
+    """One interception as plain numbers, with positions of the target at the layers."""
 
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
     initial_curvature: float  # [1/m]
     dt: float  # [s], of a layer; the last one of L ends at the case's time
-    target: np.ndarray  # (L + 1, 2) [m]
+    target: np.ndarray  # (L + 1, 2) [m], positions at the layers
     tolerance: float  # [m]
     end_heading: float  # [rad]
     heading_tolerance: float  # [rad]
     walls: tuple[np.ndarray, ...]  # corners (V, 2) [m] each, counter-clockwise
-    movers: tuple[np.ndarray, ...]  # likewise, at time 0
+    movers: tuple[np.ndarray, ...]  # corners as for walls, at time 0
     velocities: np.ndarray  # (M, 2) [m/s], of the movers
     lower: np.ndarray  # (2,) [m], of the map, which the body's middle does not leave
     upper: np.ndarray  # (2,) [m]
@@ -50,16 +50,16 @@ class Scene:
     acceleration: float  # [m/s^2], greatest
     lateral_acceleration: float  # [m/s^2], greatest
     curvature: float  # [1/m], greatest
-    steering_rate: float  # [rad/s], greatest; lattices do not look at it
+    steering_rate: float  # [rad/s], greatest; ignored by lattices
 
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """Which rounding of turns and which part of the body a lattice takes."""
+    """Rounding of turns, and the part of the body that a lattice checks for collisions."""
 
     discs: int  # 1: half the width around the middle, inside of the body; 2: they cover the body
-    # Whether a limit between two numbers of headings is the greater one in every layer. If not,
-    # limits add up: over many layers a car turns by at most one heading more than it can.
+    # Whether a fractional limit on the number of heading steps is rounded up in every layer. If
+    # not, fractions accumulate: over many layers a car turns by at most one step more than it can.
     turns_up: bool
 
 
@@ -69,15 +69,15 @@ STRICT = Rules(discs=2, turns_up=False)
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """What a lattice says of one scene."""
+    """Result of a lattice for one scene."""
 
     at_end: bool  # whether the target can be met at the case's time
     earliest: float  # [s], first layer at which it can be met; inf if there is none
-    way: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed at half layers, if asked
+    way: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed; None if not requested
 
 
 def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
-    """Where discs are ahead of the rear axle [m], and their radius [m]."""
+    """Return the positions of discs ahead of the rear axle [m], and their radius [m]."""
     half = 0.5 * scene.width
     if rules.discs == 1:
         return [scene.middle], half
@@ -87,7 +87,7 @@ def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
 
 
 def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np.ndarray:
-    """Whether (Y, X) points of a grid are within a radius [m] of a convex polygon.
+    """Return whether (Y, X) points of a grid are within a radius [m] of a convex polygon.
 
     Args:
         x: (X,) [m].
@@ -108,13 +108,13 @@ def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np
     return inside | close
 
 
-def _whole(value: np.ndarray) -> np.ndarray:
-    """The nearest whole numbers; halves go up, wherever they are."""
+def _round(value: np.ndarray) -> np.ndarray:
+    """Round to integers; halves are rounded up, also for negative numbers."""
     return np.floor(value + 0.5).astype(int)
 
 
 class Lattice:
-    """The lattice of one scene and one set of rules."""
+    """Lattice of one scene and one set of rules."""
 
     def __init__(self, scene: Scene, rules: Rules):
         if not np.isfinite([*scene.lower, *scene.upper, scene.speed, scene.acceleration]).all():
@@ -128,11 +128,11 @@ class Lattice:
         self._draw_movers()
         self.walls = self._draw_walls()
         self.placed = self._place_movers()
-        self.levels, self.shifts, self.turns = self._moves()
+        self.levels, self.shifts, self.turns = self._list_moves()
         self.free = functools.cache(self._free)
 
     def _lay_grid(self) -> None:
-        """Cells that hold every place of the rear axle, one of them just at the start."""
+        """Define cells for all positions of the rear axle, with one cell exactly at the start."""
         scene = self.scene
         first = np.ceil((scene.start[:2] - scene.lower + scene.middle) / CELL).astype(int)
         last = np.ceil((scene.upper + scene.middle - scene.start[:2]) / CELL).astype(int)
@@ -140,14 +140,14 @@ class Lattice:
         self.origin = scene.start[:2] - first * CELL
 
     def _draw_movers(self) -> None:
-        """Each mover's first place, size in cells, and bits for every place within a cell."""
+        """Store bits of each mover for every offset within a cell, with first cell and size."""
         drawn = []
         for corners in self.scene.movers:
             low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
             high = np.ceil((corners.max(axis=0) + self.radius) / _FINE).astype(int)
             x, y = (_FINE * np.arange(low[k], high[k] + 1) for k in (0, 1))
             drawn.append((low, near(x, y, corners, self.radius)))
-        # Columns that part the rows, so that nothing which moves runs into the next row.
+        # Empty columns separate the rows, so that a shifted bit never enters the next row.
         farthest = int(np.ceil(self.scene.speed * self.scene.dt / CELL)) + 2
         guard = max([farthest, *(-(-cells.shape[1] // FINER) for _, cells in drawn)])
         self.stride = int(self.count[0]) + guard
@@ -165,7 +165,7 @@ class Lattice:
         ]
 
     def _draw_walls(self) -> list[int]:
-        """For each heading the cells at which the car is on the map and touches no wall."""
+        """Return for each heading the cells at which the car is on the map and touches no wall."""
         scene, pad = self.scene, int(np.ceil(max(self.ahead) / _FINE)) + 1
         fine = [
             self.origin[k] + _FINE * np.arange(-pad, FINER * self.count[k] + pad) for k in (0, 1)
@@ -186,18 +186,24 @@ class Lattice:
                 (at_x >= scene.lower[0]) & (at_x <= scene.upper[0])
             )
             for ahead in self.ahead:
-                j, i = pad + _whole(ahead * np.array([x, y]) / _FINE)
+                j, i = pad + _round(ahead * np.array([x, y]) / _FINE)
                 is_free &= ~blocked[i::FINER, j::FINER][: self.count[1], : self.count[0]]
             free.append(as_integer(is_free, self.stride))
         return free
 
-    def _moves(self) -> tuple[np.ndarray, list, list]:
-        """Speeds (S,) [m/s]; shifts by half layer, speed and heading; turns by layer and speed."""
+    def _list_moves(self) -> tuple[np.ndarray, list, list]:
+        """Return the speed levels and the moves.
+
+        Returns:
+            levels: (S,) [m/s].
+            shifts: bit shifts by half layer, speed and heading.
+            turns: number of heading steps by layer and speed.
+        """
         scene = self.scene
         level = scene.acceleration * scene.dt
         levels = level * np.arange(int(scene.speed / level + 1e-6) + 1)
         half = 0.5 * scene.dt * levels[:, None, None] * self.direction / CELL  # (S, HEADINGS, 2)
-        passed = _whole(half * np.arange(2 * self.layers + 1)[:, None, None, None])
+        passed = _round(half * np.arange(2 * self.layers + 1)[:, None, None, None])
         steps = np.diff(passed, axis=0)
         shifts = (steps[..., 1] * self.stride + steps[..., 0]).tolist()
         rate = np.minimum(
@@ -211,14 +217,14 @@ class Lattice:
         return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
-        """Where movers are drawn: shifts of stencils, by half layer and heading."""
+        """Return stencils of movers with their bit shifts, by half layer and heading."""
         scene, num = self.scene, 2 * self.layers + 1
         times = 0.5 * scene.dt * np.arange(num)
         drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]
         for velocity, (low, size, stencil) in zip(scene.velocities, self.stencils, strict=True):
             for ahead in self.ahead:
                 place = (velocity * times[:, None] - self.origin)[:, None] - ahead * self.direction
-                place = _whole(place / _FINE) + low
+                place = _round(place / _FINE) + low
                 cell = -(-place // FINER)
                 within = FINER * cell - place
                 shift = cell[..., 1] * self.stride + cell[..., 0]
@@ -229,20 +235,20 @@ class Lattice:
         return drawn
 
     def _free(self, half: int, heading: int) -> int:
-        """Cells at which a car of one heading touches nothing after so many half layers."""
+        """Return the cells at which a car of one heading is free of collision at a half layer."""
         blocked = 0
         for stencil, shift in self.placed[half][heading]:
-            blocked |= shifted(stencil, shift)
+            blocked |= shift_bits(stencil, shift)
         walls = self.walls[heading]
         return walls ^ (walls & blocked)
 
     def _goal(self, layer: int) -> list[int]:
-        """For each heading the cells at which the body's middle is at the target."""
+        """Return for each heading the cells at which the body's middle is at the target."""
         scene = self.scene
         reach = scene.tolerance + CELL * np.sqrt(0.5)
         place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL
         side = np.arange(-int(reach / CELL) - 1, int(reach / CELL) + 2)
-        cells = np.stack(np.meshgrid(side, side), axis=2).reshape(-1, 2) + _whole(place)[:, None]
+        cells = np.stack(np.meshgrid(side, side), axis=2).reshape(-1, 2) + _round(place)[:, None]
         meets = np.linalg.norm(cells - place[:, None], axis=2) * CELL <= reach
         meets &= ((cells >= 0) & (cells < self.count)).all(axis=2)
         angle = scene.start[2] - scene.end_heading + 2.0 * np.pi * np.arange(HEADINGS) / HEADINGS
@@ -254,7 +260,7 @@ class Lattice:
         ]
 
     def sets(self) -> Iterator[list[list[int]]]:
-        """What is reached after 0, 1, ... L layers, by speed and heading."""
+        """Yield the reached cells after 0, 1, ... L layers, by speed and heading."""
         num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
         planes = [[0] * HEADINGS for _ in range(num)]
         rise = self.scene.acceleration * self.scene.dt
@@ -262,33 +268,33 @@ class Lattice:
         planes[level][0] = (1 << start) & self.free(0, 0)
         yield planes
         for layer in range(self.layers):
-            planes = self._moved(planes, 2 * layer)
+            planes = self._move(planes, 2 * layer)
             planes = [
-                [a | b | c for a, b, c in zip(*self._beside(planes, k), strict=True)]
+                [a | b | c for a, b, c in zip(*self._neighbours(planes, k), strict=True)]
                 for k in range(num)
             ]
             turns = self.turns[layer]
             planes = [_spread(row, turn) for row, turn in zip(planes, turns, strict=True)]
-            planes = self._moved(planes, 2 * layer + 1)
+            planes = self._move(planes, 2 * layer + 1)
             yield planes
 
-    def _beside(self, planes: list[list[int]], k: int) -> list[list[int]]:
-        """What is reached with a speed, and with the next lower and the next higher one."""
+    def _neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
+        """Return the reached cells of a speed level, and of the next lower and higher level."""
         last = len(planes) - 1
         return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
 
-    def _moved(self, planes: list[list[int]], half: int) -> list[list[int]]:
-        """What is reached another half layer later."""
+    def _move(self, planes: list[list[int]], half: int) -> list[list[int]]:
+        """Return the reached cells after another half layer."""
         return [
             [
-                shifted(plane, shift) & self.free(half + 1, heading) if plane else 0
+                shift_bits(plane, shift) & self.free(half + 1, heading) if plane else 0
                 for heading, (plane, shift) in enumerate(zip(row, shifts, strict=True))
             ]
             for row, shifts in zip(planes, self.shifts[half], strict=True)
         ]
 
     def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
-        """A cell's bit, level and heading of states that meet the target, one a plane."""
+        """Return bit, level and heading of states at the target, at most one for each plane."""
         goal = self._goal(layer)
         found = [
             (plane & goal[heading], level, heading)
@@ -298,7 +304,7 @@ class Lattice:
         return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
 
     def reach(self, keep_way: bool = False) -> Reach:
-        """Whether and when the target can be met, with the way to the earliest meeting if asked."""
+        """Return whether and when the target can be met; `keep_way` adds a path to that meeting."""
         earliest, at_end, kept, way = np.inf, False, [], None
         for layer, planes in enumerate(self.sets()):
             if keep_way and way is None:
@@ -307,11 +313,11 @@ class Lattice:
             at_end = bool(found)
             if found and np.isinf(earliest):
                 earliest = layer * self.scene.dt
-                way = self._way_back(kept, found[0]) if keep_way else None
+                way = self._trace_back(kept, found[0]) if keep_way else None
         return Reach(at_end=at_end, earliest=earliest, way=way)
 
-    def _way_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """A way (2 n + 1, 5) through sets of n layers to a state; see `Reach`."""
+    def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
+        """Trace a path (2 n + 1, 5) back from a state through n layers; see `Reach.way`."""
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):
             bit, level, heading = state
@@ -336,7 +342,7 @@ class Lattice:
         return np.array(rows[::-1])
 
     def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Time [s], x [m], y [m], heading [rad] and speed [m/s] of a state."""
+        """Return time [s], x [m], y [m], heading [rad] and speed [m/s] of a state."""
         bit, level, heading = state
         row, column = divmod(bit, self.stride)
         x, y = self.origin + CELL * np.array([column, row])
@@ -345,22 +351,22 @@ class Lattice:
 
 
 def as_integer(cells: np.ndarray, stride: int) -> int:
-    """Bits of cells (Y, X), the rows `stride` apart."""
+    """Pack cells (Y, X) into the bits of an integer, with rows `stride` bits apart."""
     padded = np.zeros((len(cells), stride), bool)
     padded[:, : cells.shape[1]] = cells
     return int.from_bytes(np.packbits(padded, bitorder="little").tobytes(), "little")
 
 
-def shifted(plane: int, shift: int) -> int:
-    """Bits moved up, or down."""
+def shift_bits(plane: int, shift: int) -> int:
+    """Shift bits up, or down if `shift` is negative."""
     return plane << shift if shift >= 0 else plane >> -shift
 
 
 def _spread(row: list[int], turn: int) -> list[int]:
-    """What is in each plane of a ring or in up to `turn` beside it, by doubling."""
-    wanted, width, spread = 2 * turn + 1, 1, row  # spread[h] holds row[h] to row[h + width - 1]
-    while width < wanted:
-        step = min(width, wanted - width)
+    """Unite each plane of a ring with up to `turn` neighbours on either side, by doubling."""
+    target, width, spread = 2 * turn + 1, 1, row  # spread[h] unites row[h:h + width]
+    while width < target:
+        step = min(width, target - width)
         spread = [spread[h] | spread[(h + step) % HEADINGS] for h in range(HEADINGS)]
         width += step
     return spread[-turn:] + spread[:-turn] if turn else spread

@@ -1,32 +1,36 @@
-"""Which interceptions of a suite can be solved at all, and how early their targets can be met.
+"""Measure which interceptions of a suite are feasible, and how early their targets can be met.
 
     python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
         [--planner spacetime] [--failed | --early] [--workers N] [--out FILE.npz]
 
 Three searches in space and time, which share no code with the planners, answer for each case
-whether the target can be met at the case's time, and which is the earliest layer, of 0.25 s, to
-meet it:
+whether the target can be met at the case's time, and at which layer, of 0.25 s, it can be met
+first:
 
-* `strict`: a lattice of pose and speed (`intercept_lattice`) where two discs that cover the body
-  keep off everything. What it reaches is feasible up to the grid: a cell is 0.05 m, a heading
-  5.6 degrees, obstacles are looked at every 0.125 s, and nobody looks at the steering rate. Cars
-  that turn at once get away from starts which no car gets away from, so states without a grid and
-  with a steering rate (`intercept_departure`) must get away from the start as well.
-* `minimal`: the same lattice where one disc inside of the body does, and turns are rounded up in
-  every layer. But for the rounding of cells, which closes ways as well as it opens some, it
-  reaches what any car reaches. That it does not reach a target is strong evidence, no proof.
-* `bound`: a point that goes in any direction, no faster than the car (`intercept_bound`). It is
-  sound: no car meets a target at the time of a layer at which this point does not.
+* `strict`: a lattice of pose and speed (`intercept_lattice`) with two discs that cover the body.
+What
+  it reaches is feasible up to the grid: a cell is 0.05 m, a heading step 5.6 degrees, obstacles are
+  checked every 0.125 s, and the steering rate is ignored. Lattice cars turn instantly and may leave
+  starts that no real car can leave. Therefore a search without a grid and with a steering rate
+  (`intercept_departure`) must be able to leave the start as well.
+* `minimal`: the same lattice with one disc inside of the body, and turns rounded up in every layer.
+It
+  reaches what any car reaches, except that rounding to cells may close paths as well as open them.
+  A
+  target that it does not reach is therefore strong evidence of infeasibility, but no proof.
+* `bound`: a point that moves in any direction, no faster than the car (`intercept_bound`). It is
+sound:
+  no car meets a target at the time of a layer at which this point does not.
 
-So a case is proven infeasible where `bound` fails; where `minimal` fails, it is so in all
-likelihood; where `strict` succeeds, it can be solved up to the grid. What is between `minimal` and
-`strict` is open. Meetings are looked at with the case's tolerance, in lattices half a diagonal of a
-cell more, at the times of layers alone.
+Hence a case is proven infeasible if `bound` fails, and very likely infeasible if `minimal` fails.
+If `strict` succeeds, it is feasible up to the grid. Cases that only `minimal` reaches are
+undecided. Meetings are checked at the times of layers only, with the case's tolerance, which
+lattices increase by half the diagonal of a cell.
 
-A planner, by default the default one, plans the same cases. Those that `strict` reaches, or that
-were solved, are taken for feasible; which of them it solved is its success, by the referee. With
-`--failed` no other cases than those it does not solve are searched, which gives the same success
-much sooner. With `--early` the default planner also meets every target as early as it can, beside
+A planner, `spacetime` by default, plans the same cases. Cases that `strict` reaches or that the
+planner solves count as feasible. The share of them that the planner solves, by the referee, is its
+success. With `--failed` only unsolved cases are searched, which gives the same success much sooner.
+With `--early` the default planner also meets every target as early as possible, for comparison with
 the earliest meeting of `strict`.
 """
 
@@ -57,7 +61,7 @@ SEARCHES = ("bound", "minimal", "strict")
 
 
 def scenes(cases: InterceptCase) -> list[Scene]:
-    """The cases of a batch as plain numbers."""
+    """Convert the cases of a batch to plain numbers."""
     ends = np.asarray(cases.time, float)
     layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
     times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)
@@ -102,18 +106,18 @@ def scenes(cases: InterceptCase) -> list[Scene]:
 @jax.jit
 @jax.vmap
 def _places(path: PlanePath, times: jax.Array) -> jax.Array:
-    """Where a target is at times (T,) [s], (T, 2) [m]."""
+    """Return positions (T, 2) [m] of a target at times (T,) [s]."""
     return jax.vmap(lambda time: path.at(time).pos)(times)
 
 
 def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Corners (V, 2) [m] of those that are present, and their velocities (N, 2) [m/s]."""
+    """Return corners (V, 2) [m] of the obstacles that are present, and velocities (N, 2) [m/s]."""
     corners, present = group.vertices(0.0), np.asarray(group.present)
     return tuple(np.asarray(corners)[present]), np.asarray(group.velocity)[present]
 
 
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
-    """Of each of `SEARCHES`, whether there is a meeting at the case's time; the earliest [s]."""
+    """Return for each of `SEARCHES` whether it meets at the case's time, and the earliest [s]."""
     of_bound = earliest_bound(scene)
     minimal, strict = (Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT))
     of_strict = (strict.at_end, strict.earliest) if departs(scene) else (False, np.inf)
@@ -122,26 +126,26 @@ def search(scene: Scene) -> tuple[list[bool], list[float]]:
 
 
 def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Of B scenes whether (B, 3) they can be solved at their time, and the earliest (B, 3) [s]."""
+    """Search B scenes; return both results of `search` as (B, 3) arrays."""
 
-    def gathered(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
+    def gather(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
         pairs = list(tqdm(results, total=len(found), unit="case"))
         at_end, earliest = ([pair[k] for pair in pairs] for k in range(2))
         return np.reshape(at_end, (-1, len(SEARCHES))), np.reshape(earliest, (-1, len(SEARCHES)))
 
     if workers == 1:
-        return gathered(map(search, found))
+        return gather(map(search, found))
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        return gathered(pool.imap(search, found))
+        return gather(pool.imap(search, found))
 
 
-def listed(indices: np.ndarray) -> str:
-    """Places of cases, as text."""
+def format_indices(indices: np.ndarray) -> str:
+    """Format indices of cases as text."""
     return ", ".join(map(str, indices)) or "none"
 
 
 def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.ndarray) -> None:
-    """Say what was found of B cases: at their time (B, 3), and the earliest (B, 3) [s]."""
+    """Print the results of B cases: at the case's time (B, 3), and the earliest (B, 3) [s]."""
     bench.say(
         "| search | solved at the case's time | at any time up to it | earliest median | p95 "
         "| not at the case's time |",
@@ -152,7 +156,7 @@ def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.nda
         bench.say(
             f"| {name} | {100 * at_end[:, k].mean():.1f} % "
             f"| {100 * np.isfinite(earliest[:, k]).mean():.1f} % | {median:.2f} s | {late:.2f} s "
-            f"| {listed(index[~at_end[:, k]])} |"
+            f"| {format_indices(index[~at_end[:, k]])} |"
         )
         bench.note(
             **{
@@ -166,30 +170,30 @@ def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.nda
     gaps = np.diff(earliest[both], axis=1)
     bench.say(
         "",
-        f"minimal and strict agree on {100 * same.mean():.1f} %; strict is later by "
-        f"{gaps[:, 1].mean() if both.any() else np.nan:.2f} s, minimal than the bound by "
-        f"{gaps[:, 0].mean() if both.any() else np.nan:.2f} s (means of those met).",
+        f"minimal and strict agree on {100 * same.mean():.1f} %; strict is later than minimal by "
+        f"{gaps[:, 1].mean() if both.any() else np.nan:.2f} s, minimal later than the bound by "
+        f"{gaps[:, 0].mean() if both.any() else np.nan:.2f} s (means over cases that all meet).",
     )
     bench.note(agreement=same.mean())
 
 
 def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.ndarray) -> None:
-    """Say how many of the feasible ones of B cases were solved, (B,) bool each."""
+    """Print how many of the feasible ones of B cases are solved, (B,) bool each."""
     feasible = reached | solved
     good, num = int(solved.sum()), int(feasible.sum())
     low, high = wilson_interval(good, num)
     bench.say(
         "",
-        f"The planner solves {percent(good, num)} % of the {num} that are feasible (95 % interval "
+        f"The planner solves {percent(good, num)} % of the {num} feasible cases (95 % interval "
         f"{100 * low:.1f} to {100 * high:.1f} %), and {percent(good, len(index))} % of all. "
-        f"Feasible and not solved: {listed(index[feasible & ~solved])}.",
+        f"Feasible and not solved: {format_indices(index[feasible & ~solved])}.",
     )
     bench.note(of_feasible=good / max(num, 1))
     bench.count(solved)
 
 
 def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> None:
-    """Say how early the planner meets the targets of B cases, beside a lattice's (B,) [s]."""
+    """Print how early the planner meets the targets of B cases, beside a lattice's (B,) [s]."""
     plans = pj.plan(pj.intercept.planner(meet="early"), cases)
     solved = np.asarray(pj.intercept.judge(cases, plans).success)
     met = np.where(solved, plans.time, np.inf)
@@ -197,9 +201,9 @@ def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> No
     soon = int((met <= earliest + LAYER)[reached].sum())
     bench.say(
         "",
-        f"Planned to meet as early as can be: {percent(int(solved.sum()), len(met))} % solved, "
+        f"Planned to meet as early as possible: {percent(int(solved.sum()), len(met))} % solved, "
         f"median {np.median(met):.2f} s; at most {LAYER:g} s later than the strict lattice on "
-        f"{percent(soon, int(reached.sum()))} % of the {reached.sum()} that it reaches.",
+        f"{percent(soon, int(reached.sum()))} % of the {reached.sum()} that the lattice reaches.",
     )
     bench.note(early_median=float(np.median(met)), early_share=soon / max(int(reached.sum()), 1))
 
@@ -210,17 +214,22 @@ def main() -> None:
         "python -m benchmarks.intercept_oracle", description=(__doc__ or "").partition("\n")[0]
     )
     add = parser.add_argument
-    add("--suite", choices=SUITES, default="hard")
+    add("--suite", choices=SUITES, default="hard", help="default: hard")
     for name, least, default in (("num", 1, 200), ("seed", 0, 1), ("first", 0, 0)):
         add(f"--{name}", type=at_least(least), default=default, help=f"default: {default}")
     add("--planner", choices=TASK.planners, default="spacetime", help="default: spacetime")
-    add("--failed", action="store_true", help="search only what the planner does not solve")
-    add("--early", action="store_true", help="plan to meet as early as can be, too")
-    add("--workers", type=at_least(1), default=os.cpu_count(), help="default: one a core")
-    add("--out", type=Path, help="an .npz file for what is found of every case")
+    add("--failed", action="store_true", help="search only cases that the planner does not solve")
+    add("--early", action="store_true", help="also plan to meet as early as possible")
+    add(
+        "--workers",
+        type=at_least(1),
+        default=os.cpu_count(),
+        help="processes; default: one for each core",
+    )
+    add("--out", type=Path, help="an .npz file for the results of every case")
     options = parser.parse_args()
     if options.early and options.failed:
-        parser.error("--early looks at all cases, --failed at those that are not solved")
+        parser.error("--early needs all cases, --failed searches only unsolved ones")
     with Bench("intercept_oracle", vars(options)) as bench:
         cases = draw(options.num, options.suite, options.seed, first=options.first)
         plans = pj.plan(pj.intercept.planner(options.planner), cases)
@@ -234,7 +243,7 @@ def main() -> None:
         seconds = time.perf_counter() - began
         bench.say(
             f"{options.planner}, {options.suite}, seed {options.seed}, cases {options.first} to "
-            f"{options.first + drawn[-1]}, of which {len(searched)} are searched: "
+            f"{options.first + drawn[-1]}, {len(searched)} of them searched: "
             f"{seconds:.0f} s with {options.workers} processes"
         )
         if not options.failed:

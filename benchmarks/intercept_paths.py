@@ -1,15 +1,15 @@
-"""Paths among standing walls: Hybrid A* and a published search, and smoothing.
+"""Compare path searches among static walls, Hybrid A* and a published one, and measure smoothing.
 
     python -m benchmarks.intercept_paths [--num 50] [--seed 0] [--out DIR]
 
-The walls, starts and meetings of the suites `hard` and `maze`, without what moves. First the
-heading at the meeting is free; then it is given, the one that was found, as the peer needs one:
-fastsim-navigation (C++, extra `peers`), which gets the same poses and the exact rectangle of the
-body. It looks for walls in cells of 0.1 m, this library in a distance field with discs that cover
-the body. Times are of one search, warm, from walls to poses, the fastest of three calls. A path is
-clear if the body's rectangle meets no wall at any of its poses; lengths are means over the searches
-that every row of the table has found. The last table smooths the paths that were searched with
-nine tenths of the curvature.
+Walls, starts and meetings are from the suites `hard` and `maze`, without moving obstacles. First
+the heading at the meeting is free. Then the heading that this search found is prescribed, because
+the peer needs one: fastsim-navigation (C++, extra `peers`), which gets the same poses and the exact
+rectangle of the body. The peer represents walls by cells of 0.1 m, this library by a distance field
+and by discs that cover the body. Times are of one search, compiled before, from walls to poses, the
+fastest of three calls. A path is clear if the body's rectangle meets no wall at any of its poses.
+Lengths are means over the searches for which every row of the table has found a path. The last
+table smooths paths that were searched with nine tenths of the curvature limit.
 """
 
 import dataclasses
@@ -27,40 +27,40 @@ import numpy as np
 
 from planner_jax.baselines.intercept.hybrid_astar import HybridPath, hybrid_astar
 from planner_jax.baselines.intercept.path_smoothing import smooth_path
-from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, installed, searched
+from planner_jax.benchmarks.path_peers import CELL, INSTALL, PAD, is_installed, run_searches
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.plane.obstacles import distances, separation
 from planner_jax.task.intercept.api import draw, positions
 
 SUITES = ("hard", "maze")
-ROOM = 0.9  # of the curvature, for paths that are made smooth
+CURVATURE_SHARE = 0.9  # factor of the curvature limit, for paths that are smoothed
 REPEATS = 3
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """What became of all searches with one planner."""
+    """Results of all searches with one planner."""
 
     found: np.ndarray  # (B,) bool
     clear: np.ndarray  # (B,) bool
     length: np.ndarray  # (B,) [m]
-    ms: np.ndarray  # (B,), NaN where there was no answer
+    ms: np.ndarray  # (B,), NaN if there was no answer
     note: str = ""
 
 
 def body_of(case: Any) -> tuple[float, float, float]:
-    """Ends of the body behind and ahead of the rear axle, and half its width [m]."""
+    """Return the ends of the body behind and ahead of the rear axle, and half its width [m]."""
     behind = -float(case.body.rear_overhang)
     return behind, behind + float(case.body.length), 0.5 * float(case.body.width)
 
 
-def search(case: Any, meeting: np.ndarray, room: float = 1.0, **options: Any) -> HybridPath:
-    """The path of one case, whose leaves are NumPy arrays."""
+def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -> HybridPath:
+    """Search the path of one case, whose leaves are NumPy arrays."""
     return hybrid_astar(
         case.start,
         meeting,
         case.walls,
-        curvature=room * float(case.limits.curvature),
+        curvature=share * float(case.limits.curvature),
         body=body_of(case),
         lower=case.lower,
         upper=case.upper,
@@ -68,8 +68,8 @@ def search(case: Any, meeting: np.ndarray, room: float = 1.0, **options: Any) ->
     )
 
 
-def fastest(run: Callable[[], Any]) -> tuple[Any, float]:
-    """What a function returns, and the time of its fastest call [ms]."""
+def time_fastest(run: Callable[[], Any]) -> tuple[Any, float]:
+    """Return the result of a function, and the duration of its fastest call [ms]."""
     seconds, result = [], None
     for _ in range(REPEATS):
         began = time.perf_counter()
@@ -86,14 +86,14 @@ def _gap(poses: jax.Array, walls: Any, body: jax.Array) -> jax.Array:
 
 
 def is_clear(case: Any, poses: np.ndarray, num: int = 513) -> bool:
-    """Whether the body is clear of walls at poses (N, 3), of which `num` at most are looked at."""
+    """Return whether the body is clear of walls at poses (N, 3); at most `num` are checked."""
     places = np.linspace(0, len(poses) - 1, num).astype(int)
     body = jnp.asarray(body_of(case), jnp.float32)
     return bool(_gap(jnp.asarray(poses[places], jnp.float32), case.walls, body) > 0.0)
 
 
 def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
-    """The row of this library's paths."""
+    """Return the row of this library's paths."""
     found = np.array([path.found for path in paths])
     pairs = zip(cases, paths, strict=True)
     clear = [path.found and is_clear(case, path.poses) for case, path in pairs]
@@ -102,10 +102,10 @@ def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
     return Row(found, np.array(clear), length, ms, f"{median:.0f} expansions, median")
 
 
-def searched_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
-    """Return the row of this library's search; None leaves the heading free."""
+def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
+    """Return the row of this library's search; a heading of None is free."""
     results = [
-        fastest(functools.partial(search, case, meeting, end_heading=heading))
+        time_fastest(functools.partial(search, case, meeting, end_heading=heading))
         for case, meeting, heading in zip(cases, meetings, headings, strict=True)
     ]
     paths, ms = zip(*results, strict=True)
@@ -113,7 +113,7 @@ def searched_row(cases: list, meetings: np.ndarray, headings: list[float | None]
 
 
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
-    """The row of fastsim-navigation."""
+    """Return the row of fastsim-navigation."""
     searches = []
     for case, meeting, heading in zip(cases, meetings, headings, strict=True):
         behind, ahead, half = body_of(case)
@@ -134,7 +134,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
             }
         )
     with tempfile.TemporaryDirectory() as folder:
-        results = searched(searches, Path(folder))
+        results = run_searches(searches, Path(folder))
     found = np.array([each["found"] for each in results])
     paths = [np.array(each["poses"]) if each["found"] else np.zeros((1, 3)) for each in results]
     steps = [np.diff(path[:, :2], axis=0) for path in paths]
@@ -146,7 +146,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
 
 
 def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
-    """Print a table of rows."""
+    """Print the rows of a table."""
     together = np.logical_and.reduce([row.found for row in rows.values()])
     for name, row in rows.items():
         ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3
@@ -161,9 +161,9 @@ def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> No
 
 
 def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: np.ndarray) -> None:
-    """Print what smoothing does to paths that are searched with some room in the curvature."""
+    """Print the effect of smoothing on paths that were searched with a reduced curvature limit."""
     pairs = zip(cases, meetings, strict=True)
-    paths = [search(case, meeting, ROOM) for case, meeting in pairs]
+    paths = [search(case, meeting, CURVATURE_SHARE) for case, meeting in pairs]
 
     @jax.jit
     def smooth(poses: jax.Array, bends: jax.Array, length: jax.Array, case: Any) -> Any:
@@ -183,7 +183,7 @@ def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: n
             given = (np.float32(leaf) for leaf in (path.poses, path.curvature, path.length))
             given = (*given, case)
             smooth(*given)
-            found, ms = fastest(lambda given=given: smooth(*given))
+            found, ms = time_fastest(lambda given=given: smooth(*given))
             results.append((path.length, float(found.length), bool(found.is_smooth), ms))
     before, after, is_smooth, ms = np.array(results).T
     times = np.percentile(ms, [50, 95, 99])
@@ -214,16 +214,16 @@ def main() -> None:
             cases = [jax.tree.map(lambda leaf, k=k: leaf[k], host) for k in range(options.num)]
             drawn[suite] = (batch, cases, meetings)
             paths = [search(case, meeting) for case, meeting in zip(cases, meetings, strict=True)]
-            row = searched_row(cases, meetings, [None] * options.num)
+            row = search_row(cases, meetings, [None] * options.num)
             say_rows(bench, suite, "free", {"this library": row})
             bench.count(row.clear)
-            # Where no path was found, any heading is as good.
+            # If no path was found, any heading will do.
             headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
-            rows = {"this library": searched_row(cases, meetings, list(headings))}
-            if installed():
+            rows = {"this library": search_row(cases, meetings, list(headings))}
+            if is_installed():
                 rows["fastsim-navigation"] = peer_row(cases, meetings, headings)
-            say_rows(bench, suite, "given", rows)
-        if not installed():
+            say_rows(bench, suite, "prescribed", rows)
+        if not is_installed():
             bench.say("", INSTALL)
         bench.say(
             "",

@@ -1,18 +1,18 @@
-"""All intercept planners on the same cases: Tables II and III of [Qu2022] beside our figures.
+"""Compare all intercept planners on the same cases, beside Tables II and III of [Qu2022].
 
     python -m benchmarks.intercept_peers [--suite hard] [--num 200] [--timed 50] [--out DIR]
 
-Success is what the referee says, whatever a planner claims. Accelerations along the way are means
-over successes: the root of the mean square over the horizon, and the peak. Pairs are compared on
-the cases where both succeed; `lattice, best path` and `em` drive along the same path.
+Success is judged by the referee, whatever a planner reports. Accelerations along the trajectory are
+means over successes: the root mean square over the horizon, and the peak. Pairs are compared on the
+cases where both succeed; `lattice, best path` and `em` drive along the same path.
 
-Times are of one case at a time, warm, from arrays to arrays, the fastest of three calls of each of
---timed cases: finding paths, then a speed along them. The first call of a process is told apart: it
-compiles, unless the compiled program is found in JAX's cache. Without the extra `baselines` the
-planner `paper`, whose search is compiled by numba, is left out.
+Times are of one case at a time, compiled before, from arrays to arrays, the fastest of three calls
+for each of --timed cases: the path search, then the speed along the path. The first call of a
+process is reported separately. It compiles, unless JAX's cache holds the compiled program. Without
+the extra `baselines` the planner `paper`, whose search is compiled by numba, is left out.
 
-The paper's tables are of one scenario, which it does not give, on another computer. The columns of
-its Table II must have been swapped: a mean square root cannot be above the peak.
+The paper's tables are for one scenario, which it does not specify, on another computer. The columns
+of its Table II must have been swapped: a root mean square cannot exceed the peak.
 """
 
 import dataclasses
@@ -45,11 +45,15 @@ PAIRS = (
 )
 # Table II, as printed: "Max Acc.", "Ave. Acc." [m/s^2] and the mean time [ms].
 TABLE_II = {"EM": (0.327, 1.653, 2.883), "theirs": (0.296, 1.559, 2.175)}
-TABLE_III = {"path": 150.0, "speed": 3.0, "total": 154.0}  # [ms], means; the speed's is a bound
+TABLE_III = {
+    "path": 150.0,
+    "speed": 3.0,
+    "total": 154.0,
+}  # [ms], means; the paper's speed time is an upper bound
 
 
 def planners() -> dict[str, Any]:
-    """Every planner by name."""
+    """Return every planner by name."""
     named = {
         **{name: pj.intercept.planner(name) for name in ("spacetime", "best", "quick")},
         "lattice": pj.intercept.planner("lattice"),
@@ -65,23 +69,23 @@ def planners() -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What became of all cases with one planner."""
+    """Results of one planner on all cases."""
 
     verdict: InterceptVerdict
     status: np.ndarray  # (B,)
     first_call: float  # [s], of the first batch
 
 
-def outcome_of(planner: Any, cases: Any) -> Outcome:
-    """Plan a batch and have it judged."""
+def run_planner(planner: Any, cases: Any) -> Outcome:
+    """Plan a batch and judge the plans."""
     began = time.perf_counter()
     plans = jax.tree.map(np.asarray, pj.plan(planner, cases))
     seconds = time.perf_counter() - began
     return Outcome(pj.intercept.judge(cases, plans), plans.status, seconds)
 
 
-def parts_of(planner: Any) -> dict[str, Callable]:
-    """The parts of a planner as functions of one case; each takes what the one before returned."""
+def split_planner(planner: Any) -> dict[str, Callable]:
+    """Return the parts of a planner as functions; each takes the result of the part before."""
     if isinstance(planner, PathThenSpeed):
         attempt = planner.attempts[0]
         return {
@@ -102,9 +106,9 @@ def parts_of(planner: Any) -> dict[str, Callable]:
     return {"total": jax.jit(lambda case: planner.solve(case, attempt))}
 
 
-def seconds_of(planner: Any, lanes: list) -> dict[str, np.ndarray]:
-    """Seconds (N,) of every part of a planner, and of all together, warm."""
-    parts = parts_of(planner)
+def time_parts(planner: Any, lanes: list) -> dict[str, np.ndarray]:
+    """Return the durations (N,) [s] of every part of a planner, and of all parts together, warm."""
+    parts = split_planner(planner)
     best = {name: np.full(len(lanes), np.inf) for name in (*parts, "total")}
     given = lanes[0]
     for part in parts.values():
@@ -123,14 +127,14 @@ def seconds_of(planner: Any, lanes: list) -> dict[str, np.ndarray]:
 
 
 def mean_of(values: np.ndarray) -> float:
-    """The mean, NaN of none."""
+    """Return the mean, or NaN if there are no values."""
     return float(values.mean()) if len(values) else np.nan
 
 
 def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """One row a planner: success, what is said of failures, accelerations."""
+    """Print one row a planner: success, reasons of failures, accelerations."""
     bench.say(
-        "| planner | success | claimed, refused | rms acc. [m/s2] | peak acc. [m/s2] "
+        "| planner | success | solved by status, rejected | rms acc. [m/s2] | peak acc. [m/s2] "
         "| failures | first call [s] |",
         "|---|---|---|---|---|---|---|",
     )
@@ -141,7 +145,7 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
             pj.Status(value).name: int((found.status[~claimed] == value).sum())
             for value in np.unique(found.status[~claimed])
         }
-        said = ", ".join(f"{number} {reason}" for reason, number in reasons.items()) or "none"
+        listed = ", ".join(f"{number} {reason}" for reason, number in reasons.items()) or "none"
         figures = {
             "success": good.mean(),
             "refused": int((claimed & ~good).sum()),
@@ -150,16 +154,17 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
         }
         bench.say(
             f"| {name} | {100 * figures['success']:.1f} % | {figures['refused']} | "
-            f"{figures['rms']:.3f} | {figures['peak']:.3f} | {said} | {found.first_call:.1f} |"
+            f"{figures['rms']:.3f} | {figures['peak']:.3f} | {listed} | {found.first_call:.1f} |"
         )
         bench.row(table="outcomes", planner=name, **figures, reasons=reasons)
 
 
 def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """Table II: accelerations of pairs where both succeed, beside the printed ones."""
+    """Print Table II: accelerations of pairs where both succeed, beside the paper's values."""
     bench.say(
         "",
-        "| Table II | both succeed | rms acc. [m/s2] | beside | less | peak acc. | beside | less |",
+        "| Table II | both succeed | rms acc. [m/s2] | reference | less | peak acc. "
+        "| reference | less |",
         "|---|---|---|---|---|---|---|---|",
     )
     (rms, peak, _), (rms_em, peak_em, _) = TABLE_II["theirs"], TABLE_II["EM"]
@@ -186,7 +191,7 @@ def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
-    """Table III: times of the parts of every planner, beside the printed ones."""
+    """Print Table III: times of the parts of every planner, beside the paper's values."""
     bench.say(
         "",
         "| Table III, p50 / p95 / p99 [ms] | path | speed | total |",
@@ -195,7 +200,7 @@ def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
         f"{TABLE_III['total']:.0f} |",
     )
     for name, planner in named.items():
-        seconds = seconds_of(planner, lanes)
+        seconds = time_parts(planner, lanes)
         times = {part: 1e3 * np.percentile(each, [50, 95, 99]) for part, each in seconds.items()}
         cells = [
             " / ".join(f"{value:.1f}" for value in times[part]) if part in times else "-"
@@ -209,7 +214,7 @@ def main() -> None:
     """Print the tables."""
     parser = argument_parser("intercept_peers", __doc__, num=200, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="hard", help="default: hard")
-    parser.add_argument("--timed", type=at_least(1), default=50, help="cases; default: 50")
+    parser.add_argument("--timed", type=at_least(1), default=50, help="timed cases; default: 50")
     options = parser.parse_args()
     with begin(parser, options) as bench:
         cases = pj.intercept.draw(options.num, options.suite, options.seed)
@@ -223,7 +228,7 @@ def main() -> None:
         if "paper" not in named:
             bench.say(BASELINES, "")
         on_host = jax.tree.map(np.asarray, cases)
-        outcomes = {name: outcome_of(planner, on_host) for name, planner in named.items()}
+        outcomes = {name: run_planner(planner, on_host) for name, planner in named.items()}
         table_of_outcomes(bench, outcomes)
         table_of_accelerations(bench, outcomes)
         num = min(options.timed, options.num)

@@ -1,25 +1,28 @@
-"""Targets that are only predicted: one plan, and plans made anew while the car drives.
+"""Measure interceptions of targets that are only predicted, with one plan and with re-planning.
 
     python -m benchmarks.intercept_predicted [--suite hard] [--num 40] [--seed 0] [--out DIR]
 
-A target is seen 15 times, once a second up to the start, with noise of 0.1 m on each coordinate
-[Qu2022, Section V-A], and `select` says where it will go; the planner knows walls and movers,
-but of the target the prediction alone. Rows, for targets that go straight and for those that turn:
+A target is observed 15 times, once a second up to the start, with noise of 0.1 m on each coordinate
+[Qu2022, Section V-A], and `select` predicts its path. The planner knows walls and movers, but only
+the prediction of the target. There are three rows for straight and for turning targets:
 
 * `one shot`: one plan, driven to its end.
-* `planned anew`: looks go on once a second while the car drives. After each one the target is
-  predicted from all looks until then, and what is left is planned anew. The new plan takes over
-  if it keeps every limit, otherwise the old one is driven on.
-* `known`: the target's way is known.
+* `re-planned`: observations continue once a second while the car drives. After each one the target
+is
+  predicted from all observations so far, and the remainder is re-planned. The new plan replaces the
+  old one if it keeps every limit.
+* `known`: the target's path is known.
 
-The car drives its plans exactly. Where no plan keeps every limit, the middle may be 0.2 m from the
-prediction at the meeting, and where a car has no plan yet, about 0.5 m beside it; where that does
-not help either, the plan that exceeds a limit least is driven, and planning from scratch is tried
-at every look. The whole way that was driven, at steps of 20 ms, is given to the referee as one
-plan, against the true target: every limit of the car, the map, polygons, and a meeting within 0.3 m
-at the case's time. Misses are told of all drives, whatever they touched; solvable are cases that
-some row meets. Beside them stand the predictor's own share within 0.3 m at the case's time, and
-that at the Cramer-Rao bound: what no unbiased predictor exceeds by much.
+The car follows its plans exactly. If no plan keeps every limit, the body's middle may be 0.2 m from
+the prediction at the meeting. If that fails too, and the car has no plan yet, it may meet a point
+about 0.5 m beside the prediction. If that fails as well, the plan with the smallest excess is
+driven, and planning from scratch is tried at every observation.
+
+The whole driven trajectory, at steps of 20 ms, is judged by the referee as one plan against the
+true target: every limit of the car, the map, polygons, and a meeting within 0.3 m at the case's
+time. Misses are over all drives, even those with collisions. A case is solvable if some row solves
+it. Printed beside the rows are the share of first predictions within 0.3 m at the case's time, and
+the same share at the Cramer-Rao bound, which no unbiased predictor exceeds by much.
 """
 
 import dataclasses
@@ -43,34 +46,35 @@ from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES
 
-NOISE = 0.1  # [m], standard deviation of a coordinate that is seen
-COUNT = 15  # looks up to the start
-INTERVAL = 1.0  # [s], between two looks, and between two plans
-RATE = 50.0  # [Hz], of what is driven, as the referee looks at it
+NOISE = 0.1  # [m], standard deviation of each observed coordinate
+COUNT = 15  # observations up to the start
+INTERVAL = 1.0  # [s], between two observations, and between two plans
+RATE = 50.0  # [Hz], of the driven trajectory that the referee judges
 RADII = (0.05, 0.3, 0.5)  # [m]
 SUCCESS = 0.3  # [m], from the true target
-CLOSE = 0.2  # [m], from the prediction, where no plan meets it more closely
-# [m], where no plan does that either: places around the prediction.
+CLOSE = 0.2  # [m], tolerance around the prediction if no plan keeps all limits
+# [m], points around the prediction that are tried last.
 PLACES = 0.5 * np.stack([f(np.arange(8) * np.pi / 4.0) for f in (np.cos, np.sin)], axis=1)
 PLANNER = SpacetimeIntercept()
 MODES = ("straight", "turning")
 HEADER = (
-    "| target | row | num | success % (95 %) | of the solvable, % | <= 0.05 / 0.3 / 0.5 m, % | "
-    "miss p50, m | first plan keeps all limits, % | fails by | s |"
+    "| target | row | num | success % (95 %) | success of the solvable, % | "
+    "<= 0.05 / 0.3 / 0.5 m, % | "
+    "miss p50, m | first plan keeps all limits, % | failed limits | s |"
 )
 
 
 @jax.jit
 @jax.vmap
 def predict(times: jax.Array, seen: jax.Array, weights: jax.Array) -> TurningPath:
-    """Expected paths, leaves (B, ...), from looks at times (B, L) [s] of places (B, L, 2) [m]."""
+    """Predict paths, leaves (B, ...), from observations (B, L, 2) [m] at times (B, L) [s]."""
     return select(times, seen, NOISE, weights).path
 
 
 @jax.jit
 @jax.vmap
-def at_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
-    """Shares (B,) within the success radius at the bound, of looks at times (B, L) [s]."""
+def compute_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
+    """Return shares (B,) within the success radius at the bound, for observations at (B, L) [s]."""
     straight, turning = (
         share_within(cramer_rao(path, times, NOISE, end, turning=turning), SUCCESS)
         for turning in (False, True)
@@ -79,27 +83,27 @@ def at_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class Looks:
-    """What is seen of B targets, before the start and on the way."""
+class Observations:
+    """Observations of B targets, before the start and during the drive."""
 
     times: np.ndarray  # (L,) [s]
     places: np.ndarray  # (B, L, 2) [m]
 
     def paths(self, now: float) -> TurningPath:
-        """Paths that are expected at a time [s], which count from then, leaves (B, ...)."""
+        """Return paths, leaves (B, ...), predicted at time `now` [s], which is their time 0."""
         batch = len(self.places)
         times = np.tile((self.times - now).astype(np.float32), (batch, 1))
         seen = np.tile((self.times <= now).astype(np.float32), (batch, 1))
         return jax.tree.map(np.asarray, predict(times, self.places.astype(np.float32), seen))
 
 
-def taken(tree: Any, lanes: Any) -> Any:
-    """Some lanes of a pytree, on the host."""
+def take_lanes(tree: Any, lanes: Any) -> Any:
+    """Return the batch elements `lanes` of a pytree, on the host."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], tree)
 
 
-def put(tree: Any, lanes: np.ndarray, some: Any) -> Any:
-    """A pytree with other values in some lanes, on the host."""
+def replace_lanes(tree: Any, lanes: np.ndarray, some: Any) -> Any:
+    """Return a pytree with other values in the batch elements `lanes`, on the host."""
 
     def leaf(old: Any, new: Any) -> np.ndarray:
         changed = np.array(old)
@@ -109,58 +113,58 @@ def put(tree: Any, lanes: np.ndarray, some: Any) -> Any:
     return jax.tree.map(leaf, tree, some)
 
 
-def planned(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
-    """Plans from scratch; what cannot be met is met less closely, and then beside.
+def plan_cases(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
+    """Plan from scratch; where that fails, with more tolerance, and then beside the target.
 
     Args:
         cases: leaves (B, ...).
-        around: (B,) bool, for which a place beside the target is better than no plan.
+        around: (B,) bool, whether a point beside the target is allowed.
     """
     plans = pj.plan(PLANNER, cases)
     lanes = np.flatnonzero(~is_solved(plans.status))
     if lanes.size:
-        found = pj.plan(PLANNER, within(taken(cases, lanes), CLOSE))
+        found = pj.plan(PLANNER, loosen(take_lanes(cases, lanes), CLOSE))
         better = is_solved(found.status)
-        plans = put(plans, lanes[better], taken(found, better))
+        plans = replace_lanes(plans, lanes[better], take_lanes(found, better))
     lanes = np.flatnonzero(~is_solved(plans.status) & around)
     if lanes.size:
-        found = beside(taken(cases, lanes))
+        found = plan_beside(take_lanes(cases, lanes))
         better = is_solved(found.status)
-        plans = put(plans, lanes[better], taken(found, better))
+        plans = replace_lanes(plans, lanes[better], take_lanes(found, better))
     return plans
 
 
-def within(cases: InterceptCase, distance: float) -> InterceptCase:
-    """Cases that may be met at a distance [m]."""
+def loosen(cases: InterceptCase, distance: float) -> InterceptCase:
+    """Return the cases with a tolerance of `distance` [m]."""
     return dataclasses.replace(cases, tolerance=np.full_like(cases.tolerance, distance))
 
 
-def beside(cases: InterceptCase) -> InterceptPlan:
-    """Plans that end at one of some places around the target; the first one that has a plan."""
+def plan_beside(cases: InterceptCase) -> InterceptPlan:
+    """Plan to points around the target; return the first solved plan of each case."""
     num, path = len(PLACES), cast("Any", cases.target)
-    many = taken(cases, np.repeat(np.arange(len(cases.time)), num))
+    many = take_lanes(cases, np.repeat(np.arange(len(cases.time)), num))
     moved = np.asarray(path.pos)[:, None] + PLACES
     target = dataclasses.replace(many.target, pos=moved.reshape(-1, 2).astype(np.float32))
-    plans = pj.plan(PLANNER, within(dataclasses.replace(many, target=target), CLOSE))
+    plans = pj.plan(PLANNER, loosen(dataclasses.replace(many, target=target), CLOSE))
     good = is_solved(plans.status).reshape(-1, num)
-    return taken(plans, num * np.arange(len(good)) + good.argmax(axis=1))
+    return take_lanes(plans, num * np.arange(len(good)) + good.argmax(axis=1))
 
 
 @dataclasses.dataclass
 class Drives:
-    """What B cars drive: speed and curvature every 20 ms, from the start to the case's time."""
+    """Drives of B cars: speed and curvature every 20 ms, from the start to the case's time."""
 
-    plans: InterceptPlan  # that are driven now
-    cases: InterceptCase  # what these are of
-    began: np.ndarray  # (B,) [s], when these began
-    had_plan: np.ndarray  # (B,) bool, whose first plan keeps every limit
+    plans: InterceptPlan  # currently driven
+    cases: InterceptCase  # problems that these plans solve
+    began: np.ndarray  # (B,) [s], when these plans began
+    had_plan: np.ndarray  # (B,) bool, whether the first plan keeps every limit
     speed: np.ndarray  # (B, S) [m/s]
     curvature: np.ndarray  # (B, S) [1/m]
 
     @classmethod
-    def begun(cls, cases: InterceptCase) -> "Drives":
-        """Cars that drive their first plans."""
-        plans = planned(cases, np.ones(cases.batch_shape, bool))
+    def start(cls, cases: InterceptCase) -> "Drives":
+        """Create drives that follow their first plans."""
+        plans = plan_cases(cases, np.ones(cases.batch_shape, bool))
         setpoints = plans.sample(RATE)
         return cls(
             plans,
@@ -172,26 +176,26 @@ class Drives:
         )
 
     def renew(self, now: float, target: TurningPath) -> None:
-        """Plan anew at a time [s], for where targets are expected from then on."""
+        """Plan again at a time [s], for targets predicted from then on."""
         again = PLANNER.replanner()
         task = again.begin(self.cases, self.plans, now - self.began, target=target)
         plans = pj.plan(again, task)
         lanes = np.flatnonzero(~is_solved(plans.status))
         if lanes.size:
             is_lost = np.asarray(~is_solved(self.plans.status[lanes]))
-            plans = put(plans, lanes, planned(taken(task.case, lanes), is_lost))
-        # One that exceeds a limit is driven only instead of another such.
+            plans = replace_lanes(plans, lanes, plan_cases(take_lanes(task.case, lanes), is_lost))
+        # A plan that exceeds a limit replaces only another such plan.
         lanes = np.flatnonzero(is_solved(plans.status) | ~is_solved(self.plans.status))
-        new, first = taken(plans, lanes), round(now * RATE)
+        new, first = take_lanes(plans, lanes), round(now * RATE)
         setpoints = new.sample(RATE)
-        self.plans = put(self.plans, lanes, new)
-        self.cases = put(self.cases, lanes, taken(task.case, lanes))
+        self.plans = replace_lanes(self.plans, lanes, new)
+        self.cases = replace_lanes(self.cases, lanes, take_lanes(task.case, lanes))
         self.began[lanes] = now
         self.speed[lanes, first:] = setpoints.speed
         self.curvature[lanes, first:] = setpoints.curvature
 
-    def judged(self, truth: InterceptCase) -> InterceptVerdict:
-        """What the referee says of the whole way, held against what is true."""
+    def judge(self, truth: InterceptCase) -> InterceptVerdict:
+        """Return the referee's verdict on the whole drives, against the true targets."""
         asked = dataclasses.replace(truth, tolerance=np.full_like(truth.tolerance, SUCCESS))
         whole = dataclasses.replace(
             self.plans,
@@ -203,17 +207,17 @@ class Drives:
         return pj.intercept.judge(asked, whole)
 
 
-def drive(cases: InterceptCase, looks: Looks | None, until: float) -> Drives:
-    """Drives of B cases with plans made anew at every look before a time [s].
+def drive(cases: InterceptCase, looks: Observations | None, until: float) -> Drives:
+    """Drive B cases, and re-plan at every observation before a time [s].
 
     Args:
-        cases: as they truly are.
-        looks: what is seen of the targets; None where they are known.
+        cases: the true cases.
+        looks: observations of the targets; None if the targets are known.
         until: [s]; 0 drives the first plans.
     """
     if looks is None:
-        return Drives.begun(cases)
-    drives = Drives.begun(dataclasses.replace(cases, target=looks.paths(0.0)))
+        return Drives.start(cases)
+    drives = Drives.start(dataclasses.replace(cases, target=looks.paths(0.0)))
     for now in looks.times[(looks.times > 0.0) & (looks.times < until)]:
         drives.renew(now, looks.paths(now))
     return drives
@@ -226,8 +230,8 @@ def report(
     turning: np.ndarray,
 ) -> None:
     """Print a line for each row and kind of target, (B,) bool, and which drives failed."""
-    verdicts = {name: drives.judged(truth) for name, (drives, _) in rows.items()}
-    # What no row meets, the one that knows the target among them, is left out of the last share.
+    verdicts = {name: drives.judge(truth) for name, (drives, _) in rows.items()}
+    # Cases that no row solves, not even with a known target, are left out of the last share.
     solvable = np.any([verdict.success for verdict in verdicts.values()], axis=0)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         for name, verdict in verdicts.items():
@@ -235,7 +239,7 @@ def report(
             good, miss = verdict.success[is_of_mode], verdict.miss[is_of_mode]
             num, could = len(good), int(solvable[is_of_mode].sum())
             low, high = wilson_interval(int(good.sum()), num)
-            within = [int((miss <= radius).sum()) for radius in RADII]
+            inside = [int((miss <= radius).sum()) for radius in RADII]
             limits, counts = np.unique(
                 verdict.failed_limit[is_of_mode & ~verdict.success], return_counts=True
             )
@@ -243,7 +247,7 @@ def report(
             bench.say(
                 f"| {mode} | {name} | {num} | {percent(int(good.sum()), num)} "
                 f"({100 * low:.1f} to {100 * high:.1f}) | {percent(int(good.sum()), could)} | "
-                f"{' / '.join(percent(each, num) for each in within)} | {np.median(miss):.3f} | "
+                f"{' / '.join(percent(each, num) for each in inside)} | {np.median(miss):.3f} | "
                 f"{percent(int(drives.had_plan[is_of_mode].sum()), num)} | "
                 f"{', '.join(f'{limit} {count}' for limit, count in fails.items())} | "
                 f"{seconds:.0f} |"
@@ -254,13 +258,13 @@ def report(
                 num=num,
                 success=good.mean(),
                 success_of_solvable=good.sum() / could,
-                within=np.array(within) / num,
+                within=np.array(inside) / num,
                 miss_median=np.median(miss),
                 fails=fails,
                 failed=np.flatnonzero(is_of_mode & ~verdict.success),
                 seconds=seconds,
             )
-    bench.count(verdicts["planned anew"].success)
+    bench.count(verdicts["re-planned"].success)
     for name, verdict in verdicts.items():
         if name != "one shot":
             bench.say("", f"{name}, drives that fail:")
@@ -269,13 +273,15 @@ def report(
             )
 
 
-def report_bound(bench: Bench, looks: Looks, truth: InterceptCase, turning: np.ndarray) -> None:
-    """Print what the predictor reaches at the case's time, and what could be reached."""
+def report_bound(
+    bench: Bench, looks: Observations, truth: InterceptCase, turning: np.ndarray
+) -> None:
+    """Print the predictor's share within the success radius at the case's time, and the bound's."""
     times = np.asarray(truth.time)
     there = positions(truth.target, times)
     off = np.linalg.norm(positions(looks.paths(0.0), times) - there, axis=1)
     before = looks.times[looks.times <= 0.0].astype(np.float32)
-    bound = at_bound(truth.target, np.tile(before, (len(off), 1)), times)
+    bound = compute_bound(truth.target, np.tile(before, (len(off), 1)), times)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         mine, least = (off[is_of_mode] <= SUCCESS).mean(), np.asarray(bound)[is_of_mode].mean()
         bench.say(
@@ -286,21 +292,23 @@ def report_bound(bench: Bench, looks: Looks, truth: InterceptCase, turning: np.n
 
 
 def main() -> None:
-    """Print the table, and what the predictor alone reaches."""
+    """Print the table, and the results of the predictor alone."""
     parser = argument_parser("intercept_predicted", __doc__, num=40, seed=0)
-    parser.add_argument("--suite", choices=SUITES, default="hard")
+    parser.add_argument("--suite", choices=SUITES, default="hard", help="default: hard")
     options = parser.parse_args()
     with begin(parser, options) as bench:
-        truth = taken(pj.intercept.draw(options.num, options.suite, options.seed), slice(None))
+        truth = take_lanes(pj.intercept.draw(options.num, options.suite, options.seed), slice(None))
         turning = np.asarray(cast("Any", truth.target).turn_rate) != 0.0
-        end = float(truth.time[0])  # the same of all cases of a suite
-        looks = Looks(*pj.intercept.observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end))
+        end = float(truth.time[0])  # equal for all cases of a suite
+        looks = Observations(
+            *pj.intercept.observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end)
+        )
         device = jax.devices()[0].device_kind
         bench.say(f"{options.num} cases, suite {options.suite}, seed {options.seed}; {device}", "")
         rows = {}
         for name, seen, until in (
             ("one shot", looks, 0.0),
-            ("planned anew", looks, end),
+            ("re-planned", looks, end),
             ("known", None, 0.0),
         ):
             began = time.perf_counter()

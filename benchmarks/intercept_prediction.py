@@ -1,18 +1,20 @@
-"""Where targets will be: Table I of [Qu2022] and its polynomials beside ours and the bound.
+"""Measure errors of predicted targets, beside Table I of [Qu2022], its polynomials and a bound.
 
     python -m benchmarks.intercept_prediction [--num 20000] [--seed 0] [--out DIR]
 
-Targets are seen 15 times, once a second up to time 0, with noise of 0.1 m on each coordinate
-(Section V-A), and predicted 0, 5, 10 and 15 s ahead. Straight and turning ones go at 0.2 to
-0.5 m/s, which keeps them on the paper's map; those that turn do so at 0.03 to 0.1 rad/s. The
-paper's own curve gains 0.4 m/s every second, which neither of our two models describes. Errors are
-means, relative ones over the mean distance from the map's corner: the paper does not say from
-where it measures, nor its degree, but its errors grow like those of degree 2.
+Targets are observed 15 times, once a second up to time 0, with noise of 0.1 m on each coordinate
+(Section V-A), and predicted 0, 5, 10 and 15 s ahead. Straight and turning targets move at 0.2 to
+0.5 m/s, which keeps them on the paper's map; turning ones turn at 0.03 to 0.1 rad/s. The paper's
+own curve accelerates by 0.4 m/s every second, which neither of our two models describes. Errors are
+means. Relative errors are divided by the mean distance from the map's corner. The paper states
+neither the origin of its distances nor its polynomial degree, but its errors grow like those with
+degree 2.
 
-The summary's success is that of `select` on straight and turning targets: within 0.3 m at 10 s.
-The time is that of one prediction on one core, warm, from arrays on the host to arrays on the
-host. The prior of `select` was chosen on other seeds. The mean error of 1,000 turning targets at
-10 s has a standard error of 0.01 m, which is more than some methods differ by.
+The summary's success is the share of `select` predictions within 0.3 m at 10 s, for straight and
+turning targets. The time is of one prediction on one core, compiled before, from arrays on the host
+to arrays on the host. The prior of `select` was tuned with other seeds. The mean error of 1,000
+turning targets at 10 s has a standard error of 0.01 m, which exceeds the differences between some
+methods.
 """
 
 import os
@@ -32,13 +34,13 @@ from planner_jax.sims.prediction.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0, dtype=np.float32)  # [s], of the observations
 AHEAD = np.array([0.0, 5.0, 10.0, 15.0], np.float32)  # [s]
-MEETING = 2  # which of them the shares are for
+MEETING = 2  # index in AHEAD of the time at which shares are counted
 NOISE, MAP = 0.1, 8.0  # [m]
 RADII = (0.3, 0.5)  # [m]
 MODES = {
     "straight": "straight targets",
-    "turning": "targets that turn evenly",
-    "gaining": "targets that gain 0.4 m/s every second, the paper's curve",
+    "turning": "targets with a constant turn rate",
+    "gaining": "targets that accelerate by 0.4 m/s every second, the paper's curve",
 }
 PUBLISHED = {"straight": (0.23, 0.56, 1.28, 2.04), "gaining": (0.58, 2.13, 3.94, 5.88)}  # [%]
 DEGREES = (1, 2, 3)
@@ -52,7 +54,7 @@ METHODS = (
 
 
 def draw(mode: str, num: int, seed: int) -> tuple[Any, np.ndarray]:
-    """Paths of targets, leaves (num, ...), and what is seen of them, (num, 15, 2) [m]."""
+    """Draw paths of targets, leaves (num, ...), and noisy observations (num, 15, 2) [m]."""
     rng = np.random.default_rng([seed, list(MODES).index(mode)])
     speed, heading = rng.uniform(0.2, 0.5, num), rng.uniform(-np.pi, np.pi, num)
     rate = rng.uniform(0.03, 0.1, num) * rng.choice([-1.0, 1.0], num) * (mode == "turning")
@@ -67,27 +69,30 @@ def draw(mode: str, num: int, seed: int) -> tuple[Any, np.ndarray]:
     return paths, np.asarray(places(paths, TIMES) + noise, np.float32)
 
 
-def along(path: Any, times: Any) -> jax.Array:
-    """Where a path is at times (T,) [s], (T, 2) [m]."""
+def sample_path(path: Any, times: Any) -> jax.Array:
+    """Return the positions (T, 2) [m] of a path at times (T,) [s]."""
     return jax.vmap(lambda time: path.at(time).pos)(times)
 
 
-places = jax.jit(jax.vmap(along, in_axes=(0, None)))
+places = jax.jit(jax.vmap(sample_path, in_axes=(0, None)))
 
 
 @jax.jit
 @jax.vmap
 def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
-    """Predict a target that is seen at (15, 2) [m] and will be at (4, 2) [m].
+    """Predict a target from observations (15, 2) [m], given its true positions (4, 2) [m].
 
-    Returns the distances (methods, 4) [m] from there, and of `select` the chance () that it gave
-    a smaller one at the meeting, its residual () [m], and whether () it chose a turn.
+    Returns:
+        off: (methods, 4) [m], distances of the predictions from the true positions.
+        nearer: () probability that `select` assigned to a smaller distance at the meeting.
+        residual: () [m], of `select`.
+        is_turning: () bool, whether `select` chose a turn.
     """
     chosen, tested = select(TIMES, seen, NOISE), select(TIMES, seen, NOISE, threshold=6.6)
     fits = [fit_polynomial(TIMES, seen, degree) for degree in DEGREES]
-    found = [along(path, AHEAD) for path in (*fits, fit_turn(TIMES, seen), tested.path)]
+    found = [sample_path(path, AHEAD) for path in (*fits, fit_turn(TIMES, seen), tested.path)]
     found.append(jax.vmap(lambda time: mean_position(chosen, time))(AHEAD))
-    found.append(along(chosen.path, AHEAD))
+    found.append(sample_path(chosen.path, AHEAD))
     off = jnp.linalg.norm(jnp.stack(found) - truth, axis=-1)
     nearer = chance_within(chosen, AHEAD[MEETING], off[-1, MEETING])
     return off, nearer, chosen.residual, chosen.is_turning
@@ -96,7 +101,10 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 @jax.jit
 @jax.vmap
 def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
-    """Mean distances (4,) [m] and, at the meeting, shares within the radii (2,) at the bound."""
+    """Return mean distances (4,) [m] at the Cramer-Rao bound.
+
+    Also returns the shares within the radii (2,) at the meeting.
+    """
 
     def least(time: Any) -> jax.Array:
         straight, turning = (
@@ -136,7 +144,10 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
             **{name: off[:, METHODS.index(name)].mean(axis=0) for name in ("degree 2", "selected")},
         }
         ratios = {name: " : ".join(f"{g:.1f}" for g in e / e[0]) for name, e in grown.items()}
-        lines += ["", "growth: " + "; ".join(f"{name} {text}" for name, text in ratios.items())]
+        lines += [
+            "",
+            "growth of the error: " + "; ".join(f"{name} {text}" for name, text in ratios.items()),
+        ]
     ours = off[:, -1, MEETING]
     figures = {
         "mean_error": ours.mean(),
@@ -147,8 +158,9 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
     }
     lines += [
         "",
-        f"selected, at {AHEAD[MEETING]:.0f} s: {figures['mean_error']:.4f} m, standard error "
-        f"{figures['standard_error']:.4f} m; a turn for {100 * turning.mean():.1f} %; residual "
+        f"selected, at {AHEAD[MEETING]:.0f} s: mean error {figures['mean_error']:.4f} m, "
+        f"standard error {figures['standard_error']:.4f} m; "
+        f"a turn is selected for {100 * turning.mean():.1f} %; residual "
         f"{residual.mean() / NOISE:.2f} times the noise; in its 50 % region "
         f"{100 * figures['in_50_percent_region']:.1f} %, in its 90 % region "
         f"{100 * figures['in_90_percent_region']:.1f} %",
@@ -160,7 +172,7 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
 
 
 def latency(bench: Bench, num: int, seed: int) -> None:
-    """Time predictions one at a time, each of another target, with how sure they are."""
+    """Measure predictions one at a time, each of another target, with their probabilities."""
 
     @jax.jit
     def one(seen: jax.Array) -> tuple[TurningPath, jax.Array]:
@@ -185,7 +197,7 @@ def latency(bench: Bench, num: int, seed: int) -> None:
 
 
 def main() -> None:
-    """Print a table of each kind of target, and the time of one prediction."""
+    """Print a table for each kind of target, and the time of one prediction."""
     parser = argument_parser("intercept_prediction", __doc__, num=20000, seed=0)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads

@@ -1,14 +1,15 @@
-"""Speed along a known way: the planners of [Qu2022, Table II], and more, on seeded problems.
+"""Compare speed planners along a given path, including the planners of [Qu2022, Table II].
 
     python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
 
-Every planner has the same dynamic programming, cost, limits and end; what differs is how polygons
-become bounds. A plan is good that has status CONVERGED and meets no polygon at any millisecond.
-Acceleration, jerk and clearance are means over good plans, or the least of all; the second table
-compares pairs on the problems where both are good. Times are of one problem at a time, warm, from
-its arrays to the plan's, the planners in turns; --batch adds how many a second the device solves at
-once. With the extra `peers` the programs of the trapezoids are solved by Clarabel and OSQP too:
-the cost gap of the summary is to Clarabel's.
+The problems are drawn with a seed. All planners share the dynamic programming, cost, limits and
+end. They differ in how polygons become bounds. A plan is good if its status is CONVERGED and it
+meets no polygon at any millisecond. Acceleration and jerk are means over good plans, clearance is
+the minimum. The second table compares pairs on the problems where both are good. Times are of one
+problem at a time, compiled before, from its arrays to the plan's arrays; the planners take turns.
+--batch adds the rate at which the device solves a batch. With the extra `peers`, Clarabel and OSQP
+solve the quadratic programs of the trapezoids too. The cost gap of the summary is relative to
+Clarabel's cost.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ from planner_jax.baselines.intercept.speed import (
     speed_template,
 )
 from planner_jax.baselines.intercept.station_time import StationTimeProblem, reference_line
-from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, installed
+from planner_jax.benchmarks.qp_peers import INSTALL, PEERS, is_installed
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
@@ -40,7 +41,7 @@ from planner_jax.core.protocol import Status
 PIECES = (10, 20)
 CONSTANT = "constant speed"
 OURS = "this library"
-# Each against what it shall be better than, on the problems where both are good.
+# Each planner with its reference, compared on the problems where both are good.
 PAIRS = (
     ("trapezoid", "em"),
     ("trapezoid-edges", "em"),
@@ -51,7 +52,7 @@ PAIRS = (
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """What became of all problems with one planner, one number a problem."""
+    """Results of one planner, with one number for each problem."""
 
     good: np.ndarray  # bool: solved, and clear of every polygon
     rms: np.ndarray  # [m/s^2]
@@ -62,7 +63,7 @@ class Judged:
 
 
 def planners() -> dict[str, SpeedPlanner]:
-    """Every planner with every number of pieces; samples stay 0.1 s apart for 10 s."""
+    """Return every planner with every number of pieces; samples stay 0.1 s apart for 10 s."""
     return {
         f"{name}, {pieces}": dataclasses.replace(
             planner, pieces=pieces, samples=planner.samples and 100 // pieces
@@ -79,7 +80,7 @@ def constant_speed(problem: StationTimeProblem, degree: int = 5) -> BezierCurve:
 
 
 def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
-    """Curves (B, K, n + 1) looked at every millisecond, in double precision."""
+    """Evaluate curves (B, K, n + 1) at every millisecond, in double precision."""
     pieces, degree = points.shape[1], points.shape[2] - 1
     horizon = float(problems.horizon[0])
     times = np.linspace(0.0, horizon, round(1000 * horizon) + 1)
@@ -115,12 +116,12 @@ def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
     return Judged(solved & (clearance >= 0.0), rms, peak, jerk, end_error, clearance)
 
 
-def in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, dict]:
-    """What every function makes of the lanes, one at a time and in random turns, and in what time.
+def run_in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, dict]:
+    """Run every function on the batch elements, one at a time and in random turns.
 
     Returns:
-        results: by name, the lanes' together, NumPy.
-        seconds: by name, (N,), the fastest of three calls, as other programs may be running too.
+        results: by name, NumPy, stacked over the batch elements.
+        seconds: by name, (N,), the fastest of three calls, because other programs may be running.
     """
     seconds = {name: np.full(len(lanes), np.inf) for name in runs}
     results: dict[str, list] = {name: [] for name in runs}
@@ -141,21 +142,21 @@ def in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, dict]
     return stacked, seconds
 
 
-def lanes_of(*batches: Any) -> list[tuple]:
-    """The lanes of batches, on the device."""
+def split_batches(*batches: Any) -> list[tuple]:
+    """Split batches into their elements, on the device."""
     num = len(jax.tree.leaves(batches)[0])
     return [jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), batches) for k in range(num)]
 
 
 def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
-    """One row a planner; returns what became of the problems."""
+    """Print one row a planner; return the results."""
     named = planners()
     single = {
         name: jax.jit(lambda problem, planner=planner: plan_speed(problem, planner))
         for name, planner in named.items()
     }
     single[CONSTANT] = jax.jit(constant_speed)
-    planned, seconds = in_turns(single, lanes_of(problems))
+    planned, seconds = run_in_turns(single, split_batches(problems))
     bench.say(
         "| planner, pieces | good | rms acc. [m/s2] | peak acc. [m/s2] | peak jerk [m/s3] "
         "| greatest end error [m] | least clearance [m] | p50 / p95 / p99 [ms] |",
@@ -184,14 +185,17 @@ def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
             f"{figures['clearance']:.4f} | {times[0]:.3f} / {times[1]:.3f} / {times[2]:.3f} |"
         )
         bench.row(table="planners", planner=name, **figures, ms=times)
-    bench.say("", *_pairs(bench, judged, seconds))
+    bench.say("", *_compare_pairs(bench, judged, seconds))
     return judged
 
 
-def _pairs(bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]) -> list[str]:
-    """The table of pairs, on problems where both planners are good."""
+def _compare_pairs(
+    bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]
+) -> list[str]:
+    """Return the table of pairs, on problems where both planners are good."""
     lines = [
-        "| beside | both good | good, more by | rms acc. | peak acc. | time, median |",
+        "| planner and reference | both good | good, difference | rms acc. | peak acc. "
+        "| time, median |",
         "|---|---|---|---|---|---|",
     ]
     for pieces in PIECES:
@@ -216,17 +220,17 @@ def _pairs(bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarra
 
 
 def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
-    """The quadratic programs alone, beside the peers' solvers; returns cost gaps to Clarabel."""
+    """Print results of the programs beside the peers' solvers; return cost gaps to Clarabel."""
     bench.say(
         "",
-        "| program of | solver | solved | cost above Clarabel's, median / 95 % / most "
+        "| program of | solver | solved | cost above Clarabel's, median / 95 % / largest "
         "| p50 / p95 / p99 [ms] |",
         "|---|---|---|---|---|",
     )
     gaps = []
     named = planners()
     for name in (f"{kind}, {pieces}" for pieces in PIECES for kind in ("trapezoid", "em")):
-        rows = solved_by_all(problems, named[name])
+        rows = solve_by_all(problems, named[name])
         for solver, (solved, cost, seconds) in rows.items():
             times = 1e3 * np.nanpercentile(seconds, [50, 95, 99])
             gap = np.full(3, np.nan)
@@ -242,27 +246,27 @@ def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
                 f"{times[0]:.3f} / {times[1]:.3f} / {times[2]:.3f} |"
             )
             bench.row(table="solvers", planner=name, solver=solver, ms=times, gaps=gap)
-    missing = [peer for peer in PEERS if not installed(peer)]
+    missing = [peer for peer in PEERS if not is_installed(peer)]
     if missing:
         bench.say(f"{' and '.join(missing)} not installed: {INSTALL}")
     return gaps
 
 
-def solved_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
-    """By solver which programs of a planner it solves, at what cost and in how many seconds."""
+def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
+    """Solve a planner's programs with all solvers; return solved, costs and seconds by solver."""
     programs = jax.jit(jax.vmap(lambda problem: program_of(problem, planner)))(problems)
     template = speed_template(planner)
     solve = jax.jit(lambda *program: solve_qp(template, *program))
-    results, seconds = in_turns({OURS: solve}, lanes_of(*programs))
+    results, seconds = run_in_turns({OURS: solve}, split_batches(*programs))
     found = results[OURS]
     rows: dict[str, tuple] = {
         OURS: (found.status == Status.CONVERGED, found.cost.astype(float), seconds[OURS])
     }
     on_host = list(zip(*map(np.asarray, programs), strict=True))
     for peer, make in PEERS.items():
-        if installed(peer):
+        if is_installed(peer):
             run = make(speed_matrices(planner))
-            # All programs once before any again: one may begin with the solution before.
+            # All programs before any again: a solver may start at its previous solution.
             tries = [[run(*program) for program in on_host] for _ in range(3)]
             rows[peer] = (
                 np.array([each.solved for each in tries[0]]),
@@ -273,15 +277,15 @@ def solved_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
 
 
 def program_of(problem: Any, planner: SpeedPlanner) -> tuple:
-    """Return the right sides and bounds of a planner's program for one problem."""
+    """Return the right-hand sides and bounds of a planner's program for one problem."""
     return speed_bounds(problem, reference_line(problem, planner.grid), planner)
 
 
 def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
-    """Whole plans and programs alone a second, of one batch on the device."""
+    """Print plans and programs per second, for one batch on the device."""
     places = np.arange(batch) % len(problems.horizon)
     many = jax.device_put(jax.tree.map(lambda leaf: leaf[places], problems))
-    bench.say("", "| batch | planner, pieces | plans a second | programs alone a second |")
+    bench.say("", "| batch | planner, pieces | plans/s | programs alone, 1/s |")
     bench.say("|---|---|---|---|")
     for name, planner in planners().items():
         if not name.startswith("trapezoid,"):
@@ -307,7 +311,9 @@ def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
 def main() -> None:
     """Print the tables."""
     parser = argument_parser("intercept_speed", __doc__, num=500, seed=0)
-    parser.add_argument("--batch", type=at_least(0), default=0, help="default: 0, none")
+    parser.add_argument(
+        "--batch", type=at_least(0), default=0, help="problems in a batch; default: 0, no batch"
+    )
     options = parser.parse_args()
     with begin(parser, options) as bench:
         problems = speed_problems(options.num, options.seed)

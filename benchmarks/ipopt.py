@@ -1,23 +1,24 @@
-"""IPOPT on the planners' own problems: plans a second on one core, and at the same cost gap.
+"""Compare planners with IPOPT on the same problems: plans per second on one core, at equal cost.
 
     python -m benchmarks.ipopt [--num 200] [--tune 20] [--seed 0] [--repeat 3] [--batch N]
         [--tasks hit,catch] [--out DIR]
 
-Hits of the suite `court` and catches of one ball, `throws`, by `exact` with each effort, one plan
-at a time on one core and in batches on JAX's first device, beside IPOPT through CasADi (the extra
-`oracle`) on one core. Its problem has the same decision variables, first guess, objective and
-samples, written down anew from the definitions (`ipopt_peer`), with exact derivatives and MUMPS,
-in two forms: limits as constraints, where they have to be met as the planners' statuses ask, or
-the planner's own penalties in the objective. Settings are tried on other cases, and each form's
-quickest that is as good as any is kept; it is printed.
+The planner is `exact` with each effort, on hits of the suite `court` and catches of one ball
+(`throws`). It plans one case at a time on one core, and batches on JAX's first device. IPOPT runs
+through CasADi (the extra `oracle`) on one core. Its problem has the same decision variables,
+initial guess, objective and samples, implemented independently from the definitions (`ipopt_peer`),
+with exact derivatives and MUMPS. There are two forms: limits as constraints, satisfied as the
+planners' statuses require, or the planner's own penalties in the objective. IPOPT's settings are
+tuned on other cases. For each form the fastest setting without a loss of quality is used, and
+printed.
 
-The cost of a plan is that of snap and time alone, in float64 for all, and its gap that to the
-least of any accepted plan of the case that a run found. Times on one core are those of the
-processor, so that a shared machine changes them little, compilation and building apart, each case
-as fast as the fastest of --repeat tries. IPOPT reaches a planner's plan at its first iterate that
-meets the limits and costs no more, within 0.01 %, by the planner's objective where it minimises
-that: its time up to there is the iterates' share of a search to a tolerance of 1e-6, and all of it
-where there is none. It need not know that it is there.
+The cost of a plan consists of snap and time alone, in float64 for all. Its gap is relative to the
+least cost of any accepted plan of the case in this run. Times on one core are CPU times, on which
+other load of the machine has little effect, without compiling and building; for each case the
+fastest of --repeat tries counts. IPOPT reaches a planner's plan at its first iterate that satisfies
+the limits and costs no more, within 0.01 %. The compared cost is the planner's objective if IPOPT
+minimises it. The time until then is the share of iterates, times the duration of a search to a
+tolerance of 1e-6, or the whole duration if no iterate qualifies. IPOPT need not detect this itself.
 """
 
 import dataclasses
@@ -33,7 +34,7 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import gap_figures
-from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
 from planner_jax.core.choices import EFFORTS
 from planner_jax.core.errors import install_line
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
@@ -43,35 +44,35 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.polynomial import snap_energy
 
-# By task: the suite, and the module that writes its problem down.
+# Task -> suite, and the module that defines its problem.
 TASKS = {"hit": ("court", "hits"), "catch": ("throws", "catches")}
 BATCH, GPU_BATCH = 1024, 65536
-# What the batched interior-point solver jaxipm has over IPOPT at most: [Viljoen2026], quadrotors on
-# one L40S.
+# Greatest speed-up of the batched interior-point solver jaxipm over IPOPT: [Viljoen2026],
+# quadrotors on one L40S.
 JAXIPM = 32.85
-TIGHTEST = 1e-6  # tolerance of the searches whose iterates are looked at
-NO_MORE = 1e-4  # relative, by which a cost may be above another one and still counts as no more
+TIGHTEST = 1e-6  # tolerance of the searches whose iterates are evaluated
+NO_MORE = 1e-4  # relative excess of a cost over another that counts as equal
 
 
 @dataclasses.dataclass
 class Found:
-    """What one solver made of all cases."""
+    """Results of one solver on all cases."""
 
     name: str
-    cost: np.ndarray  # (B,) of snap and time
-    objective: np.ndarray | None  # (B,) the planner's, penalties included; None where not minimised
+    cost: np.ndarray  # (B,), of snap and time
+    objective: np.ndarray | None  # (B,), the planner's, with penalties; None if not minimised
     accepted: np.ndarray  # (B,) bool, by the referee
-    seconds: np.ndarray  # (B,) of processor time, one after another on one core
-    in_batch: float | None = None  # plans a second
+    seconds: np.ndarray  # (B,), CPU time, one after another on one core
+    in_batch: float | None = None  # plans per second
 
 
 class Setup:
-    """Cases of a task with what IPOPT is told about them, in float64.
+    """Cases of a task with the parameters of IPOPT's problems, in float64.
 
     Args:
         name: of the task.
-        num: how many cases.
-        seed: that they are drawn by.
+        num: number of cases.
+        seed: with which the cases are drawn.
     """
 
     def __init__(self, name: str, num: int, seed: int):
@@ -92,31 +93,31 @@ class Setup:
             decided = jax.tree.map(lambda x: exact(np.asarray(x)), decided)
             self.contexts = jax.jit(jax.vmap(self.planner.prepare))(decided)
             self.batches = {}
-            told = peer.told_of(self.module, self.planner, self.contexts)
+            params = peer.stack_params(self.module, self.planner, self.contexts)
             for label, learned in (("learned", True), ("smooth", False)):
                 planner = self.planner.with_settings((("learned", learned),))
                 first = lambda context, planner=planner: planner.guesses(context, 1)[0]  # noqa: E731
                 starts = np.asarray(jax.jit(jax.vmap(first))(self.contexts))
-                self.batches[label] = peer.Batch(told, starts)
+                self.batches[label] = peer.Batch(params, starts)
             self._decode = jax.jit(jax.vmap(self.planner.decode))
             self._objective = jax.jit(jax.vmap(self.planner.objective))
 
     def plans(self, points: np.ndarray) -> Any:
-        """The plans of points (B, n), float64 NumPy leaves."""
+        """Return the plans of points (B, n), float64 NumPy leaves."""
         with jax.enable_x64(True):
             return jax.tree.map(np.asarray, self._decode(jnp.asarray(points), self.contexts))
 
     def objective(self, points: np.ndarray) -> np.ndarray:
-        """The planner's objective, penalties included, at points (B, n); (B,)."""
+        """Return the planner's objective, including penalties, at points (B, n); (B,)."""
         with jax.enable_x64(True):
             return np.asarray(self._objective(jnp.asarray(points), self.contexts).cost)
 
-    def accepted(self, plans: Any) -> np.ndarray:
-        """Which plans the referee passes, (B,) bool."""
+    def judge(self, plans: Any) -> np.ndarray:
+        """Return which plans the referee accepts, (B,) bool."""
         return np.asarray(self.card.judge(self.cases, plans).success)
 
     def cost(self, plans: Any) -> np.ndarray:
-        """What snap and time of plans cost, (B,)."""
+        """Return the cost of snap and time of plans, (B,)."""
         with jax.enable_x64(True):
             path = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), plans.trajectory)
             cost = self.planner.energy_weight * np.asarray(jax.vmap(snap_energy)(path))
@@ -125,8 +126,10 @@ class Setup:
         return cost
 
 
-def ours(setup: Setup, effort: str, repeat: int, batch: int, seed: int) -> tuple[Found, float]:
-    """The planner with an effort, and how long the first call of one case took, with compiling."""
+def run_planner(
+    setup: Setup, effort: str, repeat: int, batch: int, seed: int
+) -> tuple[Found, float]:
+    """Run the planner with an effort; return results and the duration of the first call."""
     planner = setup.card.planner("exact", effort=effort, **setup.card.bench)
     num, host = len(setup.batches["learned"].starts), jax.devices("cpu")[:1]
     lanes = [pj.take(setup.cases, k) for k in range(num)]
@@ -153,7 +156,7 @@ def ours(setup: Setup, effort: str, repeat: int, batch: int, seed: int) -> tuple
             name=f"`exact`, {effort}",
             cost=setup.cost(together),
             objective=np.asarray(together.cost, float),
-            accepted=setup.accepted(together),
+            accepted=setup.judge(together),
             seconds=seconds,
             in_batch=batch / min(elapsed[1:]),
         ),
@@ -164,19 +167,19 @@ def ours(setup: Setup, effort: str, repeat: int, batch: int, seed: int) -> tuple
 def seconds_to(
     setup: Setup, peer: Any, paths: list[np.ndarray], whole: np.ndarray, run: Found
 ) -> tuple[np.ndarray, np.ndarray]:
-    """How long IPOPT takes to plans that meet the limits and cost no more than a run's, (B,) [s].
+    """Return the time that IPOPT takes to a feasible plan at no more than the planner's cost.
 
     Args:
         setup: the cases.
-        peer: whose iterates these are.
+        peer: solver of the iterates.
         paths: the iterates (S, n) of each case.
-        whole: (B,) [s] that each search takes.
-        run: of the planner.
+        whole: (B,) [s], duration of each search.
+        run: results of the planner.
 
     Returns:
-        The times, and which plans are reached, (B,) bool.
+        The times (B,) [s], and which plans are reached, (B,) bool.
     """
-    worst, told = peer.programs[False].worst, setup.batches["learned"].told
+    worst, params = peer.programs[False].worst, setup.batches["learned"].params
     by_objective = peer.form == "penalties"
     target = np.asarray(run.objective if by_objective else run.cost)
     costs = np.full((max(map(len, paths)), len(paths)), np.inf)
@@ -184,7 +187,7 @@ def seconds_to(
         points = np.stack([path[min(step, len(path) - 1)] for path in paths])
         costs[step] = setup.objective(points) if by_objective else setup.cost(setup.plans(points))
     for k, path in enumerate(paths):
-        excess = np.array([float(worst(point, told[k])) for point in path]) + BETWEEN_NODES
+        excess = np.array([float(worst(point, params[k])) for point in path]) + BETWEEN_NODES
         costs[: len(path), k][~(excess <= FEASIBILITY_TOLERANCE)] = np.inf
         costs[len(path) :, k] = np.inf
     good = costs <= target * (1.0 + NO_MORE)
@@ -194,7 +197,7 @@ def seconds_to(
 
 
 def measure(bench: Bench, name: str, options: Any) -> None:
-    """All rows of one task."""
+    """Print all rows of one task."""
     peer_module: Any = importlib.import_module("planner_jax.benchmarks.ipopt_peer.peer")
     setup = Setup(name, options.num, options.seed)
     tuning = Setup(name, options.tune, options.seed + 1)
@@ -210,8 +213,8 @@ def measure(bench: Bench, name: str, options: Any) -> None:
     )
     bench.say(
         "",
-        f"Settings of IPOPT on {options.tune} other cases; tolerances are of the objective over "
-        f"{unit:.2g}, which is a usual cost:",
+        f"Settings of IPOPT on {options.tune} other cases; tolerances are for the objective "
+        f"divided by {unit:.2g}, a typical cost:",
         "",
         "| form | tolerance | options | functions | refereed | objective above the least (p90) | "
         "steps | ms |",
@@ -220,22 +223,22 @@ def measure(bench: Bench, name: str, options: Any) -> None:
     runs, peers, kept = [], {}, {}
     for form in peer_module.TRIED:
         peer = peers[form] = peer_module.Peer(setup.module, setup.planner, form, unit)
-        accepted = lambda points: tuning.accepted(tuning.plans(points))  # noqa: E731
+        accepted = lambda points: tuning.judge(tuning.plans(points))  # noqa: E731
         kept[form], rows = peer_module.best_setting(peer, tuning.batches["learned"], accepted)
         for row in rows:
             bench.row(task=name, what="setting", **row)
-            told = ", ".join(f"{k} {v}" for k, v in row["options"].items()) or "-"
-            how = "compiled C" if row["compiled"] else "CasADi's machine"
+            listed = ", ".join(f"{k} {v}" for k, v in row["options"].items()) or "-"
+            how = "compiled C" if row["compiled"] else "CasADi's virtual machine"
             mark = "**" if row["chosen"] else ""
             bench.say(
-                f"| {mark}{form}{mark} | {row['tolerance']:g} | {told} | {how} | "
+                f"| {mark}{form}{mark} | {row['tolerance']:g} | {listed} | {how} | "
                 f"{100.0 * row['success_rate']:.0f} % | {100.0 * row['above_p90']:.2f} % | "
                 f"{row['steps']:.1f} | {row['milliseconds']:.1f} |"
             )
     efforts = {}
     firsts = []
     for effort in EFFORTS:
-        efforts[effort], first = ours(setup, effort, options.repeat, batch, options.seed)
+        efforts[effort], first = run_planner(setup, effort, options.repeat, batch, options.seed)
         firsts.append(first)
         runs.append(efforts[effort])
     for start, form in ((s, f) for s in setup.batches for f in peers):
@@ -243,34 +246,34 @@ def measure(bench: Bench, name: str, options: Any) -> None:
         plans = setup.plans(found.points)
         runs.append(
             Found(
-                name=f"IPOPT, {form}, {start} first guess",
+                name=f"IPOPT, {form}, {start} initial guess",
                 cost=setup.cost(plans),
                 objective=setup.objective(found.points) if form == "penalties" else None,
-                accepted=setup.accepted(plans),
+                accepted=setup.judge(plans),
                 seconds=found.seconds,
             )
         )
-    gaps = _table(bench, name, runs)
+    gaps = _report_solvers(bench, name, runs)
     bench.say(
         "",
-        f"First calls: {', '.join(f'{each:.1f}' for each in firsts)} s by effort, with what JAX's "
-        "cache lacks compiled; "
+        f"First calls: {', '.join(f'{each:.1f}' for each in firsts)} s by effort, with compilation "
+        "of programs that JAX's cache lacks; "
         + "; ".join(
             f"IPOPT, {form}: {peer.build_seconds:.1f} s to build, {peer.compile_seconds:.1f} s "
             "to build and compile C"
             for form, peer in peers.items()
         ),
     )
-    _equal_gaps(bench, setup, efforts, peers, kept, options.repeat)
+    _report_equal_costs(bench, setup, efforts, peers, kept, options.repeat)
     bench.count(np.concatenate([each.accepted for each in efforts.values()]), *gaps)
 
 
-def _table(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
-    """A row a solver, and the gaps of the planner's efforts."""
+def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
+    """Print a row a solver; return the gaps of the planner's efforts."""
     bench.say(
         "",
         "| solver | refereed | cost above the least (median, p90, p99) | planner's objective above "
-        "the least (the same) | plans/s, one at a time on one core | plans/s in a batch |",
+        "the least (median, p90, p99) | plans/s, one at a time on one core | plans/s in a batch |",
         "|---|---|---|---|---|---|",
     )
     cost = np.min([np.where(run.accepted, run.cost, np.inf) for run in runs], axis=0)
@@ -291,7 +294,8 @@ def _table(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
             objective=gap_figures(own),
         )
         bench.say(
-            f"| {run.name} | {100.0 * success:.1f} % | {_told(gap)} | {_told(own)} | {rate:,.0f} | "
+            f"| {run.name} | {100.0 * success:.1f} % | {_format_quantiles(gap)} | "
+            f"{_format_quantiles(own)} | {rate:,.0f} | "
             f"{'-' if run.in_batch is None else f'{run.in_batch:,.0f}'} |"
         )
         if run.in_batch is not None:
@@ -299,24 +303,25 @@ def _table(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
     return gaps
 
 
-def _told(gap: np.ndarray | None) -> str:
-    """Three quantiles in per cent."""
+def _format_quantiles(gap: np.ndarray | None) -> str:
+    """Format three quantiles in per cent."""
     if gap is None or not gap.size:
         return "-"
     return ", ".join(f"{100.0 * (each or 0.0):.2f} %" for each in gap_figures(gap).values())
 
 
-def _equal_gaps(
+def _report_equal_costs(
     bench: Bench, setup: Setup, efforts: dict, peers: dict, kept: dict, repeat: int
 ) -> None:
-    """A row for each effort, form and first guess: plans a second up to the planner's cost."""
+    """Print plans/s up to the planner's cost, for each effort, form and initial guess."""
     bench.say(
         "",
-        f"At the same gap; the planner's own first guess is the learned one. jaxipm has up to "
+        f"At the same cost; the planner's own initial guess is the learned one. jaxipm has up to "
         f"{JAXIPM:g} times IPOPT's plans/s (published: other problems, one L40S):",
         "",
-        "| effort | IPOPT's form | IPOPT's first guess | reaches the planner's cost | plans/s to "
-        "there on one core | planner over IPOPT, one at a time on one core | planner in a batch "
+        "| effort | IPOPT's form | IPOPT's initial guess | reaches the planner's cost | plans/s "
+        "to this cost on one core | planner over IPOPT, one at a time on one core | "
+        "planner in a batch "
         "over IPOPT |",
         "|---|---|---|---|---|---|---|",
     )
@@ -351,12 +356,16 @@ def _equal_gaps(
 def main() -> None:
     """Print the rows."""
     parser = argument_parser("ipopt", __doc__, num=200, tune=20, seed=0, repeat=3)
-    parser.add_argument("--tasks", default=",".join(TASKS), help="default: %(default)s")
     parser.add_argument(
-        "--batch", type=at_least(1), help=f"default: {BATCH} on a CPU, {GPU_BATCH} elsewhere"
+        "--tasks", default=",".join(TASKS), help="comma-separated; default: %(default)s"
+    )
+    parser.add_argument(
+        "--batch",
+        type=at_least(1),
+        help=f"plans in a batch; default: {BATCH} on a CPU, {GPU_BATCH} elsewhere",
     )
     options = parser.parse_args()
-    names = chosen(parser, "--tasks", options.tasks, TASKS)
+    names = parse_names(parser, "--tasks", options.tasks, TASKS)
     if importlib.util.find_spec("casadi") is None:
         parser.exit(2, f"benchmarks.ipopt needs casadi: {install_line('oracle')}\n")
     if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads

@@ -1,13 +1,13 @@
-"""Time of one plan, batch 1, warm, with its success and cost beside it.
+"""Measure the time of one plan at a time, with success and cost.
 
     python -m benchmarks.latency [--num 2000] [--task hit] [--planner NAME] [--suite NAME]
         [--seed 1] [--elapsed S] [--out DIR]
 
-Every plan is of a different case of the suite, from the case's arrays to the plan's: all that the
-planner prepares, all its searches and the check of the limits included. Compile time is apart. With
---elapsed an interception is planned, and what is timed is planning it again so many seconds into
-each plan, from where the car then is, for a target that goes on as before. Run it on an idle
-machine, bound to one core; the load average is printed.
+Each plan is for another case of the suite. The time is from the case's arrays to the plan's arrays,
+with all preparations, all searches and the check of the limits. Compile time is reported
+separately. With --elapsed, interceptions are planned, and the time is for re-planning each of them
+`elapsed` seconds into its plan, from the car's state then, for a target that continues on its path.
+Run it on an idle machine, bound to one core; the load average is printed.
 """
 
 import os
@@ -25,8 +25,8 @@ from planner_jax.plane.target import LaterPath
 from planner_jax.runs.timing import measure_plans
 
 
-def planned_again(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
-    """The re-planner, and what it gets some seconds into the solved plans of a batch."""
+def begin_replans(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
+    """Return the re-planner and its problems, `elapsed` seconds into solved plans of a batch."""
     plans = pj.plan(planner, cases)
     lanes = np.flatnonzero(pj.solved(plans) & (np.asarray(plans.time) > elapsed))
     cases, plans = jax.tree.map(np.asarray, pj.take((cases, plans), lanes))
@@ -36,12 +36,14 @@ def planned_again(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Time `plan` case by case."""
+    """Measure `plan` case by case."""
     parser = argument_parser("latency", __doc__, num=2000, seed=1)
     parser.add_argument("--task", choices=all_tasks(), default="hit", help="default: hit")
-    parser.add_argument("--planner", help="default: the task's first")
-    parser.add_argument("--suite", help="default: the task's first")
-    parser.add_argument("--elapsed", type=float, help="time re-plans of interceptions [s]")
+    parser.add_argument("--planner", help="default: the first of the task")
+    parser.add_argument("--suite", help="default: the first of the task")
+    parser.add_argument(
+        "--elapsed", type=float, help="time re-plans of interceptions, this long into the plan [s]"
+    )
     options = parser.parse_args()
     card = task_named(options.task)
     if options.elapsed is not None and options.task != "intercept":
@@ -55,7 +57,7 @@ def main() -> None:
     with begin(parser, options) as bench:
         judged = batch
         if options.elapsed is not None:
-            planner, batch = planned_again(planner, batch, options.elapsed)
+            planner, batch = begin_replans(planner, batch, options.elapsed)
             judged = batch.case
         num = jax.tree.leaves(batch)[0].shape[0]
         began = time.perf_counter()
@@ -70,7 +72,7 @@ def main() -> None:
         bench.say(
             f"{num} {what} of {card.name}, suite {suite}, {jax.devices()[0].platform}, jax "
             f"{jax.__version__}, load average {os.getloadavg()[0]:.1f}",
-            f"p50 {p50:.3f} ms, p90 {p90:.3f} ms, p99 {p99:.3f} ms; of the successes "
+            f"p50 {p50:.3f} ms, p90 {p90:.3f} ms, p99 {p99:.3f} ms; of successful plans "
             f"{solved[0]:.3f}, {solved[1]:.3f} and {solved[2]:.3f} ms; "
             f"first call with compilation {first:.1f} s",
             f"refereed success {100 * success.mean():.2f} %, "
@@ -81,7 +83,7 @@ def main() -> None:
         median, most, greatest = gap_figures(gaps).values()
         if median is not None and most is not None and greatest is not None:
             bench.say(
-                f"cost above a longer search's: {100.0 * median:.1f} % at the median, p90 "
+                f"cost above a longer search: {100.0 * median:.1f} % at the median, p90 "
                 f"{100.0 * most:.1f} %, p99 {100.0 * greatest:.1f} %"
             )
         bench.note(

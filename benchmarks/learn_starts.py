@@ -1,16 +1,17 @@
-"""Train the networks that make the first guesses of hits and catches, and look what they are worth.
+"""Train the networks for the initial guesses of hits and catches, and measure their effect.
 
     python -m benchmarks.learn_starts [--tasks hit hard-hit catch] [--train MINUTES] [--num 1000]
         [--out DIR]
 
-Trained on the planner's own objective: the mean logarithm of the cost at the guess goes down, over
-batches from a large pool of cases. Half of them are of the usual suites; in the others start,
-limits, ball, racket or net and target are anything sensible, moving starts among them. Those of
-`hard-hit`, with velocities at the waypoints, are of serves planned for 0.5 to 0.88 s late, or with
-0.29 to 0.5 of the limits, many of which nobody can hit. --train does so, and replaces the shipped
-files. Prints the cost above the least that very long searches find,
-and how many hold every limit, after so many iterations from the guess with the network and without
-it, on cases that no network has seen.
+Training uses the planner's own objective: it minimises the mean logarithm of the cost at the guess,
+over batches from a large pool of cases. Half of the cases are from the usual suites. The others
+have random starts (also moving), limits, balls, rackets or nets, and targets over a reasonable
+range. Cases of `hard-hit`, with velocities at the waypoints, are serves planned 0.5 to 0.88 s late,
+or with 0.29 to 0.5 of the limits; many of them are infeasible.
+
+--train trains, and replaces the shipped files. Printed are the cost above the minimum that very
+long searches find, and the share of plans that keep every limit, after several numbers of
+iterations, with and without the network, on cases that no network was trained on.
 """
 
 import argparse
@@ -30,28 +31,28 @@ import optax
 
 import planner_jax as pj
 import planner_jax.task
-from planner_jax.benchmarks.cost_gap import to_the_optimum
+from planner_jax.benchmarks.cost_gap import with_long_search
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.optimise.shipped import StartNetwork
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.hit.default_planner import WITH_VELOCITIES
 
-_POOL = 262_144  # cases that are drawn at first, and taken in another order again and again
+_POOL = 262_144  # cases drawn at the start, and sampled again and again
 _BATCH = 8192
-_RATE = 2e-3  # of Adam at first; it falls to nothing along a cosine
-_SEED_APART = 90_001  # of cases that no network has seen
-_STEPS = 50  # a call
+_RATE = 2e-3  # initial rate of Adam, with cosine decay to zero
+_SEED_APART = 90_001  # seed of cases that no network was trained on
+_STEPS = 50  # optimiser steps in one call
 _ITERATIONS = (0, 3, 5, 7, 12, 20)
-_CHUNKS = 64  # of hard hits, each with a delay or limits of its own
+_CHUNKS = 64  # batches of hard hits, each with its own delay or limits
 
 
-def _varied(random: np.random.Generator, num: int, low: float, high: float) -> np.ndarray:
-    """Factors between two numbers, evenly by their logarithm, (num,)."""
+def _draw_factors(random: np.random.Generator, num: int, low: float, high: float) -> np.ndarray:
+    """Draw factors (num,) log-uniformly between two numbers."""
     return np.exp(random.uniform(np.log(low), np.log(high), num))
 
 
-def _moving(random: np.random.Generator, head: Any) -> Any:
-    """Head states (B, 4, 3), half of them not at rest."""
+def _add_motion(random: np.random.Generator, head: Any) -> Any:
+    """Return head states (B, 4, 3), half of them with random motion added."""
     num = len(head)
     sizes = np.array([1.5, 3.0, 15.0])[:, None] * random.uniform(size=(num, 1, 1))
     moving = random.uniform(size=(num, 1, 1)) < 0.5
@@ -60,18 +61,18 @@ def _moving(random: np.random.Generator, head: Any) -> Any:
     return head
 
 
-def hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Half of them as `pj.hit.draw` makes them, half varied."""
+def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
+    """Draw hits, half as `pj.hit.draw` does, half varied."""
     random, half = np.random.default_rng(seed), num // 2
     plain = pj.hit.draw(num - half, seed=seed)
     varied = pj.hit.draw(half, seed=seed + 1)
     limits, stroke = varied.limits, varied.hit_limits
-    factor = functools.partial(_varied, random, half)
+    factor = functools.partial(_draw_factors, random, half)
     scale = factor(0.4, 1.6)
     late = random.uniform(size=half) < 0.4
     ball = jax.tree.map(np.asarray, varied.ball)
     delay = np.where(late, random.uniform(0.0, 0.7, half), 0.0)[:, None]
-    head = _moving(random, varied.head_state)
+    head = _add_motion(random, varied.head_state)
     head[:, 0] += random.normal(size=(half, 3)) * (0.6, 0.6, 0.25)
     fall = np.array([0.0, 0.0, -9.8])
     varied = dataclasses.replace(
@@ -96,11 +97,11 @@ def hits(num: int, seed: int) -> pj.hit.HitCase:
             stroke, hitting_speed=stroke.hitting_speed * factor(0.7, 1.5)[:, None]
         ),
     )
-    return _joined(plain, varied)
+    return _concatenate(plain, varied)
 
 
-def hard_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Half of them planned late, half with weak limits."""
+def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
+    """Draw hits, half of them planned late, half with weak limits."""
     random, serves = np.random.default_rng(seed), pj.hit.generate_serves(num, seed)
     parts = []
     for k, rows in enumerate(np.array_split(np.arange(num), _CHUNKS)):
@@ -109,24 +110,24 @@ def hard_hits(num: int, seed: int) -> pj.hit.HitCase:
         else:
             options = {"limit_scale": random.uniform(0.29, 0.5)}
         parts.append(pj.hit.to_cases(serves[rows], **options))
-    return _joined(*parts)
+    return _concatenate(*parts)
 
 
-def catches(num: int, seed: int) -> pj.catch.CatchCase:
-    """Half of them of the suites `throws` and `hard` in the greedy order, half varied."""
+def draw_catches(num: int, seed: int) -> pj.catch.CatchCase:
+    """Draw catches in greedy order, half from the suites `throws` and `hard`, half varied."""
     random, half = np.random.default_rng(seed), num // 2
 
-    def drawn(num: int, seed: int) -> Any:
+    def draw_usual(num: int, seed: int) -> Any:
         suites = [
             pj.catch.draw(n, s, seed) for n, s in ((num // 2, "throws"), (num - num // 2, "hard"))
         ]
-        return first_choice(pj.catch.Greedy(), _joined(*suites))
+        return first_choice(pj.catch.Greedy(), _concatenate(*suites))
 
-    plain, varied = drawn(num - half, seed), drawn(half, seed + 1)
+    plain, varied = draw_usual(num - half, seed), draw_usual(half, seed + 1)
     limits, net = varied.limits, varied.net
-    factor = functools.partial(_varied, random, half)
+    factor = functools.partial(_draw_factors, random, half)
     scale = factor(0.6, 1.5)
-    head = _moving(random, varied.head_state)
+    head = _add_motion(random, varied.head_state)
     head[:, 0] += random.normal(size=(half, 3)) * (0.5, 0.5, 0.2)
     varied = dataclasses.replace(
         varied,
@@ -144,10 +145,10 @@ def catches(num: int, seed: int) -> pj.catch.CatchCase:
             body_rate=limits.body_rate * scale * factor(0.8, 1.25),
         ),
     )
-    return _joined(plain, varied)
+    return _concatenate(plain, varied)
 
 
-def _joined(*batches: Any) -> Any:
+def _concatenate(*batches: Any) -> Any:
     return jax.tree.map(
         lambda *parts: np.concatenate([np.asarray(p) for p in parts]).astype(parts[0].dtype),
         *batches,
@@ -155,43 +156,43 @@ def _joined(*batches: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Learnt:
-    """A network to train."""
+class _NetworkSpec:
+    """Specification of a network to train."""
 
-    file: str  # below planner_jax.task
+    file: str  # path below planner_jax.task
     draw: Callable[[int, int], Any]
     planner: Any  # without the network
     usual: Callable[[int, int], Any]  # cases of the usual suite
     hidden: tuple[int, ...] = (128, 128)
-    floor: float = 0.0  # added to a cost, so that little is gained where it is far below
+    floor: float = 0.0  # added to the cost, so that much smaller costs gain little
     iterations: tuple[int, ...] = _ITERATIONS
 
 
-def _throws(num: int, seed: int) -> Any:
+def _draw_throws(num: int, seed: int) -> Any:
     return first_choice(pj.catch.Greedy(), pj.catch.draw(num, "throws", seed))
 
 
 TASKS = {
-    "hit": _Learnt(
+    "hit": _NetworkSpec(
         "hit/start_exact-12.npz",
-        hits,
+        draw_hits,
         pj.hit.ExactHit(learned=False),
         lambda num, seed: pj.hit.draw(num, seed=seed),
     ),
-    "hard-hit": _Learnt(
+    "hard-hit": _NetworkSpec(
         "hit/start_exact-12-supple.npz",
-        hard_hits,
+        draw_hard_hits,
         pj.hit.ExactHit(learned=False).with_settings(WITH_VELOCITIES),
-        hard_hits,
+        draw_hard_hits,
         hidden=(160, 160),
         floor=3e-5,
         iterations=(0, 20, 60, 150),
     ),
-    "catch": _Learnt(
+    "catch": _NetworkSpec(
         "catch/start_exact-6.npz",
-        catches,
+        draw_catches,
         pj.catch.ExactCatch(learned=False),
-        _throws,
+        _draw_throws,
     ),
 }
 
@@ -199,7 +200,7 @@ TASKS = {
 def make_untrained(
     features: np.ndarray, outputs: int, hidden: tuple[int, ...], seed: int = 0
 ) -> StartNetwork:
-    """Return a network that adds nothing yet, for features (B, F) of a batch of cases."""
+    """Return an untrained network with zero output, for features (B, F) of a batch of cases."""
     random = np.random.default_rng(seed)
     sizes = (features.shape[-1], *hidden, outputs)
     weights = [
@@ -215,7 +216,7 @@ def make_untrained(
 
 
 def to_bytes(network: StartNetwork) -> bytes:
-    """Return a network as an archive of arrays in half precision, which is more than it knows."""
+    """Return a network as an archive of half-precision arrays, which is precise enough."""
     arrays = {"mean": network.mean, "deviation": network.deviation}
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays |= {f"weight{k}": weight, f"bias{k}": bias}
@@ -228,14 +229,16 @@ def to_bytes(network: StartNetwork) -> bytes:
     return file.getvalue()
 
 
-def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]) -> StartNetwork:
-    """The network, after so much time."""
-    planner = learnt.planner
-    pool = jax.device_put(jax.tree.map(jnp.asarray, learnt.draw(_POOL, seed)))
+def train(
+    spec: _NetworkSpec, minutes: float, seed: int, say: Callable[[str], None]
+) -> StartNetwork:
+    """Train a network for some minutes."""
+    planner = spec.planner
+    pool = jax.device_put(jax.tree.map(jnp.asarray, spec.draw(_POOL, seed)))
     prepare = jax.jit(jax.vmap(planner.prepare))
     few = prepare(jax.tree.map(lambda leaf: leaf[:16_384], pool))
     features = np.asarray(jax.jit(jax.vmap(planner.start_features))(few), np.float64)
-    network = make_untrained(features, len(planner.scale), learnt.hidden)
+    network = make_untrained(features, len(planner.scale), spec.hidden)
     params = jax.tree.map(jnp.asarray, (network.weights, network.biases))
 
     def loss(params: Any, cases: Any) -> Any:
@@ -244,7 +247,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
         def of_case(case: Any) -> Any:
             context = planner.prepare(case)
             guess = planner.guesses(context, 1)[0] + own(planner.start_features(context))
-            return jnp.log(planner.objective(guess, context).cost + learnt.floor)
+            return jnp.log(planner.objective(guess, context).cost + spec.floor)
 
         logs = jax.vmap(of_case)(cases)
         return jnp.mean(jnp.where(jnp.isfinite(logs), logs, 20.0))
@@ -272,7 +275,7 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
         rate = _RATE * 0.5 * (1.0 + np.cos(np.pi * share))
         params, state, value = steps(params, state, own, rate)
         value.block_until_ready()
-        began = began or time.perf_counter()  # the first call compiles
+        began = began or time.perf_counter()  # after the first call, which compiles
         calls += 1
         share = min((time.perf_counter() - began) / (60.0 * minutes), 1.0)
         if calls % 20 == 1:
@@ -284,27 +287,27 @@ def train(learnt: _Learnt, minutes: float, seed: int, say: Callable[[str], None]
 
 
 def compare(bench: Bench, task: str, num: int) -> None:
-    """What the shipped network is worth, a row for each number of iterations."""
-    learnt = TASKS[task]
-    cases = jax.tree.map(np.asarray, learnt.usual(num, _SEED_APART))
+    """Print the effect of the shipped network, a row for each number of iterations."""
+    spec = TASKS[task]
+    cases = jax.tree.map(np.asarray, spec.usual(num, _SEED_APART))
     planners = {
-        "smooth": learnt.planner,
-        "learned": dataclasses.replace(learnt.planner, learned=True),
+        "smooth": spec.planner,
+        "learned": dataclasses.replace(spec.planner, learned=True),
     }
-    best = np.minimum(*(pj.plan(to_the_optimum(each), cases).cost for each in planners.values()))
+    best = np.minimum(*(pj.plan(with_long_search(each), cases).cost for each in planners.values()))
     bench.say(
         f"{task}: {num:,} cases",
-        "| guess | iterations | limits hold | cost above the least found (median, p90, p99) |",
+        "| guess | iterations | limits hold | cost above the minimum found (median, p90, p99) |",
         "|---|---:|---:|---|",
     )
     holds = np.zeros(0, bool)
-    for iterations in learnt.iterations:
+    for iterations in spec.iterations:
         for name, planner in planners.items():
             plans = pj.plan(planner.with_solver(pj.LbfgsConfig(max_steps=iterations)), cases)
             holds = pj.solved(plans)
             quantiles = np.quantile(plans.cost / best - 1.0, (0.5, 0.9, 0.99))
-            told = ", ".join(f"{100.0 * each:.2f} %" for each in quantiles)
-            bench.say(f"| {name} | {iterations} | {100.0 * holds.mean():.2f} % | {told} |")
+            text = ", ".join(f"{100.0 * each:.2f} %" for each in quantiles)
+            bench.say(f"| {name} | {iterations} | {100.0 * holds.mean():.2f} % | {text} |")
             bench.row(
                 task=task,
                 guess=name,
@@ -317,24 +320,31 @@ def compare(bench: Bench, task: str, num: int) -> None:
     bench.count(holds)
 
 
-def shipped_file(task: str) -> Path:
-    """Where the network of a task is kept."""
+def locate_file(task: str) -> Path:
+    """Return the path of the shipped network of a task."""
     return Path(planner_jax.task.__path__[0]) / TASKS[task].file
 
 
 def main() -> None:
-    """Train, if asked to, and compare."""
+    """Train networks if requested, and compare."""
     parser = argument_parser("learn_starts", __doc__, num=1000, seed=11)
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--only-train", action="store_true", help="print no table")
-    parser.add_argument("--train", type=float, metavar="MINUTES", help="make the files anew")
+    parser.add_argument(
+        "--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="default: all"
+    )
+    parser.add_argument("--only-train", action="store_true", help="train only, without the table")
+    parser.add_argument(
+        "--train",
+        type=float,
+        metavar="MINUTES",
+        help="train this long, and replace the shipped files",
+    )
     options: argparse.Namespace = parser.parse_args()
     with begin(parser, options) as bench:
         for task in options.tasks:
             if options.train:
                 network = train(TASKS[task], options.train, options.seed, bench.say)
-                shipped_file(task).write_bytes(to_bytes(network))
-                bench.say(f"wrote {shipped_file(task).name}")
+                locate_file(task).write_bytes(to_bytes(network))
+                bench.say(f"wrote {locate_file(task).name}")
             if not options.only_train:
                 compare(bench, task, options.num)
 

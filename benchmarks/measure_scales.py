@@ -1,13 +1,13 @@
-"""Measure the scales of the exact planners' decision variables beside the shipped ones.
+"""Measure the scales of the exact planners' decision variables, beside the shipped scales.
 
     python -m benchmarks.measure_scales [--write] [--out DIR]
 
-Hits: serves of the generator (seed 7), 100 of each hard kind, so that limits are active.
-Catches: throws of the suite `hard`, at limits x 1 and 0.8; one segment serves for all.
-Scale i is 1 / sqrt(floor + median H_ii), where H = J^T J is the Gauss-Newton curvature of the
-planner's residuals in SI units, and the median is over cases, each taken at its first guess and at
-a solution. Prints the largest ratio to the shipped scale, and of how many cases the referee accepts
-the plan that is made with the measured one; --write makes the shipped files anew.
+Hits: serves of the generator (seed 7), 100 of each hard kind, so that limits are active. Catches:
+throws of the suite `hard`, with limits x 1 and x 0.8; all segments share one scale. Scale i is 1 /
+sqrt(floor + median H_ii). H = J^T J is the Gauss-Newton curvature of the planner's residuals in SI
+units. The median is over cases, each with the sum of H at its initial guess and at a solution.
+Prints the largest ratio to the shipped scale, and the share of plans with the measured scale that
+the referee accepts. --write replaces the shipped files.
 """
 
 import dataclasses
@@ -39,17 +39,17 @@ from planner_jax.trajectory.proportional_minco import (
 
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 
-# Sensible sizes to begin with: metres, log seconds, log m/s^2, m/s, m/s^3.
+# Reasonable initial scales: metres, log seconds, log m/s^2, m/s, m/s^3.
 _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
-# Log seconds, place in the net, m/s, m/s^2, m/s^3.
+# Log seconds, position in the net, m/s, m/s^2, m/s^3.
 _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
-# Curvature taken as none: easy throws hardly feel the place in the net and the last jerk.
+# Easy throws hardly depend on the position in the net and the final jerk, so the floor is larger.
 _CATCH_FLOOR = 0.1
 
 
-# Of a planner, a point (n,) and its context, residuals (R,).
+# Function of a planner, a point (n,) and its context; returns residuals (R,).
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
-_ROUNDS = 3  # of measuring with the scale that the round before has found
+_ROUNDS = 3  # of measuring with the scale of the round before
 
 
 def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.Array) -> jax.Array:
@@ -63,17 +63,15 @@ def measure_scale(
 ) -> np.ndarray:
     """Measure the scale of every decision variable on a batch of cases.
 
-    Solutions depend on the scale they were found with, so measuring is repeated with its own
-    result; two or three rounds settle it.
+    Solutions depend on the scale with which they are found, so the measurement is repeated with its
+    own result; it converges in two or three rounds.
 
     Args:
-        planner: a frozen dataclass with a `scale` field, the first value of which only has
-            to be sensible.
-        cases: a batch; a few hundred, hard ones among them, so that limits are active.
-        residuals: of the planner, a point (n,) and its context: (R,) whose squares sum to about
-            twice the objective near its minimum.
-        floor: curvature that is taken as none, so that a variable which hardly matters keeps
-            a finite scale.
+        planner: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.
+        cases: a batch of a few hundred cases, some of them hard, so that limits are active.
+        residuals: function of the planner, a point (n,) and its context. Returns (R,), whose
+            squares sum to about twice the objective near its minimum.
+        floor: added to the curvature, so that a variable with almost no effect gets a finite scale.
 
     Returns:
         (n,) float64.
@@ -103,7 +101,8 @@ def measure_scale(
 def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> jax.Array:
     """Return the residuals of a planner of segments: squared hinges, energy and time.
 
-    The smoothed hinge bends at most with 3 / (2 hinge_width); the residuals bend alike.
+    The curvature of the smoothed hinge is at most 3 / (2 hinge_width); the residuals have this
+    curvature.
     """
     case, along = context.case, planner.along(planner.nodes, context.case)
     offsets, natural = planner.split(point)
@@ -133,8 +132,8 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
     return jnp.concatenate([part.ravel() for part in parts])
 
 
-def hard_serves(num: int, seed: int) -> pj.hit.HitCase:
-    """`num` serves of each of five kinds: late, very late, weak, very weak, any start."""
+def draw_hard_serves(num: int, seed: int) -> pj.hit.HitCase:
+    """Draw `num` serves of each of five kinds: late, very late, weak, very weak, any start."""
     kinds = (
         functools.partial(pj.hit.to_cases, delay=0.5),
         functools.partial(pj.hit.to_cases, delay=0.6),
@@ -147,8 +146,8 @@ def hard_serves(num: int, seed: int) -> pj.hit.HitCase:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *batches)
 
 
-def weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
-    """`num` hard throws at each of two limits on speed and body rate."""
+def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
+    """Draw `num` hard throws for each of two limits on speed and body rate."""
     cases = first_choice(pj.catch.Greedy(), pj.catch.draw(num, "hard", seed))
 
     def weaker(factor: float) -> pj.catch.CatchCase:
@@ -163,7 +162,7 @@ def weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """`ExactHit` with a first guess of its scale, by the scale's name."""
+    """Return `ExactHit` with an initial guess of its scale, by the scale's name."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -173,7 +172,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """`ExactCatch` with a first guess of the scale of one segment, by the scale's name."""
+    """Return `ExactCatch` with an initial guess of a segment's scale, by the scale's name."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH
@@ -184,16 +183,16 @@ def catch_planners() -> dict[str, Any]:
 
 # Task -> cases, planners, options of `measure_scale`.
 TASKS = {
-    "hit": (hard_serves, hit_planners, {}),
-    "catch": (weak_throws, catch_planners, {"floor": _CATCH_FLOOR}),
+    "hit": (draw_hard_serves, hit_planners, {}),
+    "catch": (draw_weak_throws, catch_planners, {"floor": _CATCH_FLOOR}),
 }
 
 
 def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarray]:
-    """The scales of a task by name, compared with the shipped ones."""
+    """Measure the scales of a task by name, and compare them with the shipped scales."""
     draw, planners, options = TASKS[task]
     cases, found = draw(num, seed), {}
-    shipped = json.loads(shipped_file(task).read_text("utf-8"))
+    shipped = json.loads(locate_file(task).read_text("utf-8"))
     for name, planner in planners().items():
         scale = found[name] = measure_scale(planner, cases, chain_residuals, **options)
         bench.say(f"{task} {name} {np.array2string(scale, precision=3, max_line_width=100)}")
@@ -209,16 +208,18 @@ def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarra
     return found
 
 
-def shipped_file(task: str) -> Path:
-    """Where the scales of a task are kept."""
+def locate_file(task: str) -> Path:
+    """Return the path of the shipped scales of a task."""
     return Path(planner_jax.task.__path__[0]) / task / "measured_scales.json"
 
 
 def main() -> None:
-    """Measure, and write or compare."""
+    """Measure scales, then write or compare them."""
     parser = argument_parser("measure_scales", __doc__, num=100, seed=7)
     parser.add_argument("--write", action="store_true", help="replace the shipped files")
-    parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
+    parser.add_argument(
+        "--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="default: all"
+    )
     options = parser.parse_args()
     with begin(parser, options) as bench:
         for task in options.tasks:
@@ -228,7 +229,7 @@ def main() -> None:
                     name: [float(f"{value:.3g}") for value in scale]
                     for name, scale in found.items()
                 }
-                path = shipped_file(task)
+                path = locate_file(task)
                 path.write_text(json.dumps(rounded, indent=1) + "\n", "utf-8")
                 bench.say(f"wrote {path.name} of {task}")
 

@@ -1,11 +1,11 @@
-"""The batched L-BFGS beside optax.lbfgs and SciPy's L-BFGS-B on the same hit objective.
+"""Compare the batched L-BFGS with optax.lbfgs and SciPy's L-BFGS-B on the same hit objective.
 
     python -m benchmarks.optimiser [--num 200] [--row late-0.5] [--out DIR]
 
-All three get the same float32 objective in the same scaled variables from the same start.
-Time is per plan, warm: the batched solvers in one call over all serves, SciPy serve by serve
-with a compiled value and gradient. Success is the referee's; the summary of the run folder is of
-this library's solver, all budgets of iterations together.
+All three get the same float32 objective in the same scaled variables and the same start. Times are
+per plan, compiled before: the batched solvers in one call for all serves, SciPy serve by serve with
+a compiled value and gradient. Success is judged by the referee. The summary of the run folder is
+about this library's solver, over all iteration budgets.
 """
 
 import time
@@ -27,8 +27,8 @@ from planner_jax.task.hit.default_planner import ExactHit
 PLANNER = ExactHit()
 
 
-def ours(iterations: int) -> Callable:
-    """This library's solver, one problem."""
+def make_own_solver(iterations: int) -> Callable:
+    """Return this library's solver for one problem."""
 
     def solve(case):
         context = PLANNER.prepare(case)
@@ -41,8 +41,8 @@ def ours(iterations: int) -> Callable:
     return solve
 
 
-def with_optax(iterations: int) -> Callable:
-    """optax.lbfgs with its zoom line search, one problem."""
+def make_optax_solver(iterations: int) -> Callable:
+    """Return optax.lbfgs with its zoom line search for one problem."""
 
     def solve(case):
         context = PLANNER.prepare(case)
@@ -66,8 +66,8 @@ def with_optax(iterations: int) -> Callable:
     return solve
 
 
-def batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
-    """Points, mean iterations and warm seconds of a batched solver."""
+def run_batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
+    """Run a batched solver; return points, mean iterations and duration [s], compiled before."""
     compiled = jax.jit(jax.vmap(solve))
     jax.block_until_ready(compiled(cases))
     began = time.perf_counter()
@@ -75,8 +75,8 @@ def batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
     return np.asarray(points), float(iterations.mean()), time.perf_counter() - began
 
 
-def with_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
-    """Points, mean iterations and seconds of SciPy's L-BFGS-B, serve by serve."""
+def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
+    """Run SciPy's L-BFGS-B serve by serve; return points, mean iterations and duration [s]."""
     contexts = jax.jit(jax.vmap(PLANNER.prepare))(cases)
     starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
     value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PLANNER.objective(x, c).cost))
@@ -103,9 +103,9 @@ def with_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
 
 
 def main() -> None:
-    """Print one line a solver and iteration budget."""
+    """Print one line for each solver and iteration budget."""
     parser = argument_parser("optimiser", __doc__, num=200)
-    parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1])
+    parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1], help="default: late-0.5")
     options = parser.parse_args()
     cases = pj.hit.draw(options.num, seed=2, **ROWS[options.row])
     final = jax.jit(jax.vmap(lambda s, x: PLANNER.objective(x, PLANNER.prepare(s)).cost))
@@ -118,9 +118,9 @@ def main() -> None:
         )
         best = pj.plan(PLANNER.with_solver(), jax.tree.map(np.asarray, cases))
         runs = {
-            "planner_jax": lambda n: batched(ours(n), cases),
-            "optax.lbfgs": lambda n: batched(with_optax(n), cases),
-            "SciPy L-BFGS-B": lambda n: with_scipy(cases, n),
+            "planner_jax": lambda n: run_batched(make_own_solver(n), cases),
+            "optax.lbfgs": lambda n: run_batched(make_optax_solver(n), cases),
+            "SciPy L-BFGS-B": lambda n: run_scipy(cases, n),
         }
         for budget, name in ((budget, name) for budget in (10, 60, 200) for name in runs):
             points, iterations, seconds = runs[name](budget)

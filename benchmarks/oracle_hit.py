@@ -1,19 +1,19 @@
-"""Does any feasible hit exist? A direct transcription with an interior-point solver looks for it.
+"""Search for feasible hits by direct transcription, in cases that planners do not solve.
 
     python -m benchmarks.oracle_hit [--serves DIR] [--delay S] [--limit-scale F]
         [--failures RUN/plans | --indices FILE.npy] [--num N] [--starts K] [--out DIR]
 
-It draws a sample of the serves on which a planner failed and looks for hits by other means than
-the planners', with which it shares no code. The quadrotor's snap is constant on pieces of free
-duration, so that position to jerk are continuous. The impact, its time and the ball's flight
-after it are equations of the program, limits are inequalities at samples of every piece, and
-IPOPT minimises the largest relative excess over a limit. Coarse pieces come first, from many
-starts. Where their excess is small they are halved, and limits that still peak between samples
-are tightened on their piece. A hit counts only if the library's referee passes it.
+The search takes a sample of serves, for example those where a planner failed, and shares no code
+with the planners. The quadrotor's snap is constant on pieces of free duration, so position to jerk
+are continuous. The impact, its time and the ball's flight after it are equality constraints. Limits
+are inequalities at samples of every piece. IPOPT minimises the largest relative excess over a
+limit. It starts with coarse pieces, from many starting points. If the excess is small, the pieces
+are halved, and limits that still peak between samples are tightened on their piece. A hit counts
+only if the library's referee accepts it.
 
-A hit that is found proves its case feasible. That none is found proves nothing; but where all
-starts end at the same excess, this is how far all limits together would have to give way. Needs
-the extra `oracle` (CasADi).
+A found hit proves its case feasible. If none is found, nothing is proven; but if all starts end
+with the same excess, all limits together would probably have to be relaxed by this share. Needs the
+extra `oracle` (CasADi).
 """
 
 import argparse
@@ -31,18 +31,18 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
 
-NUM_GENERATED = 9000  # serves that are drawn where no folder is given
+NUM_GENERATED = 9000  # serves that are drawn if no folder is passed
 VERDICTS = ("feasible", "infeasible", "undecided")
 
 
-def failed_indices(plans: Path) -> np.ndarray:
-    """Indices of the serves whose plan did not succeed, from a sweep's `plans`."""
+def read_failures(plans: Path) -> np.ndarray:
+    """Read the indices of serves whose plan failed, from a sweep's `plans`."""
     table = Dataset(plans).read(["index", "success"])
     return table["index"].to_numpy()[~table["success"].to_numpy()]
 
 
 def summarise(findings: list[Finding]) -> dict:
-    """Counts with Wilson intervals, and times."""
+    """Return counts with Wilson intervals, and times."""
     num, verdicts = len(findings), {}
     for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)
@@ -61,8 +61,8 @@ def summarise(findings: list[Finding]) -> dict:
     }
 
 
-def table_of(summary: dict) -> str:
-    """The summary as a Markdown table and two sentences."""
+def format_table(summary: dict) -> str:
+    """Format the summary as a Markdown table and two sentences."""
     lines = ["| verdict | cases | share | 95 % interval |", "|---|---|---|---|"]
     for name in VERDICTS:
         row = summary[name]
@@ -71,17 +71,19 @@ def table_of(summary: dict) -> str:
         lines.append(f"| {name} | {row['count']} | {share:.1f} % | {low:.1f}..{high:.1f} % |")
     if quartiles := summary["least_excess_quartiles_of_infeasible"]:
         listed = ", ".join(f"{100.0 * value:.1f}" for value in quartiles)
-        lines += ["", f"Least excess of the infeasible, quartiles: {listed} % of every limit."]
+        lines += ["", f"Least excess over the limits of infeasible cases, quartiles: {listed} %."]
     lines += [
         "",
-        f"{summary['cpu_seconds_median']:.2f} s of processor time a case (median), "
+        f"{summary['cpu_seconds_median']:.2f} s of CPU time a case (median), "
         f"{summary['cpu_seconds_p90']:.2f} s (90 %), {summary['cpu_seconds']:.0f} s in all.",
     ]
     return "\n".join(lines)
 
 
-def keep(bench: Bench, summary: dict, indices: np.ndarray, findings: list[Finding]) -> None:
-    """Rows of all cases, and hits.npz with the trajectories that were found."""
+def write_findings(
+    bench: Bench, summary: dict, indices: np.ndarray, findings: list[Finding]
+) -> None:
+    """Store rows of all cases, and hits.npz with the trajectories of the hits."""
     for index, finding in zip(indices, findings, strict=True):
         numbers = {k: v for k, v in vars(finding).items() if k not in ("coeffs", "durations")}
         bench.row(index=index, verdict=finding.verdict, **numbers)
@@ -96,29 +98,38 @@ def keep(bench: Bench, summary: dict, indices: np.ndarray, findings: list[Findin
     )
 
 
-def parser_of_arguments() -> argparse.ArgumentParser:
-    """The parser."""
+def make_parser() -> argparse.ArgumentParser:
+    """Return the argument parser."""
     parser = argument_parser("oracle_hit", __doc__, num=200, starts=len(STARTS), seed=0, workers=1)
     add = parser.add_argument
     add("--serves", type=Path, help="folder of published trial files (default: draw serves)")
-    add("--delay", type=float, default=0.0, help="seconds from the serve to the planning")
-    add("--limit-scale", type=float, default=1.0, help="of speed, acceleration, body rate")
+    add("--delay", type=float, default=0.0, help="time from the serve to the planning [s]")
+    add(
+        "--limit-scale",
+        type=float,
+        default=1.0,
+        help="factor of the limits on speed, acceleration and body rate",
+    )
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--failures", type=Path, help="folder plans of a sweep (default: all)")
+    which.add_argument(
+        "--failures",
+        type=Path,
+        help="folder `plans` of a sweep; its failures are judged (default: all serves)",
+    )
     which.add_argument("--indices", type=Path, help=".npy file with indices of serves")
     return parser
 
 
 def main() -> None:
     """Judge a sample of cases."""
-    parser = parser_of_arguments()
+    parser = make_parser()
     options = parser.parse_args()
     try:
         drawn = functools.partial(generate_serves, NUM_GENERATED, options.seed)
         serves = read_serves(options.serves) if options.serves else drawn()
         pool = np.arange(len(serves))
         if options.failures:
-            pool = failed_indices(options.failures)
+            pool = read_failures(options.failures)
         elif options.indices:
             pool = np.load(options.indices)
         if not (pool.size and 0 <= pool.min() and pool.max() < len(serves)):
@@ -137,8 +148,8 @@ def main() -> None:
         starts = starting_points(options.starts, options.seed)
         findings = find_hits(cases, starts, workers=options.workers)
         summary = summarise(findings) | {"of": int(pool.size)}
-        bench.say(table_of(summary))
-        keep(bench, summary, sample, findings)
+        bench.say(format_table(summary))
+        write_findings(bench, summary, sample, findings)
 
 
 if __name__ == "__main__":

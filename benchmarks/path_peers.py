@@ -1,7 +1,8 @@
-"""A published Hybrid A* on the searches of `intercept_paths`: fastsim-navigation, extra `peers`.
+"""Run a published Hybrid A* (fastsim-navigation, extra `peers`) on searches of `intercept_paths`.
 
-It is C++ and has been seen to abort the process that runs it, so that it gets one of its own:
-`python -m benchmarks.path_peers SEARCHES.json RESULTS.jsonl FIRST` writes a line for every search.
+The C++ code sometimes aborts its process, so it runs in a process of its own: `python -m
+benchmarks.path_peers SEARCHES.json RESULTS.jsonl FIRST` writes a line for every search, starting
+with number FIRST.
 """
 
 import importlib
@@ -21,26 +22,30 @@ INSTALL = (
     "fastsim-navigation not installed: pip install 'planner-jax[peers]' adds it to compare with "
     "(Python 3.11, Linux, x86-64)"
 )
-CELL, PAD = 0.1, 0.4  # [m], of the cost map, and how far it reaches beyond the case's map
+CELL, PAD = 0.1, 0.4  # [m], cell size of the cost map, and margin beyond the case's map
 REPEATS = 3
-_START_UP, _EACH = 30.0, 20.0  # seconds that a process and a search may take
+_START_UP, _EACH = 30.0, 20.0  # [s], time limits of a process start and of a search
 
 
-def installed() -> bool:
-    """Whether the peer can be imported."""
+def is_installed() -> bool:
+    """Return whether the peer can be imported."""
     return importlib.util.find_spec(PEER) is not None
 
 
-def searched(searches: Sequence[dict], folder: Path) -> list[dict]:
-    """What the peer makes of searches: of each "found" and "aborted", else "ms" and "poses" too.
-
-    Raises `RuntimeError` where the peer does not run at all.
+def run_searches(searches: Sequence[dict], folder: Path) -> list[dict]:
+    """Run the peer on searches; restart it after an abort.
 
     Args:
-        searches: of each "start" and "goal" (3,), the rear axle's poses; "distance" (Y, X) [m] of
-            the cost map's cells from the nearest wall; "corner" (2,) [m] of the map; "curvature"
+        searches: each with "start" and "goal" (3,), poses of the rear axle; "distance" (Y, X) [m]
+            of the cost map's cells from the nearest wall; "corner" (2,) [m] of the map; "curvature"
             [1/m]; and "body", corners (4, 2) [m] ahead and to the left of the rear axle.
-        folder: for files in between.
+        folder: for temporary files.
+
+    Returns:
+        For each search "found" and "aborted", and "ms" and "poses" unless it aborted.
+
+    Raises:
+        RuntimeError: the peer does not run at all.
     """
     given, results = folder / "searches.json", folder / "results.jsonl"
     given.write_text(json.dumps(searches))
@@ -67,9 +72,9 @@ def searched(searches: Sequence[dict], folder: Path) -> list[dict]:
 
 
 def search_one(given: dict) -> dict:
-    """One search, the fastest of several calls; a new planner each, so that nothing is kept."""
+    """Run one search several times, each with a new planner; return the fastest."""
     peer: Any = importlib.import_module(PEER)
-    # A wall takes every cell that it comes within half a cell's side of.
+    # A cell counts as wall if a wall is within half a cell of its centre.
     cells = np.where(np.array(given["distance"]) <= 0.5 * CELL, 254, 0).astype(np.uint8)
     config = peer.PlannerConfig()
     config.allow_reverse, config.smooth_path = False, False
@@ -91,7 +96,7 @@ def search_one(given: dict) -> dict:
 
 
 def main() -> None:
-    """Search, from a place on, and write a line of results each."""
+    """Run the searches from number FIRST on, and append a line of results for each."""
     given, results, first = sys.argv[1:]
     searches = json.loads(Path(given).read_text())
     with Path(results).open("a") as file:

@@ -1,11 +1,11 @@
-"""Batches in which some cases are absurd: are these all marked, and do the others keep their bits?
+"""Check that invalid cases in a batch are all marked, and that they change no other plan.
 
     python -m benchmarks.poisoned_batches [--num 20000] [--task hit] [--every 100] [--seed 0]
         [--out DIR]
 
-Every hundredth case breaks a rule of its class, another rule and another bad value from one to the
-next: NaN, infinity, a number below or above what is allowed. Both batches, sound and poisoned, stay
-in jax arrays; a case of the poisoned one is marked if its status is BAD_INPUT.
+Every hundredth case violates a rule of its class. Rules and bad values take turns: NaN, infinity,
+numbers below or above the allowed range. Both batches, the valid and the poisoned one, are JAX
+arrays. A poisoned case is marked if the status of its plan is BAD_INPUT.
 """
 
 import argparse
@@ -22,12 +22,12 @@ from planner_jax.core.registry import all_tasks
 from planner_jax.core.rules import all_ruled
 from planner_jax.planning.decided import DecidedPlanner
 
-REPLACED = ("order", "times")  # by a decision, which does not read what they hold
+REPLACED = ("order", "times")  # replaced by a decision that does not read the values
 BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
 
 
 def poisons(case: Any) -> list[tuple[str, float]]:
-    """Names of a case's arrays, and values that break a rule of theirs."""
+    """Return names of a case's arrays with values that violate their rules."""
     found = []
     for ruled in all_ruled(jax.tree.map(np.asarray, case)):
         for value in BAD:
@@ -38,13 +38,13 @@ def poisons(case: Any) -> list[tuple[str, float]]:
     return list(dict.fromkeys(found))
 
 
-def poisoned(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
-    """The batch in NumPy arrays, in which each of some lanes breaks the next rule.
+def poison(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
+    """Return the batch in NumPy arrays, with a rule violated in some batch elements.
 
     Args:
         cases: a batch.
-        lanes: those that are poisoned.
-        spared: names of arrays that are left as they are.
+        lanes: indices of the batch elements to poison; each violates the next rule.
+        spared: names of arrays that stay unchanged.
     """
     paths, tree = jax.tree_util.tree_flatten_with_path(cases)
     leaves = {
@@ -59,12 +59,12 @@ def poisoned(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any
 
 
 def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
-    """How many lanes are poisoned, marked, sound, and sound with the bits of the sound batch."""
+    """Count poisoned and marked cases, and the other cases with the bits of the valid batch."""
     cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)
     lanes = np.arange(every // 2, num, every)
     others = np.setdiff1d(np.arange(num), lanes)
     spared = REPLACED if isinstance(planner, DecidedPlanner) else ()
-    broken = jax.tree.map(jnp.asarray, poisoned(cases, lanes, spared))
+    broken = jax.tree.map(jnp.asarray, poison(cases, lanes, spared))
     sound, found = jax.device_get((pj.plan(planner, cases), pj.plan(planner, broken)))
     same = np.ones(num, bool)
     for ours, theirs in zip(jax.tree.leaves(sound), jax.tree.leaves(found), strict=True):
@@ -81,7 +81,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """The row."""
+    """Print the row."""
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)
     bench.row(task=options.task, num=options.num, **found)

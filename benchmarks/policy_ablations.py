@@ -1,17 +1,17 @@
-"""What a policy's training owes to its parts: one left out at a time, over several seeds.
+"""Measure the effect of each part of a policy's training, by leaving out one at a time.
 
     python -m benchmarks.policy_ablations [--suite triangle3] [--decisions 1500000] [--seeds 3]
         [--variants whole,mlp,...] [--num 1000] [--seed 777] [--out DIR]
 
-"whole" is a training as `planner-jax train` makes it: the network of attention, every decision
-planned, rewards for success, early last catches and times that hold. Of the others each differs
-in one thing: "mlp" in its network; "estimate" has decisions judged by the estimate, without a
-planner; "no last" and "no ratio" lack a term of the reward. "small" is of the size that the paper
-names (IV-B): its network, 100 environments, and a tenth of the decisions, which already takes
-longer. What is trained decides about cases of a seed that it was not trained on; every plan is by
-`exact` and refereed, last catches and optimal time ratios (OTR) are of what the referee accepts.
-The spread over the seeds is given as least and largest. Seconds are of training, compilation
-included.
+"whole" is the training of `planner-jax train`: the attention network, every decision planned, and
+rewards for success, early last catches and feasible times. Each other variant differs in one part.
+"mlp" has another network. "estimate" judges decisions by the estimate, without a planner. "no last"
+and "no ratio" lack a term of the reward. "small" has the size that the paper states (IV-B): its
+network, 100 environments, and a tenth of the decisions, which already takes longer.
+
+The trained policies decide on cases of a seed that no training uses. Every plan is by `exact` and
+judged by the referee. Last catches and optimal time ratios (OTR) are over accepted plans. The
+variation over training seeds is printed as minimum and maximum. Training times include compilation.
 """
 
 import argparse
@@ -25,7 +25,7 @@ import jax
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin, parse_names
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.policies.policy import Policy
 from planner_jax.policies.settings import WEIGHTS
@@ -45,7 +45,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 FIGURES = ("success", "last", "ratio", "seconds")
 
 
-def asked(
+def training_settings(
     suite: str,
     decisions: int,
     seed: int,
@@ -55,17 +55,20 @@ def asked(
     weights: Mapping[str, float] | None = None,
     **others: Any,
 ) -> Training:
-    """The training of a variant."""
+    """Return the training settings of a variant."""
     part = Part(steps=int(share * decisions), iterations=(iterations,))
     terms = tuple({**WEIGHTS, **(weights or {})}.items())
     usual = Training(suites=(suite,), parts=(part,), seed=seed, weights=terms, eval_cases=0)
     return dataclasses.replace(usual, **others)
 
 
-def figures_of(
+def judge_decision(
     bench: Bench, decision: Any, suite: str, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Success, mean last catch [s] and optimal time ratio of a decision's plans, counted."""
+    """Judge a decision's plans, and count the successes.
+
+    Returns success [%], mean last catch [s], and optimal time ratio.
+    """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
     good = pj.catch.judge(cases, plans).success
@@ -78,7 +81,7 @@ def figures_of(
 
 
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
-    """All rows."""
+    """Print all rows."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
@@ -87,49 +90,49 @@ def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> N
     )
     for name in ("best", "greedy"):
         decision = pj.catch.Best() if name == "best" else pj.catch.Greedy()
-        one = figures_of(bench, decision, options.suite, options)
+        one = judge_decision(bench, decision, options.suite, options)
         bench.row(variant=name, **one)
         bench.say(
             f"| `{name}`, not trained | {one['success']:.1f} % | {one['last']:.3f} s "
             f"| {one['ratio']:.3f} | |"
         )
     for name in variants:
-        over_seeds(
+        report_seeds(
             bench,
             {"variant": name},
-            lambda seed, name=name: trained(
-                asked(options.suite, options.decisions, seed, **VARIANTS[name])
+            lambda seed, name=name: train_policy(
+                training_settings(options.suite, options.decisions, seed, **VARIANTS[name])
             ),
             options,
         )
 
 
-def trained(training: Training) -> Policy:
-    """The policy of a training whose folder is not kept."""
+def train_policy(training: Training) -> Policy:
+    """Train a policy in a temporary folder."""
     with tempfile.TemporaryDirectory() as scratch:
         return train(training, scratch, progress=False)
 
 
-def over_seeds(
+def report_seeds(
     bench: Bench,
     named: Mapping[str, str],
     train_by: Callable[[int], Any],
     options: argparse.Namespace,
 ) -> None:
-    """The rows of a training by every seed, and the line of their least and largest figures.
+    """Train with every seed; store a row for each, and print the line of minima and maxima.
 
     Args:
-        bench: to which they are added.
-        named: what the training is called, under the heading of its column.
-        train_by: the decision that comes of a seed.
-        options: `suite` and `seeds`, and those of `figures_of`.
+        bench: receives the rows.
+        named: the name of the training, under the heading of its column.
+        train_by: function that trains a decision with a seed.
+        options: `suite` and `seeds`, and the options of `judge_decision`.
     """
     rows = []
     for seed in range(options.seeds):
         began = time.perf_counter()
         found = train_by(seed)
         seconds = time.perf_counter() - began
-        rows.append({**figures_of(bench, found, options.suite, options), "seconds": seconds})
+        rows.append({**judge_decision(bench, found, options.suite, options), "seconds": seconds})
         bench.row(**named, seed=seed, **rows[-1])
     least, largest = (
         {key: choose(row[key] for row in rows) for key in FIGURES} for choose in (min, max)
@@ -146,10 +149,16 @@ def main() -> None:
     """Print the table."""
     parser = argument_parser("policy_ablations", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
-    parser.add_argument("--decisions", type=at_least(1000), default=1_500_000, metavar="N")
-    parser.add_argument("--variants", default=",".join(VARIANTS), help="comma-separated")
+    parser.add_argument(
+        "--decisions",
+        type=at_least(1000),
+        default=1_500_000,
+        metavar="N",
+        help="decisions in training; default: 1,500,000",
+    )
+    parser.add_argument("--variants", default=",".join(VARIANTS), help="variants, comma-separated")
     options = parser.parse_args()
-    variants = chosen(parser, "--variants", options.variants, VARIANTS)
+    variants = parse_names(parser, "--variants", options.variants, VARIANTS)
     with begin(parser, options) as bench:
         measure(bench, variants, options)
 

@@ -1,18 +1,18 @@
-"""Another PPO on the same environment: that of Stable-Baselines3 beside this library's training.
+"""Compare PPO of Stable-Baselines3 with this library's training, on the same environment.
 
     python -m benchmarks.policy_peer [--suite triangle3] [--decisions 150000] [--seeds 3]
         [--num 1000] [--seed 777] [--out DIR]
 
-Needs `pip install stable-baselines3`, in an environment without the extra `gpu`: PyTorch asks for
-other CUDA libraries than those that are pinned for JAX, so no extra holds it.
+Needs `pip install stable-baselines3`, in an environment without the extra `gpu`: PyTorch needs
+other CUDA libraries than those pinned for JAX, so no extra contains it.
 
-Both train the paper's network, two hidden layers of 64 with ReLU, in 100 environments at once,
-with as many decisions, the same rewards, and four passes over every 100 decisions in four parts.
-"sb3" has a Gaussian whose actions are cut off at -1 and 1, its own scaling of advantages, a network
-of the same size for the value, and a learning rate of 3e-4; "brax" is the training of this library,
-whose learning rate follows the divergence. What is trained decides about cases of a seed that it
-was not trained on, by its mean; every plan is by `exact` and refereed. Figures are the least and
-the largest of the seeds. Seconds are those of training, compilation included.
+Both train the paper's network, two hidden layers of 64 units with ReLU, in 100 environments at
+once, with the same number of decisions and the same rewards. Every 100 decisions are used in four
+passes of four minibatches. "sb3" clips Gaussian actions to -1 and 1, scales advantages in its own
+manner, and has a value network of the same size and a learning rate of 3e-4. "brax" is this
+library's training, whose learning rate follows the divergence. Each policy decides, by its mean, on
+cases of a seed that no training uses. Every plan is by `exact` and judged by the referee. Figures
+are minimum and maximum over the training seeds. Training times include compilation.
 """
 
 import argparse
@@ -29,10 +29,10 @@ from flax import struct
 import planner_jax as pj
 from planner_jax.benchmarks.policy_ablations import (
     ITERATIONS,
-    asked,
-    figures_of,
-    over_seeds,
-    trained,
+    judge_decision,
+    report_seeds,
+    train_policy,
+    training_settings,
 )
 from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.policies.environment import CatchEnv
@@ -52,7 +52,7 @@ FIRST_STD = 0.15
 
 
 class CatchVecEnv(vec_env.VecEnv):
-    """`CatchEnv`, which is batched itself, as Stable-Baselines3 asks for environments."""
+    """`CatchEnv`, which is a batch by itself, with the interface of Stable-Baselines3."""
 
     def __init__(self, suite: str, iterations: int, seed: int):
         self.env = CatchEnv((suite,), (iterations,))
@@ -62,45 +62,45 @@ class CatchVecEnv(vec_env.VecEnv):
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
     def reset(self) -> np.ndarray:
-        """Observations (LANES, F) of new cases."""
+        """Return observations (LANES, F) of new cases."""
         self._state = self._reset(self._keys)
         return np.array(self._state.obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Decide about all cases."""
+        """Decide on all cases."""
         self._state = self._step(self._state, jnp.asarray(actions, jnp.float32))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """The next cases, rewards, that every episode has ended, and nothing else."""
+        """Return observations of the next cases, rewards, ended episodes (all), and no info."""
         seen, reward = np.array(self._state.obs), np.array(self._state.reward)
         return seen, reward, np.ones(LANES, bool), [{} for _ in range(LANES)]
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no resource is open."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """An attribute of the environment, once a lane."""
+        """Return an attribute of the environment, once for each batch element."""
         return [getattr(self.env, attr_name, None)] * LANES
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Nothing is set."""
+        """Do nothing: the environment has no settings."""
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        """Nothing is called."""
+        """Do nothing: no method is called."""
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """No lane is."""
+        """Return False for each batch element."""
         return [False] * LANES
 
 
 @struct.dataclass
 class PeerPolicy(CatchDecision):
-    """The mean of a network that Stable-Baselines3 trained, as a decision."""
+    """Decision by the mean of a network that Stable-Baselines3 trained."""
 
-    layers: Sequence[tuple[Any, Any]]  # weights and biases, the last one without ReLU behind it
+    layers: Sequence[tuple[Any, Any]]  # weights and biases; no ReLU after the last layer
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """The one choice for one case, leaves (1, N)."""
+        """Return the single choice for one case, leaves (1, N)."""
         table = timetable(case)
         hidden = observe(case, table).ravel()
         *inner, (weights, bias) = self.layers
@@ -116,7 +116,7 @@ def _affine(weights: Any, bias: Any, hidden: jax.Array) -> jax.Array:
 
 
 def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
-    """What Stable-Baselines3 makes of a suite."""
+    """Train a policy on a suite with Stable-Baselines3."""
     network = {
         "net_arch": [64, 64],
         "activation_fn": torch.nn.ReLU,
@@ -144,9 +144,9 @@ def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
 
 
 def train_own(suite: str, decisions: int, seed: int) -> Any:
-    """What this library makes of it."""
-    return trained(
-        asked(
+    """Train a policy on a suite with this library."""
+    return train_policy(
+        training_settings(
             suite,
             decisions,
             seed,
@@ -159,14 +159,14 @@ def train_own(suite: str, decisions: int, seed: int) -> Any:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """All rows."""
+    """Print all rows."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
         "| training | refereed | last catch | OTR | time |",
         "|---|---|---|---|---|",
     )
-    greedy = figures_of(bench, pj.catch.Greedy(), options.suite, options)
+    greedy = judge_decision(bench, pj.catch.Greedy(), options.suite, options)
     bench.row(training="none", **greedy)
     bench.say(
         f"| none: `greedy` | {greedy['success']:.1f} % | {greedy['last']:.3f} s "
@@ -174,14 +174,20 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
     )
     for name, train_by in (("sb3", train_peer), ("brax", train_own)):
         of_seed = functools.partial(train_by, options.suite, options.decisions)
-        over_seeds(bench, {"training": name}, of_seed, options)
+        report_seeds(bench, {"training": name}, of_seed, options)
 
 
 def main() -> None:
     """Print the table."""
     parser = argument_parser("policy_peer", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
-    parser.add_argument("--decisions", type=at_least(1000), default=150_000, metavar="N")
+    parser.add_argument(
+        "--decisions",
+        type=at_least(1000),
+        default=150_000,
+        metavar="N",
+        help="decisions in training; default: 150,000",
+    )
     options = parser.parse_args()
     with begin(parser, options) as bench:
         measure(bench, options)

@@ -1,4 +1,4 @@
-"""Cramer-Rao bounds of predicted targets: the least error of an unbiased prediction."""
+"""Cramer-Rao bounds for predicted targets: the smallest errors of unbiased predictions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,18 +15,18 @@ def cramer_rao(
 ) -> Array:
     """Return the least covariance (2, 2) [m^2] of an unbiased prediction of a position at one time.
 
-    The inverse of the exact Fisher information of place, velocity and turn rate, taken to the
-    position by its derivatives.
+    This is the inverse of the exact Fisher information of position, velocity and turn rate,
+    propagated to the predicted position by its derivatives.
 
     Args:
-        path: of the target.
+        path: true path of the target.
         times: (L,) [s], of the observations.
         noise: () [m], standard deviation of a coordinate.
         time: () [s], of the prediction.
-        turning: whether the turn rate is unknown too; False for one who knows that it is zero.
+        turning: whether the turn rate is unknown too; False if it is known to be zero.
 
     Raises:
-        ValueError: there is no room for two observations, or for three of a turn.
+        ValueError: there are fewer than two observations, or three with a turn rate.
     """
     times = jnp.asarray(times)
     seen = centre(times, jnp.zeros((*times.shape, 2)), None, 3 if turning else 2)
@@ -47,16 +47,16 @@ def cramer_rao(
 
 def mean_distance(bound: Array) -> Array:
     """Return the mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
-    return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_around(bound)))
+    return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_square_radii(bound)))
 
 
 def share_within(bound: Array, radius: ArrayLike) -> Array:
     """Return the probability () that a Gaussian error of a covariance is within a radius [m]."""
-    return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _around(bound)))
+    return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _square_radii(bound)))
 
 
-def _around(bound: Array) -> Array:
-    """Return squares (64,) of the standard ellipse's radius at equal steps of its parameter."""
+def _square_radii(bound: Array) -> Array:
+    """Return squared radii (64,) of the standard ellipse at equal steps of its parameter."""
     mean = 0.5 * (bound[0, 0] + bound[1, 1])
     apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
     return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)

@@ -1,4 +1,4 @@
-"""Published solvers on the programs of `baselines.intercept.qp`, with the extra `peers`."""
+"""Published solvers for the programs of `baselines.intercept.qp`, with the extra `peers`."""
 
 import dataclasses
 import importlib
@@ -13,14 +13,14 @@ import scipy.sparse
 INSTALL = "pip install 'planner-jax[peers]' adds Clarabel and OSQP to compare with"
 
 
-def installed(name: str) -> bool:
-    """Whether a peer can be imported."""
+def is_installed(name: str) -> bool:
+    """Return whether a peer can be imported."""
     return importlib.util.find_spec(name) is not None
 
 
 @dataclasses.dataclass(frozen=True)
 class PeerSolution:
-    """What a peer found, and how long it took on one program, warm."""
+    """Solution of one program by a peer, and its duration, compiled before."""
 
     point: np.ndarray  # (n,)
     cost: float
@@ -29,14 +29,14 @@ class PeerSolution:
 
 
 def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
-    """A solver of programs of these matrices (as of `qp_template`): an interior-point method.
+    """Return Clarabel, an interior-point method, for these matrices (as of `qp_template`).
 
-    It is set up anew for every program, as its interface has no other bounds for the same matrices
-    where some are infinite; that is part of its time.
+    It is set up for every program, which is part of its time, because its interface cannot change
+    which bounds are infinite.
     """
     clarabel: Any = importlib.import_module("clarabel")
 
-    hessian, equalities, rows = _sparse(matrices)
+    hessian, equalities, rows = _to_sparse(matrices)
     settings = clarabel.DefaultSettings()
     settings.verbose = False
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = 1e-9
@@ -44,7 +44,9 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
     def solve(right_side: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> PeerSolution:
         has_lower, has_upper = np.isfinite(lower), np.isfinite(upper)
         matrix = scipy.sparse.vstack([equalities, rows[has_upper], -rows[has_lower]], format="csc")
-        known = np.concatenate([_known(matrices, right_side), upper[has_upper], -lower[has_lower]])
+        known = np.concatenate(
+            [_equality_values(matrices, right_side), upper[has_upper], -lower[has_lower]]
+        )
         inequalities = len(known) - equalities.shape[0]
         cones = [
             clarabel.ZeroConeT(equalities.shape[0]),
@@ -55,19 +57,20 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
         found = clarabel.DefaultSolver(hessian, linear, matrix, known, cones, settings).solve()
         seconds = time.perf_counter() - began
         solved = str(found.status) in ("Solved", "AlmostSolved")
-        return _solution(matrices, np.asarray(found.x), solved, seconds)
+        return _make_solution(matrices, np.asarray(found.x), solved, seconds)
 
     return solve
 
 
 def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
-    """A solver of programs of these matrices (as of `qp_template`): OSQP, the paper's.
+    """Return OSQP, the solver of [Qu2022], for these matrices (as of `qp_template`).
 
-    It is set up once, and gets new bounds for every program, warm from the solution before.
+    It is set up once, and gets new bounds for every program, with a warm start at the solution
+    before.
     """
     osqp: Any = importlib.import_module("osqp")
 
-    hessian, equalities, rows = _sparse(matrices)
+    hessian, equalities, rows = _to_sparse(matrices)
     matrix = scipy.sparse.vstack([equalities, rows], format="csc")
     unbounded = np.full(equalities.shape[0] + rows.shape[0], np.inf)
     solver = osqp.OSQP()
@@ -84,32 +87,32 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
     )
 
     def solve(right_side: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> PeerSolution:
-        known = _known(matrices, right_side)
+        known = _equality_values(matrices, right_side)
         low, high = np.concatenate([known, lower]), np.concatenate([known, upper])
-        if (low > high).any():  # which OSQP refuses to look at
-            return _solution(matrices, np.full(hessian.shape[0], np.nan), False, np.nan)
+        if (low > high).any():  # OSQP rejects such bounds
+            return _make_solution(matrices, np.full(hessian.shape[0], np.nan), False, np.nan)
         began = time.perf_counter()
         solver.update(l=low, u=high)
         found = solver.solve(raise_error=False)
         seconds = time.perf_counter() - began
-        return _solution(matrices, np.asarray(found.x), found.info.status == "solved", seconds)
+        return _make_solution(matrices, np.asarray(found.x), found.info.status == "solved", seconds)
 
     return solve
 
 
-def _sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Upper triangle of the Hessian, all equalities and the rows, as sparse matrices."""
+def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
+    """Return the upper triangle of the Hessian, all equalities and the rows, as sparse matrices."""
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])
 
 
-def _known(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
-    """Right sides of all equalities."""
+def _equality_values(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
+    """Return the right-hand sides of all equalities."""
     return np.concatenate([np.asarray(right_side, float), np.zeros(len(matrices["zeros"]))])
 
 
-def _solution(
+def _make_solution(
     matrices: Mapping[str, np.ndarray], point: np.ndarray, solved: bool, seconds: float
 ) -> PeerSolution:
     cost = 0.5 * point @ matrices["hessian"] @ point

@@ -1,9 +1,10 @@
-"""Ways to rest behind plans that do not come to rest, as `export` makes them: how many are found.
+"""Count recovery trajectories that bring the robot to a standstill after a plan, as in `export`.
 
     python -m benchmarks.recoveries [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
 
-Cases of each row are drawn and planned; of the plans that the referee lets pass each one is asked
-for its way to rest by itself. What is left without one has the limit that fails beside it.
+Cases of each row are drawn and planned. For every plan that the referee accepts and that does not
+end at rest, a recovery trajectory is computed by itself. If none is found, the limit that fails is
+counted.
 """
 
 import time
@@ -14,11 +15,11 @@ import jax
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.core.errors import NoRecovery
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 
-# Row -> words of the task, options of `draw` and of `planner`, and the way to rest.
+# Row -> API of the task, options of `draw` and of `planner`, and kind of recovery.
 ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
     "hits": (pj.hit, {}, {}, "brake"),
     "hits-home": (pj.hit, {}, {}, "home"),
@@ -29,8 +30,11 @@ ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
 }
 
 
-def found_behind(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[Counter, float]:
-    """How many plans rest, get a way to rest, or break which limit; and seconds a way, warm."""
+def count_recoveries(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[Counter, float]:
+    """Count recoveries, and return the median duration of a computation [s], warm.
+
+    The counts are plans that end at rest, found recoveries, and failed limits.
+    """
     counts: Counter[str] = Counter()
     seconds = []
     for place in np.flatnonzero(passed).tolist():
@@ -50,12 +54,12 @@ def found_behind(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[C
 
 def main() -> None:
     parser = argument_parser("recoveries", __doc__, num=1000, seed=1)
-    parser.add_argument("--rows", metavar="ROW,...", default=",".join(ROWS))
+    parser.add_argument("--rows", metavar="ROW,...", default=",".join(ROWS), help="default: all")
     options = parser.parse_args()
-    rows = chosen(parser, "--rows", options.rows, ROWS)
+    rows = parse_names(parser, "--rows", options.rows, ROWS)
     with begin(parser, options) as bench:
         bench.say(
-            "| row | plans that pass | rest already | way to rest | none, by limit | ms a way |",
+            "| row | accepted plans | end at rest | recovery found | none, by limit | ms each |",
             "|---|---|---|---|---|---|",
         )
         for row in rows:
@@ -64,7 +68,7 @@ def main() -> None:
             cases = jax.tree.map(np.asarray, drawn)
             plans = pj.plan(task.planner(**of_planner), cases)
             passed = np.asarray(task.judge(cases, plans).success)
-            counts, median = found_behind(cases, plans, passed, to)
+            counts, median = count_recoveries(cases, plans, passed, to)
             rests, found = counts.pop("rests", 0), counts.pop("found", 0)
             none = ", ".join(f"{num} {name}" for name, num in counts.most_common()) or "-"
             bench.say(

@@ -1,10 +1,10 @@
-"""Robots beside each other: what passes the referee, and what a look at the rotors costs.
+"""Compare quadrotor models: refereed success, and the computing cost of their rotor limits.
 
     python -m benchmarks.robot_rows [--robots NAME|FILE ...] [--num 2048] [--repeats 5] [--out DIR]
 
-Every robot is planned for twice, with the limits of its rotors and without (`rotor_share` null), in
-turns, so that what else the machine does meets both. Rackets hit the serves of the suite court,
-nets catch the throws of parabola2. Plans without these limits are judged without them, too.
+Every robot plans with and without the limits of its rotors (`rotor_share` null). The two take
+turns, so that other load on the machine affects both. Rackets hit the serves of the suite court,
+nets catch the throws of parabola2. Plans without rotor limits are judged without them too.
 """
 
 import dataclasses
@@ -19,11 +19,11 @@ from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import MODELS, robot_named
 
-SHARE = 0.9  # of a rotor's range, of robots that do not look at their rotors otherwise
+SHARE = 0.9  # share of a rotor's range, for robots without a rotor limit
 
 
-def of_both_kinds(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
-    """The robot without and with limits of its rotors."""
+def vary_rotor_limits(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
+    """Return the robot without and with limits of its rotors."""
     share = robot.limits.rotor_share or SHARE
 
     def with_share(share: float | None) -> QuadrotorModel:
@@ -33,15 +33,15 @@ def of_both_kinds(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
     return {"without": with_share(None), "with": with_share(share)}
 
 
-def measured(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
-    """Success (num,) and plans a second, of the clock and of the processor, without and with.
+def measure_robot(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
+    """Return success (num,) and plans/s by wall-clock and by CPU time, without and with limits.
 
-    The first plans compile and are not counted; a speed is the best of the others.
+    The first plans compile and are not timed; a rate is the best of the others.
     """
     task, suite = (pj.catch, "parabola2") if robot.tool.kind == NET else (pj.hit, "court")
     planner, found = task.planner(), {}
     for repeat in range(repeats + 1):
-        for name, one in of_both_kinds(robot).items():
+        for name, one in vary_rotor_limits(robot).items():
             cases = jax.tree.map(np.asarray, task.draw(num, suite, seed=3, robot=one))
             clock, busy = time.perf_counter(), time.process_time()
             plans = jax.block_until_ready(pj.plan(planner, cases))
@@ -56,7 +56,9 @@ def measured(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
 
 def main() -> None:
     parser = argument_parser("robot_rows", __doc__, num=2048, repeats=5)
-    parser.add_argument("--robots", nargs="+", metavar="NAME|FILE", default=list(MODELS))
+    parser.add_argument(
+        "--robots", nargs="+", metavar="NAME|FILE", default=list(MODELS), help="default: all"
+    )
     options = parser.parse_args()
     try:
         robots = [robot_named(word) for word in options.robots]
@@ -64,11 +66,13 @@ def main() -> None:
         parser.error(f"argument --robots: {error}")
     with begin(parser, options) as bench:
         bench.say(
-            "| robot | rotors | success % | plans/s, clock | plans/s, processor |",
+            "| robot | rotor limits | success % | plans/s, wall clock | plans/s, CPU time |",
             "|---|---|---|---|---|",
         )
         for robot in robots:
-            for name, (success, speed) in measured(robot, options.num, options.repeats).items():
+            for name, (success, speed) in measure_robot(
+                robot, options.num, options.repeats
+            ).items():
                 bench.say(
                     f"| {robot.name} | {name} | {100 * success.mean():.2f} "
                     f"| {speed[0]:,.0f} | {speed[1]:,.0f} |"

@@ -1,9 +1,9 @@
-"""What all benchmarks share: arguments, what is printed, and the folder that a run writes.
+"""Shared parts of all benchmarks: arguments, printed output, and the run folder.
 
 The folder holds manifest.json (kind "bench NAME", state, parameters, versions, device, commit,
-times, summary), table.md with what was printed and, where there are rows, rows.json. Every summary
-has `num`, the plans that were judged, and `success_rate`; where a speed is measured also the
-median, the 90 and the 99 % quantile of `cost_gaps`.
+times, summary), table.md with the printed lines and, if the benchmark has rows, rows.json. Every
+summary has `num`, the number of plans that the referee judged, and `success_rate`. If the benchmark
+computes `cost_gaps`, the summary also has their median, 90 % and 99 % quantile.
 """
 
 import argparse
@@ -25,7 +25,10 @@ from planner_jax.runs.run_folder import RunFolder
 
 
 def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.ArgumentParser:
-    """A parser of a benchmark with --out and some counts, by name with their defaults."""
+    """Build a benchmark's parser with --out and one integer option per count.
+
+    The keywords `counts` are the names of these options with their defaults.
+    """
     head, _, _ = (doc or "").partition("\n")
     parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=head)
     for count, default in counts.items():
@@ -37,7 +40,7 @@ def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.Argum
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """What reads an integer argument that must not be smaller."""
+    """Return a parser of integer arguments that rejects values below `least`."""
 
     def integer(text: str) -> int:
         if (value := int(text)) < least:
@@ -47,8 +50,10 @@ def at_least(least: int) -> Callable[[str], int]:
     return integer
 
 
-def chosen(parser: argparse.ArgumentParser, flag: str, text: str, known: Iterable[str]) -> list:
-    """The names in a comma-separated argument; an unknown one ends the program with a line."""
+def parse_names(
+    parser: argparse.ArgumentParser, flag: str, text: str, known: Iterable[str]
+) -> list:
+    """Split a comma-separated argument into names; exit with an error for an unknown name."""
     for name in (names := text.split(",")):
         if name not in known:
             parser.error(f"argument {flag}: must be among {', '.join(known)}, got {name!r}")
@@ -56,7 +61,7 @@ def chosen(parser: argparse.ArgumentParser, flag: str, text: str, known: Iterabl
 
 
 def begin(parser: argparse.ArgumentParser, options: argparse.Namespace) -> "Bench":
-    """The run of parsed arguments; a folder that cannot be written ends the program with a line."""
+    """Create the run of parsed arguments; exit with an error if its folder cannot be created."""
     given = {name: value for name, value in vars(options).items() if name != "benchmark"}
     try:
         return Bench(options.benchmark, given, given.pop("out"))
@@ -65,9 +70,10 @@ def begin(parser: argparse.ArgumentParser, options: argparse.Namespace) -> "Benc
 
 
 class Bench:
-    """One run; its folder is made where its block begins, and JAX is not started before.
+    """One run of a benchmark: a context manager that creates the run folder on entry.
 
-    Raises `ArgumentError` unless `out` (None: runs/bench-NAME-DATE-TIME) can be a new folder.
+    JAX is not started before entry. Raises `ArgumentError` unless `out` (None:
+    runs/bench-NAME-DATE-TIME) can be a new folder.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any], out: Any = None):
@@ -98,7 +104,7 @@ class Bench:
         self._owning.close()
 
     def say(self, *lines: str) -> None:
-        """Print lines, and keep them for table.md."""
+        """Print lines, and store them for table.md."""
         print("\n".join(lines), flush=True)
         self._lines += lines
 
@@ -108,16 +114,16 @@ class Bench:
         self._folder.write_text("rows.json", json.dumps(self._rows, indent=1) + "\n")
 
     def count(self, accepted: Any, *gaps: np.ndarray | None) -> None:
-        """Add plans to the summary: which the referee accepts, and their `cost_gaps` if asked."""
+        """Add plans to the summary: whether the referee accepts each, and their `cost_gaps`."""
         self._accepted += np.asarray(accepted, bool).tolist()
         self._gaps += gaps
 
     def note(self, **figures: Any) -> None:
-        """Add figures of the benchmark's own to the summary."""
+        """Add the benchmark's own figures to the summary."""
         self._figures |= figures
 
 
 def plain(value: Any) -> Any:
-    """A value as JSON has it: arrays are lists, paths are text, what is not finite is null."""
+    """Convert a value to JSON types: arrays to lists, paths to text, NaN and infinity to null."""
     text = json.dumps(value, default=lambda x: x.tolist() if hasattr(x, "tolist") else str(x))
     return json.loads(text, parse_constant=lambda _: None)

@@ -1,17 +1,19 @@
-"""The live loop under throws one after another, with packets lost, late and repeated.
+"""Measure the live loop's deadlines while balls are thrown, with lost, late and repeated packets.
 
     python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
         [--deadline 0.01] [--server-core N] [--out DIR]
 
-Starts `planner-jax serve TASK --report` as a process of its own, and sends it balls of the task's
-suite as they fly, with noise on their places, and the state of a robot that is where the last
-answer has it. Of the packets as many per cent as --bad says are lost, come 30 ms late, or are sent
-twice, a third each. A round trip that takes longer than the deadline is a miss. A process that only
-sleeps notes when the host has not let it run; with --server-core another one does on the server's
-core, which this process then leaves to the server. Misses within such a gap are the host's. At the
-end stand misses, times, and the server's own report with its memory at the start and at the end.
-The success of the summary is the share of the balls that are within the radius of the net or
-racket at the contact, where the setpoints then have its centre.
+Starts `planner-jax serve TASK --report` as a separate process. Sends it the positions of flying
+balls of the task's suite, with noise, and the state of a robot that follows the last answer
+exactly. Of --bad per cent of the packets, a third each is lost, delayed by 30 ms, or sent twice. A
+round trip longer than the deadline is a miss.
+
+A process that only sleeps records when the host does not run it. With --server-core a second one
+does so on the server's core, which this process then leaves to the server. Misses during such a gap
+are attributed to the host. Printed at the end are misses, times, and the server's own report with
+its memory at the start and at the end. The success of the summary is the share of the balls that
+are within the radius of the net or racket at the contact, where the centre is given by the
+setpoints.
 """
 
 import gc
@@ -43,12 +45,12 @@ from planner_jax.live.packets import (
 )
 from planner_jax.live.report import Latencies
 
-NUM = 200  # balls that are drawn, and thrown again and again
-SECONDS = 1.8  # of a throw
+NUM = 200  # balls that are drawn, and thrown repeatedly
+SECONDS = 1.8  # [s], duration of a throw
 NOISE = 0.005  # [m]
-LATE = 0.03  # [s]
+LATE = 0.03  # [s], delay of late packets
 TOOLS = {"hit": "racket", "catch": "net"}
-NAP, GAP = 0.001, 0.004  # [s], of a process that sleeps, and what it notes
+NAP, GAP = 0.001, 0.004  # [s], of the sleeping process: sleep, and the least delay that it records
 SLEEPER = """
 import os, sys, time
 nap, gap = map(float, sys.argv[1:3])
@@ -64,8 +66,8 @@ while os.getppid() == asker:
 """
 
 
-def paths(task: str, rate: float) -> np.ndarray:
-    """Places (NUM, K, 3) [m] of balls at the rate."""
+def draw_paths(task: str, rate: float) -> np.ndarray:
+    """Return positions (NUM, K, 3) [m] of balls at the rate."""
     steps = int(SECONDS * rate)
     if task == "hit":
         cases = pj.hit.draw(NUM)
@@ -82,7 +84,7 @@ def paths(task: str, rate: float) -> np.ndarray:
 
 
 def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray) -> float:
-    """Distance [m] of a tool's centre, above the propellers, from a ball (3,) at the contact."""
+    """Return the distance [m] of a tool's centre, `height` above the body, from a ball (3,)."""
     times = answer.begin + answer.period * np.arange(answer.setpoints.shape[0])
     pos, acc = (
         np.array([np.interp(answer.contact, times, x) for x in answer.column(name).T])
@@ -93,19 +95,19 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 
 
 class Naps:
-    """A process that only sleeps, and notes when it was not let run, on one core or on any."""
+    """Process that only sleeps, and records when it was not run, on one core or on any."""
 
     def __init__(self, core: int | None = None) -> None:
         words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]
         words += [] if core is None else [str(core)]
         self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        self.gaps: list[tuple[float, float]] = []  # begin and end [s], when it has ended
+        self.gaps: list[tuple[float, float]] = []  # start and end [s], available after `end`
 
     def end(self) -> None:
-        """Note no more."""
+        """Stop the process, and read the recorded gaps."""
         self._process.terminate()
-        told, _ = self._process.communicate()
-        lines = told.splitlines(keepends=True)
+        output, _ = self._process.communicate()
+        lines = output.splitlines(keepends=True)
         pairs = (x.split() for x in lines if x.endswith("\n"))
         self.gaps = [(float(begin), float(end)) for begin, end in pairs]
 
@@ -115,7 +117,7 @@ class Naps:
 
 
 class Soak:
-    """Throws balls at a server and counts what comes back."""
+    """Client that throws balls at a server and counts the answers."""
 
     def __init__(self, port: int, options: Any, tool: tuple[float, float], gravity: float) -> None:
         (self.height, self.radius), self.gravity = tool, gravity  # [m], [m/s^2]
@@ -126,11 +128,11 @@ class Soak:
         self._sequence = self._tie = 0
         self._later: list[tuple[float, int, bytes]] = []
         self.lost = self.late = self.repeated = self.silent = 0
-        self.missed: list[tuple[float, float]] = []  # begin and end [s] of trips above the deadline
+        self.missed: list[tuple[float, float]] = []  # start and end [s] of trips above the deadline
         self.thrown = self.met = 0
 
     def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
-        """The answer to a packet, None where none comes or it was not sent in time."""
+        """Send a packet; return the answer, or None if packet or answer were lost or late."""
         self._sequence = (self._sequence + 1) % 2**32
         sent = time.monotonic()
         data = request(kind, self._sequence, sent, measured, values, ball)
@@ -165,25 +167,25 @@ class Soak:
         return None
 
     def throw(self, path: np.ndarray, start: np.ndarray, ball: int) -> None:
-        """One ball from its first sight to its contact, the robot in hover at first."""
+        """Throw one ball until its contact; the robot hovers at first."""
         self.thrown += 1
-        period, wanted, planned = 1.0 / self.options.rate, None, None
+        period, state_now, planned = 1.0 / self.options.rate, None, None
         began = time.monotonic()
         for k, place in enumerate(path):
             now = began + k * period
             time.sleep(max(0.0, now - time.monotonic()))
             while self._later and self._later[0][0] < time.monotonic():
                 self._socket.send(heapq.heappop(self._later)[2])
-            state = np.zeros((3, 3)) if wanted is None else wanted
-            if wanted is None:
+            state = np.zeros((3, 3)) if state_now is None else state_now
+            if state_now is None:
                 state[0] = start
             known = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
             answer = self.send(BALL, now, tuple(seen), ball) or known
-            # Until the server has heard where the robot hovers, it hovers on.
-            if answer is None or (wanted is None and known is None):
+            # Until the server knows where the robot hovers, the robot keeps hovering.
+            if answer is None or (state_now is None and known is None):
                 continue
-            wanted = answer.setpoints[0, :9].astype(float).reshape(3, 3)
+            state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)
             planned = answer if answer.motion is Motion.PLAN else planned
             if planned is not None and time.monotonic() > planned.contact:
                 looks = began + period * np.arange(len(path))
@@ -192,17 +194,17 @@ class Soak:
                 self.met += off < self.radius
                 break
 
-    def missed_within(self, gaps: list[tuple[float, float]]) -> int:
-        """How many trips above the deadline one of the gaps falls into."""
+    def count_misses(self, gaps: list[tuple[float, float]]) -> int:
+        """Count the misses that overlap one of the gaps."""
         return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
 
     def end(self) -> None:
-        """Give the socket back."""
+        """Close the socket."""
         self._socket.close()
 
 
-def started(options: Any) -> tuple[subprocess.Popen, int, float]:
-    """The server's process, its port, and after how many seconds it answers."""
+def start_server(options: Any) -> tuple[subprocess.Popen, int, float]:
+    """Start the server; return its process, its port, and the time [s] until it answers."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
     words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
     if options.server_core is not None:
@@ -218,17 +220,26 @@ def started(options: Any) -> tuple[subprocess.Popen, int, float]:
 
 
 def main() -> None:
-    """Soak, and report."""
+    """Throw balls, and report."""
     parser = argument_parser("serve_soak", __doc__, seed=0)
     parser.add_argument("--task", choices=("hit", "catch"), default="catch", help="default: catch")
-    parser.add_argument("--minutes", type=float, default=1.0, help="default: 1")
-    parser.add_argument("--rate", type=float, default=100.0, help="looks a second [Hz]")
-    parser.add_argument("--bad", type=float, default=2.0, help="per cent of packets (default: 2)")
-    parser.add_argument("--deadline", type=float, default=0.01, help="[s] (default: 0.01)")
-    parser.add_argument("--server-core", type=int, help="core that the server is bound to")
+    parser.add_argument("--minutes", type=float, default=1.0, help="duration [min]; default: 1")
+    parser.add_argument(
+        "--rate", type=float, default=100.0, help="observations per second [Hz]; default: 100"
+    )
+    parser.add_argument(
+        "--bad",
+        type=float,
+        default=2.0,
+        help="per cent of packets that are lost, late or repeated (default: 2)",
+    )
+    parser.add_argument(
+        "--deadline", type=float, default=0.01, help="deadline of a round trip [s] (default: 0.01)"
+    )
+    parser.add_argument("--server-core", type=int, help="core to which the server is bound")
     options = parser.parse_args()
     with begin(parser, options) as bench:
-        balls = paths(options.task, options.rate)
+        balls = draw_paths(options.task, options.rate)
         if options.task == "hit":
             case = pj.take(pj.hit.draw(1), 0)
             tool = float(case.racket_height), float(np.asarray(case.racket_radius))
@@ -236,13 +247,13 @@ def main() -> None:
             case = pj.take(pj.catch.draw(1), 0)
             tool = float(case.net.height), float(case.net.radius)
         start = np.asarray(case.head_state[0], float)
-        process, port, seconds = started(options)
+        process, port, seconds = start_server(options)
         naps = {"any core": Naps()}
         if options.server_core is not None:
             naps["the server's core"] = Naps(options.server_core)
             others = os.sched_getaffinity(0) - {options.server_core}
             os.sched_setaffinity(0, others or {options.server_core})
-        gc.disable()  # or the pauses of this process would count
+        gc.disable()  # otherwise pauses of this process would count
         soak = Soak(port, options, tool, float(case.gravity))
         ends = time.monotonic() + 60.0 * options.minutes
         while time.monotonic() < ends:
@@ -250,23 +261,23 @@ def main() -> None:
         soak.end()
         for sleeper in naps.values():
             sleeper.end()
-        by_host = soak.missed_within([gap for sleeper in naps.values() for gap in sleeper.gaps])
+        by_host = soak.count_misses([gap for sleeper in naps.values() for gap in sleeper.gaps])
         process.send_signal(signal.SIGINT)
-        told, _ = process.communicate(timeout=30.0)
+        output, _ = process.communicate(timeout=30.0)
         trips = [1e3 * soak.trips.quantile(share) for share in (0.5, 0.99)]
         bench.say(
-            f"{options.task}, {options.minutes:g} min at {options.rate:g} looks/s: answers "
-            f"{seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by the "
+            f"{options.task}, {options.minutes:g} min at {options.rate:g} observations/s: first "
+            f"answer {seconds:.1f} s after the start; {soak.thrown} balls, {soak.met} met by the "
             f"{TOOLS[options.task]}",
             f"{soak.trips.num:,} round trips: p50 {trips[0]:.2f} ms, p99 {trips[1]:.2f} ms, max "
             f"{1e3 * soak.trips.longest:.1f} ms; {len(soak.missed)} took longer "
-            f"than {1e3 * options.deadline:g} ms, {by_host} of these while the host kept a process "
-            f"that sleeps from running; {soak.silent} without an answer",
+            f"than {1e3 * options.deadline:g} ms, {by_host} of these while the host did not run "
+            f"the sleeping process; {soak.silent} without an answer",
             f"lost {soak.lost}, late {soak.late}, repeated {soak.repeated}",
-            "the host kept a process that sleeps from running, on "
+            "the host did not run the sleeping process, on "
             + ", on ".join(f"{where} {sleeper}" for where, sleeper in naps.items()),
             "the server's own report:",
-            told.strip(),
+            output.strip(),
         )
         bench.count(np.arange(soak.thrown) < soak.met)
         bench.note(

@@ -8,19 +8,20 @@ import numpy as np
 from planner_jax.baselines.intercept.station_time import Blocked, StationTimeProblem, reference_line
 
 _BLOCK = 256  # problems drawn at once
-_MOST = 3  # polygons of one problem
+_MOST = 3  # maximum number of polygons of a problem
 
 
 def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> StationTimeProblem:
-    """Problems with the setting of [Qu2022, Section V-C], and one to three random parallelograms.
+    """Draw problems with the setting of [Qu2022, Section V-C] and one to three parallelograms.
 
-    6 m in 10 s, beginning with 0.5 m/s and no acceleration. The limits, 1.5 m/s and 2 m/s^2, and
-    the parallelograms are assumptions: centres at 1 to 5 m and 1.5 to 8.5 s, 0.6 to 1.5 m high and
-    1 to 2.5 s long, moving at -0.3 to 0.5 m/s. Only problems through which dynamic programming on
-    the default grid finds a line are kept. The first ones are the same whatever `num` is.
+    The car drives 6 m in 10 s, starting at 0.5 m/s with zero acceleration. The limits, 1.5 m/s and
+    2 m/s^2, and the random parallelograms are assumptions: centres at 1 to 5 m and 1.5 to 8.5 s,
+    0.6 to 1.5 m high and 1 to 2.5 s long, moving at -0.3 to 0.5 m/s. Only problems for which
+    dynamic programming on the default grid finds a line are used. The first problems are the same
+    for every `num`.
 
     Args:
-        num: how many.
+        num: number of problems.
         seed: of NumPy's generator.
         dtype: of every floating leaf.
 
@@ -31,21 +32,21 @@ def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> Stati
     rng = np.random.default_rng(seed)
     kept, have = [], 0
     while have < num:
-        block = _drawn(rng)
-        places = np.flatnonzero(found(_as(block, np.float32)))
+        block = _draw_block(rng)
+        places = np.flatnonzero(found(_convert_floats(block, np.float32)))
         kept.append(jax.tree.map(lambda leaf, places=places: leaf[places], block))
         have += places.size
-    return _as(jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *kept), dtype)
+    return _convert_floats(jax.tree.map(lambda *parts: np.concatenate(parts)[:num], *kept), dtype)
 
 
-def _as(problems: StationTimeProblem, dtype: Any) -> StationTimeProblem:
+def _convert_floats(problems: StationTimeProblem, dtype: Any) -> StationTimeProblem:
     return jax.tree.map(
         lambda leaf: leaf.astype(dtype) if leaf.dtype == np.float64 else leaf, problems
     )
 
 
-def _drawn(rng: np.random.Generator) -> StationTimeProblem:
-    """One block of problems, whether or not there is a line through them, in double precision."""
+def _draw_block(rng: np.random.Generator) -> StationTimeProblem:
+    """Draw one block of problems, solvable or not, in double precision."""
     shape = (_BLOCK, _MOST)
     num = rng.integers(1, _MOST + 1, _BLOCK)
     station, time = rng.uniform(1.0, 5.0, shape), rng.uniform(1.5, 8.5, shape)

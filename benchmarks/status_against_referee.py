@@ -1,14 +1,14 @@
-"""Does the status of a plan say what the referee says? Every task and suite, limits tight and weak.
+"""Count plans whose status disagrees with the referee, for every task, suite and kind of limit.
 
     python -m benchmarks.status_against_referee [--num 200] [--rows hit:court,catch:throws]
         [--seed 0] [--out DIR]
 
-A row counts the plans whose status says that every limit holds, those that the referee accepts, and
-both ways to disagree: claims that the referee refuses, with the limits that it names, and plans
-that it accepts though their status claims nothing. Of the latter the table says how many exceed a
-limit by no more than the referee's tolerance, which a status does not use up. Obstacles stand in
-the way: each where the plan of the same case without it comes by. Rows that take long have one case
-in ten, or in forty.
+A row counts the plans whose status claims that every limit holds, the plans that the referee
+accepts, and both kinds of disagreement: claims that the referee rejects, with the limits that fail,
+and accepted plans whose status claims nothing. The number in brackets counts accepted plans without
+a claim that exceed a limit by no more than the referee's tolerance, which a status does not use. In
+rows with obstacles each obstacle is put where the plan of the same case without it passes. Slow
+rows have a tenth or a fortieth of the cases.
 """
 
 import collections
@@ -21,48 +21,50 @@ import jax
 import numpy as np
 
 import planner_jax as pj
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.robot.quadrotor_models import MODELS
 from planner_jax.task.catch.spec import SUITES as CATCHES
 from planner_jax.task.intercept.spec import SUITES as INTERCEPTIONS
 from planner_jax.trajectory.polynomial import states_at
 
-TOLERANCE = 1e-3  # of the referee, relative
+TOLERANCE = 1e-3  # relative, of the referee
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Cases and the planner that is asked."""
+    """Cases, and the planner that plans them."""
 
     task: str
     suite: str
     draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of the planner
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the planner
     judge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    changed: Callable[["Row", Any, np.random.Generator], Any] | None = None  # the drawn cases
-    every: int = 1  # of so many cases one is planned
+    change: Callable[["Row", Any, np.random.Generator], Any] | None = (
+        None  # changes the drawn cases
+    )
+    every: int = 1  # one in this number of cases is planned
 
     @property
     def card(self) -> Any:
-        """The task's."""
+        """The specification of the task."""
         return pj.task_named(self.task)
 
     @property
     def planner(self) -> Any:
-        """The one that is asked."""
+        """The planner of the row."""
         return self.card.planner(**{**self.card.bench, **self.options})
 
     def cases(self, num: int, seed: int) -> Any:
-        """A batch in NumPy arrays."""
+        """Draw a batch in NumPy arrays."""
         cases = self.card.draw(max(num // self.every, 1), self.suite, seed, **self.draw)
         cases = jax.tree.map(np.asarray, cases)
-        if self.changed is None:
+        if self.change is None:
             return cases
-        return self.changed(self, cases, np.random.default_rng([seed, len(self.suite)]))
+        return self.change(self, cases, np.random.default_rng([seed, len(self.suite)]))
 
 
-def tight(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Half the speed, two thirds of the acceleration and three fifths of the body rate."""
+def tighten_limits(row: Row, cases: Any, random: np.random.Generator) -> Any:
+    """Tighten the limits to 2.5 m/s, 10 m/s^2 and 3 rad/s."""
     own = cases.limits
     weak = {"speed": 2.5 + 0.0 * own.speed, "body_rate": 3.0 + 0.0 * own.body_rate}
     if own.acceleration is not None:
@@ -70,47 +72,47 @@ def tight(row: Row, cases: Any, random: np.random.Generator) -> Any:
     return cases.replace(limits=dataclasses.replace(own, **weak))
 
 
-def _passed(row: Row, cases: Any, random: np.random.Generator) -> np.ndarray:
-    """A place (B, 3) on the way of each case's plan, between 35 and 75 % of its time."""
+def _point_on_plan(row: Row, cases: Any, random: np.random.Generator) -> np.ndarray:
+    """Return a position (B, 3) on the trajectory of each case's plan, at 35 to 75 % of its time."""
     path = pj.plan(row.planner, cases).trajectory
     share = random.uniform(0.35, 0.75, len(path.durations))
     return states_at(path, share * np.asarray(path.durations).sum(axis=1))[:, 0]
 
 
-def _with(cases: Any, extra: Any) -> Any:
-    """Cases with one more limit."""
+def _add_constraint(cases: Any, extra: Any) -> Any:
+    """Return the cases with one more constraint."""
     return cases.replace(extras=(jax.tree.map(lambda leaf: leaf.astype(np.float32), extra),))
 
 
-def spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """A sphere of 10 to 30 cm in the way."""
-    place = _passed(row, cases, random)
+def add_spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
+    """Add a sphere with a radius of 10 to 30 cm in the way."""
+    place = _point_on_plan(row, cases, random)
     centre = place + random.normal(0.0, 0.08, place.shape)
-    return _with(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
+    return _add_constraint(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
 
 
-def boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """A box with sides of 20 to 60 cm in the way."""
-    place = _passed(row, cases, random)
+def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
+    """Add a box with sides of 20 to 60 cm in the way."""
+    place = _point_on_plan(row, cases, random)
     middle = place + random.normal(0.0, 0.08, place.shape)
     half = random.uniform(0.1, 0.3, place.shape)
-    return _with(cases, pj.KeepOutBox(middle - half, middle + half))
+    return _add_constraint(cases, pj.KeepOutBox(middle - half, middle + half))
 
 
-def planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """A wall up to 15 cm beside the straight line to where the way comes by, on any side of it."""
-    start, place = cases.head_state[:, 0], _passed(row, cases, random)
+def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
+    """Add a wall up to 15 cm from the straight line to a position on the plan, on a random side."""
+    start, place = cases.head_state[:, 0], _point_on_plan(row, cases, random)
     along = place - start
     along /= np.linalg.norm(along, axis=1, keepdims=True) + 1e-6
     normal = random.normal(size=place.shape)
     normal -= (normal * along).sum(axis=1, keepdims=True) * along
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
     beside = random.uniform(0.0, 0.15, (len(place), 1))
-    return _with(cases, pj.Plane(start - beside * normal, normal))
+    return _add_constraint(cases, pj.Plane(start - beside * normal, normal))
 
 
 def _hits() -> dict[str, Row]:
-    """Rows of hits."""
+    """Return the rows of hits."""
     late = {f"late-{delay}": Row("hit", "court", {"delay": delay}) for delay in (0.3, 0.5, 0.6)}
     weak = {
         f"limits-{scale}": Row("hit", "court", {"limit_scale": scale}) for scale in (0.7, 0.5, 0.35)
@@ -122,11 +124,11 @@ def _hits() -> dict[str, Row]:
         "drag-after": Row("hit", "court", options=after, judge=after),
         **late,
         **weak,
-        "tight": Row("hit", "court", changed=tight),
-        "spheres": Row("hit", "court", changed=spheres),
-        "boxes": Row("hit", "court", changed=boxes),
-        "planes": Row("hit", "court", changed=planes),
-        "late-boxes": Row("hit", "court", {"delay": 0.3}, changed=boxes),
+        "tight": Row("hit", "court", change=tighten_limits),
+        "spheres": Row("hit", "court", change=add_spheres),
+        "boxes": Row("hit", "court", change=add_boxes),
+        "planes": Row("hit", "court", change=add_planes),
+        "late-boxes": Row("hit", "court", {"delay": 0.3}, change=add_boxes),
         **{name: Row("hit", "court", {"robot": MODELS[name]}) for name in ("racer", "x500")},
         "brake": Row("hit", "court", options={"recovery": "brake"}),
         "home": Row("hit", "court", options={"recovery": "home"}),
@@ -134,25 +136,25 @@ def _hits() -> dict[str, Row]:
 
 
 def _catches() -> dict[str, Row]:
-    """Rows of catches."""
+    """Return the rows of catches."""
     robots = ("crazyflie", "racer-net", "x500-net")
     return {
         **{suite: Row("catch", suite) for suite in CATCHES},
-        "hard-tight": Row("catch", "hard", changed=tight),
-        "parabola2-tight": Row("catch", "parabola2", changed=tight),
-        "triangle3-tight": Row("catch", "triangle3", changed=tight),
-        "throws-spheres": Row("catch", "throws", changed=spheres),
-        "parabola2-spheres": Row("catch", "parabola2", changed=spheres),
-        "throws-boxes": Row("catch", "throws", changed=boxes),
-        "parabola2-boxes": Row("catch", "parabola2", changed=boxes),
-        "parabola2-planes": Row("catch", "parabola2", changed=planes),
+        "hard-tight": Row("catch", "hard", change=tighten_limits),
+        "parabola2-tight": Row("catch", "parabola2", change=tighten_limits),
+        "triangle3-tight": Row("catch", "triangle3", change=tighten_limits),
+        "throws-spheres": Row("catch", "throws", change=add_spheres),
+        "parabola2-spheres": Row("catch", "parabola2", change=add_spheres),
+        "throws-boxes": Row("catch", "throws", change=add_boxes),
+        "parabola2-boxes": Row("catch", "parabola2", change=add_boxes),
+        "parabola2-planes": Row("catch", "parabola2", change=add_planes),
         **{name: Row("catch", "parabola2", {"robot": MODELS[name]}) for name in robots},
         "parabola2-brake": Row("catch", "parabola2", options={"recovery": "brake"}),
     }
 
 
 def _others() -> dict[str, Row]:
-    """Rows of interceptions and blocks."""
+    """Return the rows of interceptions and blocks."""
     blocks = {
         f"{suite}-{regime}": Row("block", suite, {"regime": regime}, every=10)
         for suite in ("pole", "open")
@@ -170,7 +172,7 @@ def _others() -> dict[str, Row]:
     }
 
 
-# The task stands before a name.
+# The key of a row is the task and the name.
 ROWS = {
     f"{row.task}:{name}": row
     for rows in (_hits(), _catches(), _others())
@@ -178,8 +180,8 @@ ROWS = {
 }
 
 
-def compared(row: Row, num: int, seed: int) -> dict[str, Any]:
-    """What status and referee say of a row's plans."""
+def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
+    """Count what status and referee state about the plans of a row."""
     cases, planner = row.cases(num, seed), row.planner
     began = time.perf_counter()
     plans = jax.device_get(pj.plan(planner, cases))
@@ -201,16 +203,16 @@ def compared(row: Row, num: int, seed: int) -> dict[str, Any]:
 
 
 def measure(bench: Bench, options: Any, names: list[str]) -> None:
-    """A row each, and the sums."""
+    """Print a row each, and the sums."""
     bench.say(
         f"seed {options.seed}, {jax.devices()[0].device_kind}, jax {jax.__version__}",
-        "| row | cases | solved by status | accepted by referee | claimed, refused | accepted, not "
-        "claimed (within tolerance) | limits that refuse | seconds |",
+        "| row | cases | solved by status | accepted by referee | solved, rejected | accepted, not "
+        "solved (within tolerance) | failed limits | seconds |",
         "|---|---|---|---|---|---|---|---|",
     )
     total = collections.Counter()
     for name in names:
-        found = compared(ROWS[name], options.num, options.seed)
+        found = compare(ROWS[name], options.num, options.seed)
         total.update({key: value for key, value in found.items() if isinstance(value, int)})
         limits = ", ".join(f"{limit} {count}" for limit, count in found["limits"].items())
         bench.say(f"| {name} | {_counts(found)} | {limits} | {found['seconds']:.1f} |")
@@ -230,9 +232,11 @@ def _counts(found: Mapping[str, Any]) -> str:
 def main() -> None:
     """Print the table."""
     parser = argument_parser("status_against_referee", __doc__, num=200, seed=0)
-    parser.add_argument("--rows", default=",".join(ROWS), help="comma-separated; default all")
+    parser.add_argument(
+        "--rows", default=",".join(ROWS), help="rows, comma-separated; default: all"
+    )
     options = parser.parse_args()
-    names = chosen(parser, "--rows", options.rows, ROWS)
+    names = parse_names(parser, "--rows", options.rows, ROWS)
     with begin(parser, options) as bench:
         measure(bench, options, names)
 

@@ -1,16 +1,16 @@
-"""Plans a second of batches that stay on the devices: `planner-jax bench throughput`.
+"""Measure plans per second for batches that stay on the devices: `planner-jax bench throughput`.
 
     planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N] [--out DIR]
     python -m benchmarks.throughput [--tasks hit,catch] [--out DIR]
 
-One row a batch size: the first call, with what it compiles; then, after half a second of calls
-that bring up the device's clock, the fastest and the median of some more; the share that the
-referee accepts; and by how much the cost is above that of a longer search (`cost_gap`). For
-several devices also the efficiency beside one, and what each takes for its share alone. What
-is timed is the whole of `plan`, by any planner of any task, with the options that the task's card
-has for this (catches are decided "greedy"): ball tables, guesses, all rounds, and the check of
-the limits, from arrays on the devices to arrays on the devices, where each holds its share. The
-referee is not part of it.
+Each batch size has one row: the first call, with its compilation; then, after half a second of
+calls that raise the device's clock, the fastest and the median call; the share of plans that the
+referee accepts; and the cost above a longer search (`cost_gap`). For several devices there is also
+the efficiency relative to one device, and the time of each device alone with its share. The time is
+for the whole of `plan`, by any planner of any task, with the benchmark options of the task
+specification (catches are decided "greedy"). This includes ball tables, guesses, all rounds and the
+check of the limits, from arrays on the devices to arrays on the devices, each with its share. It
+does not include the referee.
 """
 
 import dataclasses
@@ -26,7 +26,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
-from planner_jax.benchmarks.run import Bench, argument_parser, begin, chosen
+from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_names
 from planner_jax.benchmarks.throughput_settings import ThroughputSettings
 from planner_jax.core.choices import require
 from planner_jax.core.registry import Task, all_tasks, task_named
@@ -36,24 +36,24 @@ from planner_jax.planning.plan import plan
 from planner_jax.runs.timing import CompileClock
 
 _WARM_UP = 0.5  # [s]
-_JUDGED = 300_000  # lanes of a batch that the referee sees, at most
+_JUDGED = 300_000  # maximum number of plans of a batch that the referee judges
 
 
 def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
-    """Measure, print one row a batch size, and write a run folder.
+    """Measure throughput, print one row a batch size, and write a run folder.
 
     Args:
-        out: run folder, new or empty; None for one of runs/.
-        **settings: of `ThroughputSettings`.
+        out: run folder, new or empty; None for a new one in runs/.
+        **settings: fields of `ThroughputSettings`.
 
     Raises:
-        ArgumentError: the folder cannot be written, or a setting breaks a rule.
-        UnknownName: as `measure` says.
+        ArgumentError: the folder cannot be written, or a setting is invalid.
+        UnknownName: as for `measure`.
     """
-    asked, there = ThroughputSettings(**settings), len(jax.local_devices())
-    require((asked.devices or 1) <= there, "devices", f"<= {there}", asked.devices)
-    with Bench("throughput", dataclasses.asdict(asked), out) as bench:
-        measure(bench, asked)
+    parsed, there = ThroughputSettings(**settings), len(jax.local_devices())
+    require((parsed.devices or 1) <= there, "devices", f"<= {there}", parsed.devices)
+    with Bench("throughput", dataclasses.asdict(parsed), out) as bench:
+        measure(bench, parsed)
 
 
 def measure(bench: Bench, settings: ThroughputSettings) -> None:
@@ -79,25 +79,25 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     bench.say(
         f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
         f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
-        "| plans | first call [s] | of it compiling [s] | fastest [ms] | median [ms] | plans/s | "
-        "refereed | cost above a longer search's (median, p90, p99) | memory [GiB] |",
+        "| plans | first call [s] | compiling of it [s] | fastest [ms] | median [ms] | plans/s | "
+        "refereed | cost above a longer search (median, p90, p99) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
     )
     beside = []
     for num in settings.batch:
         host = jax.tree.map(np.asarray, card.draw(num, suite, settings.seed))
-        timed = _timed(made, host, used, repeat)
+        timed = _time_calls(made, host, used, repeat)
         _add_row(bench, card, made, host, used, timed)
         if num >= len(used) > 1:
-            beside.append(_efficiency(made, host, used, repeat, timed))
+            beside.append(_compare_devices(made, host, used, repeat, timed))
     if beside:
         bench.say(*beside)
     if settings.agree:
-        bench.say(_agreement(card, made, card.draw(COMPARED, suite, settings.seed), used))
+        bench.say(_compare_with_cpu(card, made, card.draw(COMPARED, suite, settings.seed), used))
 
 
 def _with_iterations(planner: Any, iterations: int) -> Any:
-    """A planner with another number of iterations in its first round."""
+    """Return the planner with another number of iterations in its first round."""
     if isinstance(planner, DecidedPlanner):
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
     first, *rest = planner.rounds
@@ -107,11 +107,11 @@ def _with_iterations(planner: Any, iterations: int) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _Timed:
-    """Calls on one batch."""
+    """Durations and plans of calls on one batch."""
 
     first: float  # [s]
-    compiling: float  # [s], of the first
-    seconds: list[float]  # of the others
+    compiling: float  # [s], compile time of the first call
+    seconds: list[float]  # [s], of the other calls
     plans: Any
 
     @property
@@ -119,8 +119,8 @@ class _Timed:
         return min(self.seconds)
 
 
-def _timed(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
-    """Plan a batch that the devices hold in equal shares, once and then `repeat` times, warm."""
+def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
+    """Plan a batch, which the devices hold in equal shares, once and then `repeat` times, warm."""
     num = jax.tree.leaves(host)[0].shape[0]
     shares = NamedSharding(Mesh(np.array(devices), "lanes"), PartitionSpec("lanes"))
     there = shares if len(devices) > 1 and num % len(devices) == 0 else devices[0]
@@ -138,7 +138,7 @@ def _timed(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
         call()
     seconds, plans = [], None
     for _ in range(repeat):
-        del plans  # or their memory would be counted, too
+        del plans  # otherwise the memory peak would count these plans too
         took, plans = call()
         seconds.append(took)
     return _Timed(first, clock.seconds, seconds, plans)
@@ -163,7 +163,7 @@ def _add_row(
         "judged": success.size,
         "success": success.mean(),
         **figures,
-        "memory_gib": _memory(devices),
+        "memory_gib": _peak_memory(devices),
     }
     gap = ", ".join("-" if x is None else f"{100.0 * x:.1f} %" for x in figures.values())
     bench.say(
@@ -175,25 +175,25 @@ def _add_row(
     bench.row(**row)
 
 
-def _efficiency(planner: Any, host: Any, devices: list, repeat: int, timed: _Timed) -> str:
-    """What several devices make of a batch beside one, and beside each of them alone."""
+def _compare_devices(planner: Any, host: Any, devices: list, repeat: int, timed: _Timed) -> str:
+    """Return text on several devices' speed relative to one device, and to each with its share."""
     num = timed.plans.status.size
-    whole = _timed(planner, host, devices[:1], repeat).fastest
+    whole = _time_calls(planner, host, devices[:1], repeat).fastest
     ends = np.linspace(0, num, len(devices) + 1).astype(int)
     alone = []
     for device, begins, ended in zip(devices, ends[:-1], ends[1:], strict=True):
         share = jax.tree.map(lambda leaf: leaf[begins:ended], host)  # noqa: B023
-        alone.append(_timed(planner, share, [device], repeat).fastest)
+        alone.append(_time_calls(planner, share, [device], repeat).fastest)
     shares = ", ".join(f"{1e3 * seconds:.2f}" for seconds in alone)
     return (
-        f"{num:,} plans: one device takes {1e3 * whole:.2f} ms, so that {len(devices)} have an "
+        f"{num:,} plans: one device takes {1e3 * whole:.2f} ms, so {len(devices)} devices have an "
         f"efficiency of {whole / timed.fastest / len(devices):.3f}; each alone takes {shares} ms "
         f"for its share"
     )
 
 
-def _memory(devices: list) -> float:
-    """Peak of a device, or of the process on a CPU [GiB]."""
+def _peak_memory(devices: list) -> float:
+    """Return the peak memory [GiB] of a device, or of the process on a CPU."""
     stats = devices[0].memory_stats() or {}
     peak = stats.get("peak_bytes_in_use")
     if peak is None:
@@ -201,14 +201,14 @@ def _memory(devices: list) -> float:
     return peak / 2**30
 
 
-def _agreement(card: Task, planner: Any, cases: Any, devices: list) -> str:
-    """How far plans of the devices differ from those of a CPU, lane by lane."""
+def _compare_with_cpu(card: Task, planner: Any, cases: Any, devices: list) -> str:
+    """Return text on differences between plans of the devices and of a CPU."""
     cases = jax.tree.map(np.asarray, cases)
     ours = plan(planner, cases, devices=devices)
     with jax.default_device(jax.devices("cpu")[0]):
         theirs = plan(planner, cases, devices=jax.devices("cpu")[:1])
     same = np.asarray(ours.status) == np.asarray(theirs.status)
-    text = f"beside a CPU, {COMPARED} lanes: status equal on {100.0 * same.mean():.2f} %"
+    text = f"compared with a CPU, {COMPARED} plans: status equal on {100.0 * same.mean():.2f} %"
     if card.contact:
         contact = operator.attrgetter(card.contact)
         later = np.abs(contact(ours) - contact(theirs))
@@ -221,11 +221,13 @@ def _agreement(card: Task, planner: Any, cases: Any, devices: list) -> str:
 
 
 def main() -> None:
-    """Both tasks of the library, or others, small."""
+    """Measure the requested tasks with small batches."""
     parser = argument_parser("throughput", __doc__, seed=0)
-    parser.add_argument("--tasks", default="hit,catch", help="comma-separated")
+    parser.add_argument(
+        "--tasks", default="hit,catch", help="tasks, comma-separated (default: hit,catch)"
+    )
     options = parser.parse_args()
-    tasks = chosen(parser, "--tasks", options.tasks, all_tasks())
+    tasks = parse_names(parser, "--tasks", options.tasks, all_tasks())
     with begin(parser, options) as bench:
         for task in tasks:
             measure(bench, ThroughputSettings(task=task, seed=options.seed, agree=True))

@@ -1,4 +1,4 @@
-"""What `planner-jax bench throughput` is asked to do; imports no JAX."""
+"""Settings of `planner-jax bench throughput`; this module does not import JAX."""
 
 import dataclasses
 import pkgutil
@@ -8,34 +8,36 @@ from planner_jax.core.choices import EFFORTS, require, require_memory, require_o
 from planner_jax.core.registry import task_named
 from planner_jax.runs.settings import SweepSettings, option
 
-_MOST = 100_000  # iterations, or calls: an hour and more
+_MOST = 100_000  # iterations, or calls; more would take hours
 
 
 @dataclasses.dataclass(frozen=True)
 class ThroughputSettings:
-    """The arguments of a measurement.
+    """Arguments of a throughput measurement.
 
     Raises:
-        ArgumentError: a value breaks its rule.
+        ArgumentError: a value is invalid.
         UnknownName: there is no such task.
     """
 
-    task: str = option("hit", "NAME", "whose cases are planned")
-    planner: str | None = option(None, "NAME", "(default: the task's first)")
-    suite: str | None = option(None, "NAME", "(default: the task's first)")
+    task: str = option("hit", "NAME", "task whose cases are planned")
+    planner: str | None = option(None, "NAME", "(default: the first of the task)")
+    suite: str | None = option(None, "NAME", "(default: the first of the task)")
     batch: tuple[int, ...] = option((1024, 8192), "B", "plans in one call, one or more sizes")
-    devices: int | None = option(None, "N", "how many share a batch (default: all)")
-    iterations: int | None = option(None, "K", "of the first round (default: the planner's own)")
-    effort: str | None = option(
-        None, "NAME", f"of the planner of hits or catches: {', '.join(EFFORTS)}"
+    devices: int | None = option(None, "N", "number of devices that share a batch (default: all)")
+    iterations: int | None = option(
+        None, "K", "iterations of the first round (default: the planner's own)"
     )
-    repeat: int = option(5, "R", "timed calls")
-    seed: int = option(0, "K", "of the cases")
-    agree: bool = option(False, "", "compare the first lanes with those of a CPU, too")
+    effort: str | None = option(
+        None, "NAME", f"effort of the planner of hits or catches: {', '.join(EFFORTS)}"
+    )
+    repeat: int = option(5, "R", "number of timed calls")
+    seed: int = option(0, "K", "seed of the cases")
+    agree: bool = option(False, "", "also compare the first plans with plans of a CPU")
 
     DESCRIPTION: ClassVar[str] = (
-        "Plans a second of batches that stay on the devices, with what the referee says of them,\n"
-        "the cost beside a long search's, compile time and memory."
+        "Measure plans per second for batches that stay on the devices, with refereed success,\n"
+        "the cost above a long search, compile time and memory."
     )
 
     def __post_init__(self) -> None:
@@ -51,5 +53,5 @@ class ThroughputSettings:
         require(min(self.batch) >= 1, "batch", ">= 1", min(self.batch))
         task = task_named(self.task)
         kind: type[SweepSettings] = pkgutil.resolve_name(task.sweep)
-        asked = kind(planner=self.planner, suite=self.suite, seed=self.seed).of(task)
-        require_memory("batch", max(self.batch), asked.case_bytes)
+        sweep = kind(planner=self.planner, suite=self.suite, seed=self.seed).of(task)
+        require_memory("batch", max(self.batch), sweep.case_bytes)

@@ -1,20 +1,22 @@
-"""How much quicker a sweep is with Ray workers for each core or GPU than for one, on this machine.
+"""Measure the speed-up of a sweep with Ray workers on all cores or GPUs of this machine.
 
     python -m benchmarks.workers [--num 60000] [--batch 2000] [--turns 3] [--ways 1,2] [--out DIR]
 
-Four ways to make the same hits take turns, so that a slow minute of the machine meets all of them:
-a plain sweep on one core; a plain sweep on each core, all at the same time; one Ray worker, on one
-core with the process that asks it; and a Ray worker for each core. The second says how much the
-cores of this machine give at most, since they may share caches, memory or a clock. `--ways` leaves
-some of the four out.
+Four set-ups of the same sweep of hits take turns, so that a slow minute of the machine affects all
+of them: (1) a plain sweep on one core; (2) a plain sweep on each core, all at the same time; (3)
+one Ray worker, on one core together with the driver process; and (4) a Ray worker for each core.
+The second shows the greatest speed-up that this machine allows, because cores may share caches,
+memory or a clock. `--ways` selects set-ups by number.
 
-Where JAX computes on GPUs these take the place of cores, and it is workers of one GPU beside those
-of all; several workers share a GPU. One GPU has its share of the cores as well, but for the plain
-sweep on one, which has all of them as it has without workers. There, take --num 10000000 --batch
-65536 or more, and a temporary folder with room for 3 kB a hit, times the GPUs.
+If JAX computes on GPUs, GPUs take the place of cores, and workers on one GPU are compared with
+workers on all GPUs; several workers share a GPU. A sweep on one GPU also gets its share of the
+cores, except the plain sweep on one GPU, which gets all cores as it does without workers. On GPUs
+use --num 10000000 --batch 65536 or more, and a temporary folder with space for 3 kB a hit times the
+number of GPUs.
 
-A rate is the slope of the chunks written over time, after the first few, which the workers need to
-begin. The cost gap is that of a thousand of the hits. Linux, because processes are bound to cores.
+A rate is the slope of the number of written chunks over time, without the first few chunks, during
+which the workers start. The cost gap is computed for a thousand of the hits. Linux only, because
+processes are bound to cores.
 """
 
 import os
@@ -32,72 +34,72 @@ import numpy as np
 
 import planner_jax as pj
 from planner_jax.benchmarks.cost_gap import COMPARED, cost_gaps, gap_figures
-from planner_jax.benchmarks.run import argument_parser, begin, chosen
+from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.cluster import WORKERS_OF_GPU
 
-_FIRST = 9  # chunks that are not counted, at least
+_FIRST = 9  # minimum number of first chunks that are not counted
 _GPUS, _PREALLOCATE = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 
 class _Share(NamedTuple):
-    """What of the machine a sweep may use."""
+    """Part of the machine that a sweep may use."""
 
     cores: list[int]
-    gpus: list[str]  # none: it computes on the cores
+    gpus: list[str]  # empty if the sweep computes on the cores
 
     @property
     def first(self) -> int:
-        """How many chunks are not counted: those that its workers begin with."""
+        """Number of chunks that are not counted, because the workers start during them."""
         return max(_FIRST, WORKERS_OF_GPU * len(self.gpus) if self.gpus else len(self.cores))
 
 
 class _Sweep:
-    """A sweep in a process of its own, on some of the machine, and when its chunks were there."""
+    """Sweep in a separate process on a part of the machine, with the times of its chunks."""
 
     def __init__(self, out: Path, num: int, batch: int, share: _Share, ray: bool):
         self._out, self._batch, self._first, self._times = out, batch, share.first, list[float]()
-        self._said = out.with_suffix(".said")
+        self._errors = out.with_suffix(".stderr")
         workers = ["--workers", "ray"] if ray else []
         what = ["hit", "--num", str(num), "--batch", str(batch), *workers, "--out", str(out)]
         environ = {**os.environ, "NPROC": str(len(share.cores))}
         if share.gpus:
             environ[_GPUS] = ",".join(share.gpus)
-            del environ[_PREALLOCATE]  # which is for this process
-        with open(self._said, "wb") as said:
+            del environ[_PREALLOCATE]  # which is set for this process only
+        with open(self._errors, "wb") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "planner_jax", "sweep", *what],
                 env=environ,
                 stdout=subprocess.DEVNULL,
-                stderr=said,
+                stderr=errors,
             )
         os.sched_setaffinity(self._process.pid, share.cores)
 
-    def look(self) -> bool:
-        """Count the chunks that are there; whether the process still runs."""
+    def poll(self) -> bool:
+        """Record new chunks; return whether the process still runs."""
         there = len(list(self._out.glob("plans/part-*.parquet")))
         self._times += [time.perf_counter()] * (there - len(self._times))
         return self._process.poll() is None
 
     def rate(self) -> float:
-        """Plans a second after the first chunks.
+        """Return plans per second after the first chunks.
 
         Raises:
             RuntimeError: the sweep has failed.
         """
         if self._process.returncode != 0:
-            said = (self._said.read_text(errors="replace").splitlines() or ["nothing"])[-1]
-            raise RuntimeError(f"a sweep ended with exit code {self._process.returncode}: {said}")
+            last = (self._errors.read_text(errors="replace").splitlines() or ["nothing"])[-1]
+            raise RuntimeError(f"a sweep ended with exit code {self._process.returncode}: {last}")
         late = self._times[self._first :]
         return self._batch * np.polyfit(np.array(late) - late[0], np.arange(len(late)), 1)[0]
 
     def summary(self) -> dict:
-        """Of its manifest."""
+        """Return the summary in the manifest."""
         return RunFolder(self._out).read_manifest()["summary"]
 
 
-def _ways(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
-    """By name, the shares of the sweeps that run at the same time, and whether Ray makes them."""
+def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
+    """Return by name the shares of the simultaneous sweeps, and whether Ray runs them."""
     whole, num = _Share(cores, gpus), len(gpus or cores)
     if not gpus:
         each = [_Share([core], []) for core in cores]
@@ -107,7 +109,7 @@ def _ways(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bo
             "one worker": (each[-1:], True),
             f"{num} workers": ([whole], True),
         }
-    cores = sorted(cores, key=_place)
+    cores = sorted(cores, key=_core_order)
     ends = np.linspace(0, len(cores), num + 1).astype(int)
     each = [
         _Share(cores[first:last], [gpu])
@@ -121,18 +123,18 @@ def _ways(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bo
     }
 
 
-def _place(core: int) -> tuple[int, ...]:
-    """Where a core, as the system counts them, is: beside those of its package and threads."""
+def _core_order(core: int) -> tuple[int, ...]:
+    """Return a sort key that groups cores by package and by physical core."""
     topology = Path(f"/sys/devices/system/cpu/cpu{core}/topology")
     try:
         names = "physical_package_id", "core_id"
         return *(int((topology / name).read_text()) for name in names), core
-    except (OSError, ValueError):  # the system does not say
+    except (OSError, ValueError):  # the system does not report it
         return (core,)
 
 
-def _gpus() -> list[str]:
-    """Those that JAX computes on, as CUDA_VISIBLE_DEVICES has them."""
+def _list_gpus() -> list[str]:
+    """Return the GPUs that JAX uses, in the notation of CUDA_VISIBLE_DEVICES."""
     if jax.default_backend() != "gpu":
         return []
     known = os.environ.get(_GPUS)
@@ -143,11 +145,11 @@ def main() -> None:
     """Take turns and print the rates."""
     parser = argument_parser("workers", __doc__, num=60000, batch=2000, turns=3)
     known = "1,2,3,4"
-    parser.add_argument("--ways", default=known, help=f"by number; default: {known}")
+    parser.add_argument("--ways", default=known, help=f"set-ups, by number; default: {known}")
     options = parser.parse_args()
-    numbers = chosen(parser, "--ways", options.ways, known.split(","))
-    os.environ[_PREALLOCATE] = "false"  # of GPUs: the sweeps need their memory
-    ways = _ways(sorted(os.sched_getaffinity(0)), _gpus())
+    numbers = parse_names(parser, "--ways", options.ways, known.split(","))
+    os.environ[_PREALLOCATE] = "false"  # leaves the GPUs' memory to the sweeps
+    ways = _list_setups(sorted(os.sched_getaffinity(0)), _list_gpus())
     ways = {name: way for k, (name, way) in enumerate(ways.items(), 1) if str(k) in numbers}
     least = 3 + max(share.first for shares, _ in ways.values() for share in shares)
     if options.num < least * options.batch:
@@ -162,7 +164,7 @@ def main() -> None:
                     _Sweep(place / str(k), options.num, options.batch, share, ray)
                     for k, share in enumerate(shares)
                 ]
-                while any([sweep.look() for sweep in sweeps]):
+                while any([sweep.poll() for sweep in sweeps]):
                     time.sleep(0.005)
                 rates[name].append(sum(sweep.rate() for sweep in sweeps))
                 summaries[name] = sweeps[0].summary()
@@ -170,9 +172,9 @@ def main() -> None:
                 print(f"{name}: {rates[name][-1]:.0f} plans/s", flush=True)
         planner, cases = pj.hit.planner("exact"), pj.hit.draw(COMPARED)
         gaps = cost_gaps(planner, cases, pj.plan(planner, cases))
-        told = ", ".join(f"{100.0 * (each or 0.0):.1f} %" for each in gap_figures(gaps).values())
-        bench.say(f"cost above a longer search's (median, p90, p99): {told}")
-        bench.say("| made by | plans/s, median | lowest | highest | times one | success |")
+        text = ", ".join(f"{100.0 * (each or 0.0):.1f} %" for each in gap_figures(gaps).values())
+        bench.say(f"cost above a longer search (median, p90, p99): {text}")
+        bench.say("| set-up | plans/s, median | lowest | highest | times one | success |")
         bench.say("|---|---|---|---|---|---|")
         for name, found in rates.items():
             one = rates[next(first for first in ways if ways[first][1] == ways[name][1])]

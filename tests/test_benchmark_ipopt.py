@@ -39,7 +39,7 @@ def points(name):
 
 @functools.cache
 def program(name, penalised):
-    problem = setup(name).module.problem(setup(name).planner)
+    problem = setup(name).module.make_problem(setup(name).planner)
     return Program(problem, penalised, BETWEEN_NODES)
 
 
@@ -53,11 +53,11 @@ def test_objective_and_greatest_excess_are_those_of_the_planner(name):
     task, written = setup(name), program(name, True)
     with jax.enable_x64(True):
         found = task._objective(jnp.asarray(points(name)), task.contexts)
-    told = task.batches["smooth"].told
+    params = task.batches["smooth"].params
     values = [
-        float(written.functions[0](*each)[0]) for each in zip(points(name), told, strict=True)
+        float(written.functions[0](*each)[0]) for each in zip(points(name), params, strict=True)
     ]
-    worst = [float(written.worst(*each)) for each in zip(points(name), told, strict=True)]
+    worst = [float(written.worst(*each)) for each in zip(points(name), params, strict=True)]
     np.testing.assert_allclose(values, found.cost, rtol=1e-12)
     np.testing.assert_allclose(np.array(worst) + BETWEEN_NODES, found.violation, rtol=1e-12)
     assert max(worst) > 0.0
@@ -67,23 +67,23 @@ def test_objective_and_greatest_excess_are_those_of_the_planner(name):
 @pytest.mark.parametrize("name", TASKS)
 @pytest.mark.parametrize("penalised", (True, False))
 def test_derivatives_are_those_of_finite_differences(name, penalised):
-    written, told = program(name, penalised), setup(name).batches["smooth"].told[0]
+    written, params = program(name, penalised), setup(name).batches["smooth"].params[0]
     nlp, gradient, jacobian, hessian = written.functions
     point, step = points(name)[0], 1e-5
     multipliers = np.random.default_rng(1).uniform(size=written.num_constraints)
 
     def slope(x):
-        by_g = array(jacobian(x, told)[1]).T @ multipliers if not penalised else 0.0
-        return array(gradient(x, told)[1]).ravel() + by_g
+        by_g = array(jacobian(x, params)[1]).T @ multipliers if not penalised else 0.0
+        return array(gradient(x, params)[1]).ravel() + by_g
 
     def value(x):
-        f, g = nlp(x, told)
+        f, g = nlp(x, params)
         return float(f) + (array(g).ravel() @ multipliers if not penalised else 0.0)
 
     sides = [(point + step * unit, point - step * unit) for unit in np.eye(point.size)]
     slopes = [(value(more) - value(less)) / (2.0 * step) for more, less in sides]
     bends = [(slope(more) - slope(less)) / (2.0 * step) for more, less in sides]
-    upper = array(hessian(point, told, 1.0, multipliers))
+    upper = array(hessian(point, params, 1.0, multipliers))
     whole = upper + np.triu(upper, 1).T
     np.testing.assert_allclose(slopes, slope(point), atol=1e-6 * np.abs(slopes).max())
     np.testing.assert_allclose(bends, whole, atol=1e-6 * np.abs(whole).max())
@@ -99,7 +99,7 @@ def test_with_limits_as_constraints_it_costs_no_more_than_the_planner_and_the_re
     setting = (1e-6, {"mu_strategy": "adaptive"}, False)
     found = peer.solve(setting, starts)
     plans = task.plans(found.points)
-    assert found.converged.all() and task.accepted(plans).all()
+    assert found.converged.all() and task.judge(plans).all()
     ours = pj.plan(task.card.planner("exact", **task.card.bench), task.cases)
     assert (task.cost(plans) <= task.cost(ours) * (1.0 + 1e-6)).all()
     paths = peer.iterates(setting, starts)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.benchmarks.latency import planned_again
+from planner_jax.benchmarks.latency import begin_replans
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane.reach import Lattice
 from planner_jax.robot.car import pose_at
@@ -280,7 +280,7 @@ def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
 
 def test_latency_plans_the_remainders_of_solved_plans_again(planned):
     cases, plans = planned
-    planner, tasks = planned_again(PLANNER, cases, 2.0)
+    planner, tasks = begin_replans(PLANNER, cases, 2.0)
     assert planner == PLANNER.replanner()
     assert len(tasks.case.time) == pj.solved(plans).sum()
     np.testing.assert_allclose(tasks.case.time, 8.0, atol=1e-5)

@@ -1,1 +1,1 @@
-"""The problem of `PaperCatch` with one ball once more in C++, with a search of its own."""
+"""The problem of `PaperCatch` with one ball in C++, with solvers of its own."""

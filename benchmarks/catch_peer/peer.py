@@ -1,21 +1,23 @@
 """Build the C++ program of this folder, run it on a table of throws, and compare with the table.
 
 The program minimises the objective of `planner_jax.baselines.catch.paper.PaperCatch`, on one core
-and in double precision: one throw after another, none of them with a heap allocation. It shares no
-code with the library.
+and in double precision, one throw after another, without a heap allocation. It shares no code with
+the library.
 
-A peer gets its best settings. They were found by some 500 to 1,500 random steps for each search, on
-the 240 throws of both sets, from the least time while 97 % were within 1e-3 of the published cost.
-Tried were memories of 8 to 64 and BFGS with a dense matrix, `past` 2 to 20, `delta` 1e-7 to 1e-5,
-both constants of the weak Wolfe conditions, halved and cubic trials, a unit for each kind of
-variable, and variables relative to the smoothest way and to the ball. Plans per CPU second on a
-core of an AMD EPYC (Zen 3 or later), which others used too, so that 10 % mean nothing; in brackets
-the percentage within 1e-3 and the mean iterations. On 960 throws shifted from these by some 0.1 m
-and 0.15 m/s, `SEARCHES` ends within 1e-3 of a long search on 98 to 100 %.
+The settings of each search were tuned by some 500 to 1,500 random steps on the 240 throws of both
+sets, for the least time with 97 % of the costs within 1e-3 of the published cost. The following
+were varied: memories of 8 to 64 and BFGS with a dense matrix, `past` from 2 to 20, `delta` from
+1e-7 to 1e-5, both constants of the weak Wolfe conditions, bisection and cubic interpolation, a unit
+for each kind of variable, and variables relative to the smoothest trajectory and to the ball.
+
+The table lists plans per CPU second on a core of an AMD EPYC (Zen 3 or later), which other programs
+used too, so that differences of 10 % are not significant. In brackets are the percentage of costs
+within 1e-3 and the mean iterations. On 960 throws shifted from these by some 0.1 m and 0.15 m/s,
+`SEARCHES` ends within 1e-3 of a long search on 98 to 100 %.
 
 | variables | search | `past`, `delta` | easy set | hard set |
 |---|---|---|---|---|
-| published, unscaled | L-BFGS 48, halved trials | 10, 1e-7 | 2,110 (100, 255) | 1,680 (99, 321) |
+| published, unscaled | L-BFGS 48, bisection | 10, 1e-7 | 2,110 (100, 255) | 1,680 (99, 321) |
 | published | L-BFGS 8 | 5, 8e-7 | 1,470 (94, 693) | 1,590 (88, 626) |
 | published | L-BFGS 24 | 5, 8e-7 | 5,430 (92, 134) | 3,750 (87, 185) |
 | published | L-BFGS 48 | 5, 8e-7 | 5,240 (99, 102) | 3,470 (99, 147) |
@@ -37,24 +39,26 @@ import numpy as np
 
 SOURCE = Path(__file__).with_name("catch.cpp")
 COMPILERS = ("g++", "c++")
-# Without -ffinite-math-only: a step that is too long may overflow, and has to be seen.
+# Without -ffinite-math-only: a step that is too long may overflow, which must be detected.
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 FLAGS += ("-fno-signed-zeros", "-fassociative-math", "-freciprocal-math", "-Wno-psabi")
 NO_COMPILER = f"C++: not measured, there is no compiler ({' or '.join(COMPILERS)})"
-AS_GOOD = 1e-3  # relative cost above the published one that counts as none
+AS_GOOD = 1e-3  # relative cost above the published cost that counts as equal
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How the program searches; the fields are its arguments on the command line."""
+    """Settings of the search; the fields are the program's command-line arguments."""
 
-    relative: bool = False  # whitened offsets and the net from the ball, not q and p(T)
+    relative: bool = (
+        False  # whitened offsets and the net relative to the ball, instead of q and p(T)
+    )
     memory: int = 48  # pairs of L-BFGS, at most 64; 0 for BFGS with a dense matrix
     past: int = 10  # iterations over which the cost is compared
-    delta: float = 1e-7  # relative change of the cost over them that ends the search
+    delta: float = 1e-7  # relative change of the cost over `past` iterations that ends the search
     decrease: float = 1e-4  # of the weak Wolfe conditions
     curvature: float = 0.9
-    interpolate: bool = True  # cubic trials within a bracket, not halves
+    interpolate: bool = True  # cubic interpolation within a bracket, not bisection
     scale_q: float = 1.0  # units of the variables: waypoints or offsets, log T, p, v, a
     scale_t: float = 1.0
     scale_p: float = 1.0
@@ -62,13 +66,13 @@ class Settings:
     scale_a: float = 1.0
 
     def words(self) -> list[str]:
-        """The arguments of the program."""
+        """Return the command-line arguments of the program."""
         given = dataclasses.asdict(self)
         return [f"{name}={float(value):g}" for name, value in given.items()]
 
 
-# The quickest settings found that hold `AS_GOOD` on at least 98 % of both published sets, which
-# leaves room for another processor's rounding.
+# The fastest settings that satisfy `AS_GOOD` on at least 98 % of both published sets, with some
+# margin for another processor's rounding.
 SEARCHES = {
     "C++, own L-BFGS, one core, double": Settings(
         memory=48, past=5, delta=8e-7, decrease=0.01, curvature=0.5,
@@ -87,17 +91,17 @@ SEARCHES = {
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """What the program did with a table."""
+    """Results of the program on a table."""
 
-    plans_per_second: float  # of processor time, reading and printing left out
-    share_within: float  # of cases whose cost is at most `AS_GOOD` above the published one
+    plans_per_second: float  # per CPU second, without reading and printing
+    share_within: float  # share of cases whose cost is at most `AS_GOOD` above the published one
     median_gap: float  # relative cost above the published one
     mean_iterations: float
-    success_rate: float  # by the published test: 200 samples, five per cent to spare
-    guess_error: float  # the guess's cost against the published one, the largest, relative
+    success_rate: float  # by the published test: 200 samples, five per cent tolerance
+    guess_error: float  # largest relative error of the cost at the initial guess
 
     def __str__(self) -> str:
-        """In a line."""
+        """Format the results in one line."""
         return (
             f"{self.plans_per_second:.0f} plans/s, gap <= {AS_GOOD:.0e} on "
             f"{100 * self.share_within:.1f} %, median {self.median_gap:.1e}, "
@@ -107,7 +111,7 @@ class Figures:
 
 
 def build(folder: Path) -> Path | None:
-    """Compile the program into a folder; None where there is no compiler (`NO_COMPILER`)."""
+    """Compile the program into a folder; return None if there is no compiler (`NO_COMPILER`)."""
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
         return None
@@ -123,7 +127,7 @@ def measure(program: Path, table: Path, settings: Settings, repeats: int = 5) ->
         program: from `build`.
         table: with the columns of tests/data/catch_paper.csv.
         settings: of the search.
-        repeats: rounds over all cases, of which the quickest counts.
+        repeats: number of rounds over all cases; the fastest counts.
     """
     with table.open(newline="", encoding="utf-8") as file:
         published = list(csv.DictReader(file))

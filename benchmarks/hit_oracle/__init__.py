@@ -1,1 +1,1 @@
-"""Direct transcription of a hit, to tell infeasible cases from missed ones."""
+"""Direct transcription of a hit, to distinguish infeasible cases from failures of a planner."""

@@ -1,7 +1,7 @@
-"""The nonlinear program of a hit: snap constant on pieces, the impact as equations.
+"""The nonlinear program of a hit: snap constant on pieces, the impact as equality constraints.
 
-Shares no code with the planners. Written once with symbols, for CasADi and IPOPT; what differs
-from case to case are parameters. World frame, z up, SI units.
+Shares no code with the planners. The program is built once with symbols, for CasADi and IPOPT; the
+numbers of a case are its parameters. World frame, z up, SI units.
 """
 
 import dataclasses
@@ -15,15 +15,15 @@ from scipy.interpolate import BPoly
 
 from planner_jax.task.hit.case import HitCase
 
-ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
+ca: Any = importlib.import_module("casadi")  # from the extra `oracle`
 
-BALL_DEGREE = 10  # of the ball's path up to its landing; below 1e-7 m off the integration
-# Sizes of position, velocity, acceleration and jerk, and of snap, in a program's variables.
+BALL_DEGREE = 10  # of the ball's path up to its landing; its error is below 1e-7 m
+# Typical sizes of position, velocity, acceleration and jerk, and of snap; they scale the variables.
 STATE_SCALE, SNAP_SCALE = np.array([1.0, 3.0, 10.0, 60.0]), 600.0
-LEAST_THRUST = 1.0  # [m/s^2]; below it the attitude turns faster than samples can follow
+LEAST_THRUST = 1.0  # [m/s^2]; with less thrust the attitude would turn too fast for the samples
 GUESSED_EXCESS = 0.5
 
-# What a program is told about a case, and how many numbers that is. SI units.
+# A program's parameters and their number of values, in SI units.
 PARAMETERS = {
     "ball": 3 * (BALL_DEGREE + 1),  # position = sum_k ball[k] (t / landing_time)^k
     "landing_time": 1,
@@ -41,7 +41,7 @@ PARAMETERS = {
     "max_apex": 1,
 }
 
-# Adaptive barriers converge from far away, and from a solution on coarser pieces.
+# Adaptive barriers converge from poor guesses, and from a solution on coarser pieces.
 OPTIONS = {
     "max_iter": 250,
     "max_cpu_time": 10.0,
@@ -53,7 +53,7 @@ OPTIONS = {
 
 
 def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
-    """The values of `PARAMETERS` for one case (no batch axis); the ball by integration."""
+    """Return the values of `PARAMETERS` for one case (no batch axis); the ball by integration."""
     drag, floor = float(case.drag), float(case.target[2])
     fall = np.array([0.0, 0.0, -float(case.gravity)])
 
@@ -80,13 +80,13 @@ def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
 
 
 def unpack(vector, sizes: dict[str, int]) -> dict:
-    """Named parts of a vector, symbolic or not."""
+    """Split a vector, symbolic or not, into named parts."""
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return {name: vector[ends[i] : ends[i + 1]] for i, name in enumerate(sizes)}
 
 
-def later(motion: list, time) -> list:
-    """Position, velocity and so on after `time`; the last derivative in `motion` is constant."""
+def advance(motion: list, time) -> list:
+    """Return position, velocity etc. after `time`; the last derivative in `motion` is constant."""
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])
@@ -95,7 +95,7 @@ def later(motion: list, time) -> list:
 
 
 def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
-    """Ball position, velocity before and after, racket normal, and size of the velocity's jump.
+    """Return ball position, velocities before and after, racket normal, and size of their change.
 
     Args:
         case: parameters, symbolic or not.
@@ -103,7 +103,7 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
         impact_time: [s].
         flight_time: [s], from the impact to the target, under gravity alone.
         up: (3,) unit vector.
-        norm: the function that gives a vector's length.
+        norm: function that returns the length of a vector.
     """
     share = impact_time / case["landing_time"]
     pos = sum(c * share**k for k, c in enumerate(ball))
@@ -113,24 +113,24 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
     return pos, before, after, (after - before) / jump, jump
 
 
-def path_limits(motion: list, case: dict, room) -> tuple[list, Any]:
-    """What must be <= 0 at one sample, and the body z axis there.
+def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
+    """Return the constraints <= 0 at one sample, and the body z axis there.
 
-    `room` is 1 + the excess that is granted. Body rates (Hopf fibration, zero heading) are
-    multiplied by the squared thrust: divided by it, the solver runs away where it is small.
+    `allowance` is 1 + the permitted excess. Body rates (Hopf fibration, zero heading) are
+    multiplied by the squared thrust. Divided by it, the solver would diverge for small thrust.
     """
     pos, vel, acc, jerk = motion[:4]
     gravity = case["gravity"]
     thrust = acc + ca.vertcat(0.0, 0.0, gravity)
     cross, squared = ca.cross(thrust, jerk), ca.sumsqr(thrust)
-    # The constants keep roots smooth; they are small beside the square of LEAST_THRUST.
+    # The constants keep roots smooth; they are small relative to the square of LEAST_THRUST.
     upright = ca.sqrt(squared + 0.1) + thrust[2]
     turning = ca.sumsqr(cross) + cross[2] ** 2 * (squared + 0.1) / upright**2
     limits = [
-        ca.sumsqr(vel) / case["speed"] ** 2 - room**2,
-        ca.sumsqr(acc) / case["acceleration"] ** 2 - room**2,
-        (turning / case["body_rate"] ** 2 - (room * squared) ** 2) / gravity**4,
-        case["min_height"] * (2.0 - room) - pos[2],
+        ca.sumsqr(vel) / case["speed"] ** 2 - allowance**2,
+        ca.sumsqr(acc) / case["acceleration"] ** 2 - allowance**2,
+        (turning / case["body_rate"] ** 2 - (allowance * squared) ** 2) / gravity**4,
+        case["min_height"] * (2.0 - allowance) - pos[2],
         (LEAST_THRUST**2 - squared) / gravity**2,
         0.05 - upright / gravity,
     ]
@@ -138,9 +138,9 @@ def path_limits(motion: list, case: dict, room) -> tuple[list, Any]:
 
 
 def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[list, list]:
-    """What must be 0, and what must be <= 0, at the impact."""
+    """Return the equality constraints, and the constraints <= 0, at the impact."""
     ball = ca.horzsplit(ca.reshape(case["ball"], 3, BALL_DEGREE + 1))
-    up, room = ca.DM([0.0, 0.0, 1.0]), 1.0 + unknown["excess"]
+    up, allowance = ca.DM([0.0, 0.0, 1.0]), 1.0 + unknown["excess"]
     pos, before, after, normal, jump = impact(
         case, ball, impact_time, unknown["flight_time"], up, ca.norm_2
     )
@@ -153,26 +153,26 @@ def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[li
     ]
     apex = pos[2] + ca.fmax(after[2], 0.0) ** 2 / (2.0 * case["gravity"])
     below = [
-        end[1] / case["hitting_speed"] - room,
-        -end[1] / case["hitting_speed"] - room,
-        2.0 - room - apex / case["min_apex"],
-        apex / case["max_apex"] - room,
+        end[1] / case["hitting_speed"] - allowance,
+        -end[1] / case["hitting_speed"] - allowance,
+        2.0 - allowance - apex / case["min_apex"],
+        apex / case["max_apex"] - allowance,
         impact_time / case["landing_time"] - 0.99,
     ]
     return equal, below
 
 
 class Program:
-    """The nonlinear program with a given number of pieces, built once for all cases.
+    """Nonlinear program with a given number of pieces, built once for all cases.
 
-    The unknowns are the durations of the pieces, the states at their ends, their snaps, the
-    ball's flight time after the impact, the thrust at the impact [g], and the excess: by which
-    share every limit is exceeded at most. The last is minimised.
+    The unknowns are the durations of the pieces, the states at their ends, their snaps, the ball's
+    flight time after the impact, the thrust at the impact [g], and the excess: the greatest
+    relative excess over all limits. The excess is minimised.
 
     Args:
-        pieces: how many.
-        samples: of a piece, its end included, at which limits are looked at.
-        floor: excess below which the solver need not go.
+        pieces: number of pieces.
+        samples: number of samples of a piece at which limits are checked, including its end.
+        floor: lower bound of the excess.
     """
 
     def __init__(self, pieces: int, samples: int, floor: float):
@@ -181,27 +181,27 @@ class Program:
         self.pieces = pieces
         unknowns = ca.SX.sym("unknowns", sum(self.sizes.values()))
         parameters = PARAMETERS | {"margins": pieces}
-        told = ca.SX.sym("told", sum(parameters.values()))
+        values = ca.SX.sym("values", sum(parameters.values()))
         cost, equal, below = self._build(
-            unpack(unknowns, self.sizes), unpack(told, parameters), samples
+            unpack(unknowns, self.sizes), unpack(values, parameters), samples
         )
         num_equal, num = equal.numel(), equal.numel() + below.numel()
         self._bounds = {
-            "lbx": self._bound(0.004, -np.inf, 0.15, 0.05, floor),
-            "ubx": self._bound(0.5, np.inf, 3.0, 3.0, np.inf),
+            "lbx": self._repeat_bounds(0.004, -np.inf, 0.15, 0.05, floor),
+            "ubx": self._repeat_bounds(0.5, np.inf, 3.0, 3.0, np.inf),
             "lbg": np.where(np.arange(num) < num_equal, 0.0, -np.inf),
             "ubg": np.zeros(num),
         }
-        problem = {"x": unknowns, "p": told, "f": cost, "g": ca.vertcat(equal, below)}
+        problem = {"x": unknowns, "p": values, "f": cost, "g": ca.vertcat(equal, below)}
         settings = {"ipopt": OPTIONS, "print_time": False, "error_on_fail": False}
         self._solver = ca.nlpsol("hit", "ipopt", problem, settings)
 
-    def _bound(self, duration, state, flight_time, thrust, excess) -> np.ndarray:
+    def _repeat_bounds(self, duration, state, flight_time, thrust, excess) -> np.ndarray:
         values = (duration, state, state, flight_time, thrust, excess)
         return np.repeat(values, list(self.sizes.values()))
 
     def _build(self, unknown: dict, case: dict, samples: int) -> tuple:
-        """Cost, what must be 0, and what must be <= 0."""
+        """Return cost, equality constraints, and constraints <= 0."""
         states = ca.horzcat(
             case["head_state"],
             ca.reshape(unknown["states"], 12, self.pieces) * np.repeat(STATE_SCALE, 3),
@@ -211,16 +211,16 @@ class Program:
         for k in range(self.pieces):
             duration = unknown["durations"][k]
             motion = [*self._motion(states[:, k]), SNAP_SCALE * unknown["snaps"][3 * k : 3 * k + 3]]
-            room = 1.0 + unknown["excess"] - case["margins"][k]
-            # What the axis can turn from sample to sample keeps it from flipping in between.
-            turn = case["body_rate"] * room * duration / samples
+            allowance = 1.0 + unknown["excess"] - case["margins"][k]
+            # Limiting the turn of the axis between samples prevents a flip in between.
+            turn = case["body_rate"] * allowance * duration / samples
             ends = self._motion(states[:, k + 1])
-            inside = [later(motion, duration * i / samples) for i in range(1, samples)]
+            inside = [advance(motion, duration * i / samples) for i in range(1, samples)]
             for here in (*inside, ends):
-                limits, ahead = path_limits(here, case, room)
+                limits, ahead = path_limits(here, case, allowance)
                 below += [*limits, 1.0 - ca.dot(axis, ahead) - turn**2 / 2.0 - 1.5e-3]
                 axis = ahead
-            defects = zip(later(motion, duration)[:4], ends, STATE_SCALE, strict=True)
+            defects = zip(advance(motion, duration)[:4], ends, STATE_SCALE, strict=True)
             equal += [(there - node) / scale for there, node, scale in defects]
             share = duration * self.pieces / impact_time
             below += [0.1 - share, share - 2.0]
@@ -235,13 +235,13 @@ class Program:
     def solve(
         self, case: dict, guess: np.ndarray, margins: np.ndarray | None = None
     ) -> tuple[np.ndarray, bool]:
-        """The unknowns where the solver stops, and whether it has converged.
+        """Return the unknowns at which the solver stops, and whether it has converged.
 
         Args:
             case: values of `PARAMETERS`.
             guess: of the unknowns.
-            margins: (M,) by which share the limits are tightened on each piece; the durations
-                then stay those of the guess, so that each margin stays where it belongs.
+            margins: (M,) relative tightening of the limits on each piece. The durations are then
+                fixed to their guess, so that each margin stays on its part of the trajectory.
         """
         bounds = dict(self._bounds)
         if margins is not None:
@@ -252,7 +252,7 @@ class Program:
         return np.asarray(found["x"]).ravel(), self._solver.stats()["success"]
 
     def guess(self, case: dict, start: tuple) -> np.ndarray:
-        """The polynomial of degree 7 from the head state to the impact of a start."""
+        """Return the polynomial of degree 7 from the head state to the impact of a start."""
         share, flight_time, thrust = start
         duration, up = share * case["landing_time"][0], np.array([0.0, 0.0, 1.0])
         pos, before, _, normal, jump = impact(
@@ -268,17 +268,17 @@ class Program:
         tail = [flight_time, thrust, GUESSED_EXCESS]
         return np.concatenate([np.diff(times), states.ravel(), snaps.ravel(), tail])
 
-    def halved(self, case: dict, unknowns: np.ndarray) -> np.ndarray:
-        """The same path for a program with twice as many pieces."""
+    def halve(self, case: dict, unknowns: np.ndarray) -> np.ndarray:
+        """Return the same trajectory for a program with twice as many pieces."""
         motion, durations = self.motion(case, unknowns)
         half = 0.5 * durations
-        nodes = np.stack([later(motion, half[:, None]), later(motion, durations[:, None])])
+        nodes = np.stack([advance(motion, half[:, None]), advance(motion, durations[:, None])])
         states = np.moveaxis(nodes[:, :4], (0, 1), (1, 2)) / STATE_SCALE[:, None]
         snaps = np.repeat(motion[4], 2, axis=0) / SNAP_SCALE
         return np.concatenate([np.repeat(half, 2), states.ravel(), snaps.ravel(), unknowns[-3:]])
 
     def motion(self, case: dict, unknowns: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-        """Position to snap (M, 3) where the pieces begin, and their durations (M,)."""
+        """Return position to snap (M, 3) at the start of the pieces, and their durations (M,)."""
         found = unpack(unknowns, self.sizes)
         states = found["states"].reshape(-1, 4, 3)[:-1] * STATE_SCALE[:, None]
         states = np.concatenate([case["head_state"].reshape(1, 4, 3), states])

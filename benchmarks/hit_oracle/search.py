@@ -1,4 +1,4 @@
-"""From many starts to a verdict: coarse pieces, halved pieces, tightening, referee."""
+"""Search from many starts to a verdict: coarse pieces, halved pieces, tightening, referee."""
 
 import dataclasses
 import functools
@@ -11,24 +11,24 @@ import jax
 import numpy as np
 from tqdm import tqdm
 
-from planner_jax.benchmarks.hit_oracle.program import Program, case_parameters, later
+from planner_jax.benchmarks.hit_oracle.program import Program, advance, case_parameters
 from planner_jax.referee.hit import referee_hits
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-TOLERANCE = 1e-3  # of the referee, relative
-COARSE_PIECES, COARSE_SAMPLES = 20, 3  # samples of a piece, its end included
+TOLERANCE = 1e-3  # relative, of the referee
+COARSE_PIECES, COARSE_SAMPLES = 20, 3  # samples of a piece, including its end
 FINE_SAMPLES = 4
-COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # excesses at which the solver may rest
-REFINED_BELOW = 0.06  # coarse excesses above it are left: halving takes off 0.03 at most
-NEW_BELOW = 0.001  # by how much a coarse excess must be lower than one refined in vain
-# A case is given up early if so many starts agree on no less than this excess.
+COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # lower bounds of the excess
+REFINED_BELOW = 0.06  # larger coarse excesses are not refined: halving reduces them by 0.03 at most
+NEW_BELOW = 0.001  # difference by which a coarse excess must be below one whose refinement failed
+# A case is abandoned early if this number of starts has no excess below this value.
 HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5
-INFEASIBLE_ABOVE = 0.01  # a case whose least excess is larger is called infeasible
+INFEASIBLE_ABOVE = 0.01  # a case with a larger least excess counts as infeasible
 
-# Impact over landing time, flight time after the impact [s], thrust at the impact [g]. The
+# Impact time over landing time, flight time after the impact [s], thrust at the impact [g]. The
 # fifth is a smash from above the least apex.
 STARTS = (
     (0.93, 1.6, 1.2),
@@ -40,13 +40,13 @@ STARTS = (
     (0.65, 1.1, 0.8),
     (0.97, 1.0, 1.4),
 )
-START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))  # of starts beyond these
+START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))  # of random starts
 
 
 def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) -> np.ndarray:
-    """Largest of speed, acceleration and body rate over their limits on every piece, (M,)."""
+    """Return the largest ratio of speed, acceleration or body rate to its limit, by piece (M,)."""
     times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
-    _, vel, acc, jerk, _ = later([part[:, None] for part in motion], times)
+    _, vel, acc, jerk, _ = advance([part[:, None] for part in motion], times)
     thrust = acc + values["gravity"] * np.array([0.0, 0.0, 1.0])
     size, cross = np.linalg.norm(thrust, axis=-1), np.cross(thrust, jerk)
     rate = np.hypot(np.linalg.norm(cross, axis=-1) / size, cross[..., 2] / (size + thrust[..., 2]))
@@ -60,11 +60,11 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
 
 @dataclasses.dataclass
 class Finding:
-    """What the oracle found about one case."""
+    """Result of the oracle for one case."""
 
-    feasible: bool = False  # the referee passed a hit
+    feasible: bool = False  # the referee accepts a hit
     least_excess: float = math.inf  # of the programs that converged
-    starts: int = 0  # how many were used
+    starts: int = 0  # number of starts used
     cpu_seconds: float = 0.0
     impact_time: float = math.nan  # [s], of the hit, or of the least excess
     flight_time: float = math.nan  # [s]
@@ -73,14 +73,14 @@ class Finding:
     durations: np.ndarray | None = None  # (M,) [s]
 
     def note(self, unknowns: np.ndarray, durations: np.ndarray) -> None:
-        """Keep the result of a program that converged if it is the best so far."""
+        """Store the result of a converged program if it is the best so far."""
         if unknowns[-1] < self.least_excess:
             self.impact_time = float(durations.sum())
             self.flight_time, self.thrust, self.least_excess = unknowns[-3:].tolist()
 
     @property
     def verdict(self) -> str:
-        """feasible, infeasible (as far as the programs can tell), or undecided."""
+        """Verdict: feasible, infeasible (as far as the programs can show), or undecided."""
         if self.feasible:
             return "feasible"
         clear = INFEASIBLE_ABOVE < self.least_excess < math.inf
@@ -95,7 +95,7 @@ class Oracle:
         self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
 
     def find(self, case: HitCase, starts) -> Finding:
-        """Look for a hit in one case (NumPy leaves, no batch axis) from several starts."""
+        """Search for a hit in one case (NumPy leaves, no batch axis) from several starts."""
         began, finding, in_vain = time.process_time(), Finding(), math.inf
         values = case_parameters(case)
         for start in starts:
@@ -119,8 +119,8 @@ class Oracle:
         return finding
 
     def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
-        """Halve the pieces and tighten what peaks between samples; the excess, if it converged."""
-        guess, margins = self.coarse.halved(values, coarse), np.zeros(self.fine.pieces)
+        """Halve the pieces, and tighten limits that peak between samples; return the excess."""
+        guess, margins = self.coarse.halve(values, coarse), np.zeros(self.fine.pieces)
         unknowns, converged = self.fine.solve(values, guess)
         if not converged:
             unknowns, converged = self.fine.solve(values, guess, margins)
@@ -144,7 +144,7 @@ class Oracle:
 
 
 def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-    """Whether the library's referee passes one trajectory."""
+    """Return whether the library's referee accepts one trajectory."""
     none: Any = np.zeros(1)
     path: Any = coeffs[None], durations[None]
     stroke = Stroke(
@@ -169,7 +169,7 @@ def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> 
 
 
 def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
-    """`STARTS`, then random ones."""
+    """Return `STARTS`, then random starts."""
     low, high = np.transpose(START_RANGES)
     draws = np.random.default_rng(seed).uniform(low, high, (max(num - len(STARTS), 0), 3))
     return [*STARTS, *map(tuple, draws)][:num]
@@ -177,17 +177,17 @@ def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
 
 @functools.cache
 def oracle() -> Oracle:
-    """The one oracle of a process; building it takes a second."""
+    """Return the one oracle of a process; building it takes a second."""
     return Oracle()
 
 
 def find_hit(case: HitCase, starts) -> Finding:
-    """What the process's oracle finds about one case."""
+    """Run the process's oracle on one case."""
     return oracle().find(case, starts)
 
 
 def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
-    """Findings for a batch of cases, in order, with a progress bar."""
+    """Return findings for a batch of cases, in order, with a progress bar."""
     cases = jax.tree.map(np.asarray, cases)
     num = len(cases.drag)
     lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], cases) for i in range(num)]

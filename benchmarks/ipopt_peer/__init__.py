@@ -1,1 +1,1 @@
-"""The problems of the `exact` planners once more in CasADi's symbols, for IPOPT."""
+"""The problems of the `exact` planners in CasADi's symbols, for IPOPT."""

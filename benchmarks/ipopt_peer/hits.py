@@ -4,9 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from planner_jax.benchmarks.ipopt_peer.program import Problem, across, ca, rate_squared
+from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
-# What a program is told about a hit, and how many numbers that is; SI units.
+# Parameters of a hit, and their numbers of values; SI units.
 SIZES = {
     "gravity": 1,
     "speed": 1,
@@ -24,8 +24,8 @@ SIZES = {
 }
 
 
-def told(context: Any) -> dict[str, Any]:
-    """The numbers of one case's context (NumPy leaves), by name."""
+def read_params(context: Any) -> dict[str, Any]:
+    """Return the parameters of one context (NumPy leaves), by name."""
     case, path = context.case, context.path
     found = {"path_pos": path.pos, "path_vel": path.vel, "resolution": path.resolution}
     for source in (case, case.limits, case.hit_limits):
@@ -33,65 +33,69 @@ def told(context: Any) -> dict[str, Any]:
     return found
 
 
-def problem(planner: Any) -> Problem:
-    """The problem of an `ExactHit`."""
+def make_problem(planner: Any) -> Problem:
+    """Return the problem of an `ExactHit`."""
     nodes = planner.num_table_nodes
     return Problem(
         planner=planner,
         sizes=SIZES | {"path_pos": 3 * nodes, "path_vel": 3 * nodes},
         num_natural=8,
-        ends=lambda natural, told: ends(natural, told, nodes),
+        ends=lambda natural, read_params: ends(natural, read_params, nodes),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 1.0),
         impact_weight=planner.impact_weight,
     )
 
 
-def keys(distance: Any) -> Any:
-    """Keys' kernel with a = -1/2 at a distance in nodes [Yu2023bat, eq. 10b]."""
+def keys_kernel(distance: Any) -> Any:
+    """Return Keys' kernel with a = -1/2 at a distance in nodes [Yu2023bat, eq. 10b]."""
     u = ca.fabs(distance)
     near = (1.5 * u - 2.5) * u * u + 1.0
     far = ((-0.5 * u + 2.5) * u - 4.0) * u + 2.0
     return ca.if_else(u < 1.0, near, ca.if_else(u < 2.0, far, 0.0))
 
 
-def ball_at(time: Any, told: dict, nodes: int) -> tuple[Any, Any]:
-    """Position and velocity of the incoming ball, read from its table [Yu2023bat, eqs 8 to 10]."""
-    inside = ca.fmin(ca.fmax(time, 0.0), told["resolution"] * (nodes - 3))
-    place = inside / told["resolution"] + 1.0
-    weights = keys(place - ca.DM(np.arange(nodes)))
-    vel = ca.reshape(told["path_vel"], 3, nodes) @ weights
-    return ca.reshape(told["path_pos"], 3, nodes) @ weights + vel * (time - inside), vel
+def ball_at(time: Any, read_params: dict, nodes: int) -> tuple[Any, Any]:
+    """Interpolate position and velocity of the incoming ball [Yu2023bat, eqs 8 to 10]."""
+    inside = ca.fmin(ca.fmax(time, 0.0), read_params["resolution"] * (nodes - 3))
+    place = inside / read_params["resolution"] + 1.0
+    weights = keys_kernel(place - ca.DM(np.arange(nodes)))
+    vel = ca.reshape(read_params["path_vel"], 3, nodes) @ weights
+    return ca.reshape(read_params["path_pos"], 3, nodes) @ weights + vel * (time - inside), vel
 
 
-def ends(natural: Any, told: dict, nodes: int) -> tuple[Any, Any, list, Any]:
-    """The stroke that log T, log t_post, log thrust, two tangential speeds and jerk describe."""
+def ends(natural: Any, read_params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
+    """Return the end of a hit.
+
+    The variables are log T, log t_post, log thrust, two tangential speeds and jerk. Returns tail
+    state, duration, excesses and cost, as `Problem.ends`.
+    """
     time, flight, thrust = (ca.exp(natural[k]) for k in range(3))
-    gravity, up = told["gravity"], ca.DM([0.0, 0.0, 1.0])
-    pos, before = ball_at(time, told, nodes)
-    after = (told["target"] - pos) / flight + 0.5 * gravity * flight * up
+    gravity, up = read_params["gravity"], ca.DM([0.0, 0.0, 1.0])
+    pos, before = ball_at(time, read_params, nodes)
+    after = (read_params["target"] - pos) / flight + 0.5 * gravity * flight * up
     change = after - before
     normal = change / ca.norm_2(change)
-    beta = told["restitution"]
+    beta = read_params["restitution"]
     speed = ca.dot((beta * before + after) / (1.0 + beta), normal)
-    across_x, across_y = across(normal)
+    across_x, across_y = body_axes(normal)
     tail = ca.horzcat(
-        pos - told["racket_height"] * normal,
+        pos - read_params["racket_height"] * normal,
         speed * normal + natural[3] * across_x + natural[4] * across_y,
         thrust * normal - gravity * up,
         natural[5:8],
     ).T
     apex = pos[2] + ca.fmax(after[2], 0.0) ** 2 / (2.0 * gravity)
-    hitting = (tail[1, :].T / told["hitting_speed"]) ** 2 - 1.0
-    excess = [1.0 - apex / told["min_apex"], apex / told["max_apex"] - 1.0]
+    hitting = (tail[1, :].T / read_params["hitting_speed"]) ** 2 - 1.0
+    excess = [1.0 - apex / read_params["min_apex"], apex / read_params["max_apex"] - 1.0]
     return tail, time, [*excess, *ca.vertsplit(hitting)], ca.SX(0.0)
 
 
-def limits(height: Any, vel: Any, acc: Any, jerk: Any, told: dict) -> list:
-    """Squares of speed, acceleration and body rate over their limits, less one, and the height."""
+def limits(height: Any, vel: Any, acc: Any, jerk: Any, read_params: dict) -> list:
+    """Return squares of speed, acceleration, body rate over their limits, less one; and height."""
     return [
-        ca.sumsqr(vel) / told["speed"] ** 2 - 1.0,
-        ca.sumsqr(acc) / told["acceleration"] ** 2 - 1.0,
-        rate_squared(acc, jerk, told["gravity"]) / told["body_rate"] ** 2 - 1.0,
-        told["min_height"] - height,
+        ca.sumsqr(vel) / read_params["speed"] ** 2 - 1.0,
+        ca.sumsqr(acc) / read_params["acceleration"] ** 2 - 1.0,
+        rate_squared(acc, jerk, read_params["gravity"]) / read_params["body_rate"] ** 2 - 1.0,
+        read_params["min_height"] - height,
     ]

@@ -1,4 +1,4 @@
-"""IPOPT on the cases of a batch: one after another, on one core, with its iterates if asked."""
+"""Run IPOPT on a batch, one case after another on one core, and record its iterates."""
 
 import dataclasses
 import shutil
@@ -13,13 +13,13 @@ from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
 from planner_jax.core.protocol import take
 from planner_jax.cost.along import BETWEEN_NODES
 
-# How MUMPS orders and scales: what it does by default, and the least of it, as matrices are small.
+# MUMPS's ordering and scaling: its defaults, and the least effort, because the matrices are small.
 _USUAL: dict[str, Any] = {}
 _PLAIN = {"mumps_scaling": 0, "mumps_permuting_scaling": 0, "mumps_pivot_order": 0}
 _ADAPTIVE = {"mu_strategy": "adaptive"}
-_NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}  # starts are good ones
+_NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}  # the starts are good
 _QUASI_NEWTON = {"hessian_approximation": "limited-memory", "max_iter": 100}
-# By form, what is tried: tolerance, options, and whether the functions are compiled.
+# Form -> settings to try: tolerance, options, and whether the functions are compiled.
 TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     "limits": (
         (1e-6, _PLAIN, True),
@@ -45,34 +45,36 @@ TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     ),
 }
 MOST_STEPS = 300
-AS_GOOD = 1e-3  # relative cost above the least, of nine cases in ten, that counts as none
+AS_GOOD = (
+    1e-3  # relative excess over the least objective, in nine of ten cases, that counts as equal
+)
 
 
 @dataclasses.dataclass
 class Batch:
-    """Cases as a peer gets them, and where it begins."""
+    """Parameters of cases, and starting points."""
 
-    told: np.ndarray  # (B, P), numbers of the cases
+    params: np.ndarray  # (B, P), parameters of the cases
     starts: np.ndarray  # (B, n)
 
 
 @dataclasses.dataclass
 class Solutions:
-    """Where IPOPT ended."""
+    """IPOPT's results."""
 
     points: np.ndarray  # (B, n)
-    objectives: np.ndarray  # (B,), its own
-    seconds: np.ndarray  # (B,) of processor time
+    objectives: np.ndarray  # (B,), IPOPT's own
+    seconds: np.ndarray  # (B,), CPU time
     steps: np.ndarray  # (B,)
     converged: np.ndarray  # (B,) bool
 
 
-def told_of(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
-    """What programs of a task's module are told about a batch of contexts, (B, P)."""
+def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
+    """Return the parameters of a task's programs for a batch of contexts, (B, P)."""
     contexts = jax.tree.map(np.asarray, contexts)
-    sizes = module.problem(planner).sizes
+    sizes = module.make_problem(planner).sizes
     num = jax.tree.leaves(contexts)[0].shape[0]
-    each = (module.told(take(contexts, k)) for k in range(num))
+    each = (module.read_params(take(contexts, k)) for k in range(num))
     return np.stack([np.concatenate([np.ravel(one[name]) for name in sizes]) for one in each])
 
 
@@ -80,17 +82,17 @@ class Peer:
     """IPOPT on a planner's problem in one form.
 
     Args:
-        module: that writes the task's problem down, `hits` or `catches`.
+        module: defines the task's problem, `hits` or `catches`.
         planner: an `ExactHit` or `ExactCatch`.
-        form: "limits" has them as constraints, "penalties" minimises the planner's own objective.
-        unit: a usual cost; IPOPT's tolerances are told relative to it.
-        compiled: whether the functions are there as compiled C code too, if there is a compiler.
+        form: "limits" has limits as constraints, "penalties" minimises the planner's own objective.
+        unit: a typical cost; IPOPT's tolerances are relative to it.
+        compiled: whether to compile the functions as C code too, if there is a compiler.
     """
 
     def __init__(
         self, module: ModuleType, planner: Any, form: str, unit: float, compiled: bool = True
     ):
-        problem, penalised = module.problem(planner), form == "penalties"
+        problem, penalised = module.make_problem(planner), form == "penalties"
         self.form, self._scale, began = form, 1.0 / unit, time.perf_counter()
         self.programs = {False: Program(problem, penalised, BETWEEN_NODES)}
         self.build_seconds, began = time.perf_counter() - began, time.perf_counter()
@@ -101,15 +103,15 @@ class Peer:
     def solve(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch, repeat: int = 1
     ) -> Solutions:
-        """Solve all cases, each as fast as the fastest of some tries."""
+        """Solve all cases; the time of each case is the fastest of `repeat` tries."""
         solver, options = self._solver(setting)
-        solver(batch.starts[0], batch.told[0])  # IPOPT's first call sets things up
+        solver(batch.starts[0], batch.params[0])  # IPOPT's first call initialises it
         found, seconds = [], np.full(len(batch.starts), np.inf)
         for _ in range(repeat):
             found = []
-            for k, (start, told) in enumerate(zip(batch.starts, batch.told, strict=True)):
+            for k, (start, params) in enumerate(zip(batch.starts, batch.params, strict=True)):
                 began = time.process_time()
-                result, stats = solver(start, told)
+                result, stats = solver(start, params)
                 seconds[k] = min(seconds[k], time.process_time() - began)
                 found.append((np.ravel(np.asarray(result["x"])), float(result["f"]), stats))
         points, objectives, stats = zip(*found, strict=True)
@@ -124,15 +126,15 @@ class Peer:
     def iterates(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch
     ) -> list[np.ndarray]:
-        """The points (steps + 1, n) that each search goes through; not timed."""
+        """Return the iterates (steps + 1, n) of each search; not timed."""
         size = batch.starts.shape[1]
         program = self.programs[False]
-        callback = _Recorder(size, program.num_constraints, batch.told.shape[1])
+        callback = _Recorder(size, program.num_constraints, batch.params.shape[1])
         solver, _ = self._solver(setting, callback)
         paths = []
-        for start, told in zip(batch.starts, batch.told, strict=True):
+        for start, params in zip(batch.starts, batch.params, strict=True):
             callback.points.clear()
-            solver(start, told)
+            solver(start, params)
             paths.append(np.stack(callback.points))
         return paths
 
@@ -144,13 +146,13 @@ class Peer:
 
 
 class _Recorder(ca.Callback):
-    """Keeps the points that IPOPT comes through."""
+    """Callback that stores the iterates of IPOPT."""
 
-    def __init__(self, size: int, constraints: int, told: int):
+    def __init__(self, size: int, constraints: int, params: int):
         ca.Callback.__init__(self)
         self.points: list[np.ndarray] = []
         self._sizes = {"x": size, "f": 1, "g": constraints, "lam_x": size}
-        self._sizes |= {"lam_g": constraints, "lam_p": told}
+        self._sizes |= {"lam_g": constraints, "lam_p": params}
         self.construct("recorder", {})
 
     def get_n_in(self):
@@ -174,15 +176,15 @@ class _Recorder(ca.Callback):
 
 
 def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
-    """The quickest setting that is as good as any: by the referee, and by the peer's own objective.
+    """Return the fastest setting with the highest success rate and a near-minimal objective.
 
     Args:
         peer: whose settings are tried.
-        batch: cases that nothing else is measured on.
-        accepted: of points (B, n), which the referee passes, (B,) bool.
+        batch: cases that are used for tuning only.
+        accepted: function of points (B, n); returns which of them the referee accepts, (B,) bool.
 
     Returns:
-        The setting, and a row of figures for each that was tried.
+        The setting, and a row of figures for each tried setting.
     """
     tried = [each for each in TRIED[peer.form] if each[2] in peer.programs]
     found = [peer.solve(each, batch) for each in tried]

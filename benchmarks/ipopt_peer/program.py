@@ -1,13 +1,14 @@
-"""The nonlinear program of one minimum-snap segment, its derivatives exact, for IPOPT.
+"""The nonlinear program of one minimum-snap segment with exact derivatives, for IPOPT.
 
-A planner's decision variables x are whitened waypoint offsets and a few variables of the ends, as
-`ExactHit` and `ExactCatch` have them. The ends make boundary rows R and the mean duration h of a
-piece; rows and offsets are the columns C of the trajectory, and constant matrices times C are its
-samples in time over h. So the ends are one small function, and a sample's limits another one:
+As in `ExactHit` and `ExactCatch`, the decision variables x are whitened waypoint offsets and a few
+variables of the ends. The ends determine boundary rows R and the mean duration h of a piece. Rows
+and offsets are the columns C of the trajectory, and its samples in time over h are constant
+matrices times C. Hence the ends are one small function, and the limits of a sample another one.
 CasADi differentiates both symbolically, and the chain rule through the matrices is written out
-here. Differentiated as a whole the graph would be a hundred times larger, and IPOPT slower.
+here. If CasADi differentiated the whole program, the graph would be a hundred times larger, and
+IPOPT slower.
 
-Shares no code with the planners but the trajectory's constant matrices and the settings.
+Shares only the constant matrices of the trajectory and the settings with the planners.
 """
 
 import dataclasses
@@ -24,38 +25,39 @@ from planner_jax.cost.penalty import join_trapezoid_weights
 
 ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
 
-ORDERS = 4  # position to jerk
-# Of a sample: height, velocity, acceleration, jerk, each as (order, axis).
+ORDERS = 4  # from the extra `oracle`
+# Components of a sample: height, velocity, acceleration, jerk, each as (order, axis).
 PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
 COMPILER = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-shared")
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """What a task asks of a segment; all functions take and give CasADi's symbols.
+    """Definition of a task's segment; all functions take and return CasADi symbols.
 
-    `told` is a dict of the numbers of a case by name, as in `sizes`.
+    `params` is a dict of the parameters of a case by name, as in `sizes`.
     """
 
     planner: Any  # an `ExactHit` or `ExactCatch`, for its settings
-    sizes: dict[str, int]  # what a program is told about a case, and how many numbers that is
-    num_natural: int  # variables of the ends
-    # Of those variables and `told`: tail state (4, 3), duration [s], list of excesses, and cost.
+    sizes: dict[str, int]  # parameters of a case, and their numbers of values
+    num_natural: int  # number of variables of the ends
+    # Function of these variables and `params`: tail state (4, 3), duration [s], list of excesses,
+    # cost.
     ends: Callable[[Any, dict], tuple[Any, Any, list, Any]]
-    # Of height, velocity, acceleration, jerk at a sample and `told`: list of excesses.
+    # Function of height, velocity, acceleration, jerk at a sample and `params`: list of excesses.
     limits: Callable[[Any, Any, Any, Any, dict], list]
-    factors: tuple[float, ...]  # of the planner's margin, for each of these excesses
-    impact_weight: float  # [s], of the hinges of the ends
+    factors: tuple[float, ...]  # factors of the planner's margin, for each of these excesses
+    impact_weight: float  # [s], weight of the hinges of the ends
 
 
 def hinge(x: Any, width: float) -> Any:
-    """The smoothed hinge of [Yu2023catch, eq. 27b]."""
+    """Return the smoothed hinge of [Yu2023catch, eq. 27b]."""
     blend = (width - 0.5 * x) * (x / width) ** 3
     return ca.if_else(x <= 0.0, 0.0, ca.if_else(x < width, blend, x - 0.5 * width))
 
 
 def rate_squared(acc: Any, jerk: Any, gravity: Any) -> Any:
-    """|omega|^2 of the Hopf fibration at zero heading, from flatness."""
+    """Return |omega|^2 of the Hopf fibration at zero heading, by differential flatness."""
     thrust = acc + ca.vertcat(0.0, 0.0, gravity)
     squared = ca.fmax(ca.sumsqr(thrust), 1e-4)
     size = ca.sqrt(squared)
@@ -64,21 +66,20 @@ def rate_squared(acc: Any, jerk: Any, gravity: Any) -> Any:
     return tilt + (twist / ca.fmax(size + thrust[2], 1e-2)) ** 2
 
 
-def across(axis: Any) -> tuple[Any, Any]:
-    """The body x and y axes at zero heading for a body z axis."""
+def body_axes(axis: Any) -> tuple[Any, Any]:
+    """Return the body x and y axes at zero heading for a body z axis."""
     x, y, z = axis[0], axis[1], axis[2]
     k = 1.0 / ca.fmax(1.0 + z, 1e-6)
     return ca.vertcat(1.0 - k * x * x, -k * x * y, -x), ca.vertcat(-k * x * y, 1.0 - k * y * y, -y)
 
 
 class Program:
-    """The program of a problem, built once for all of its cases.
+    """Program of a problem, built once for all of its cases.
 
     Args:
         problem: of a task.
-        penalised: whether limits are the planner's own penalties in the objective, and not
-            constraints.
-        backoff: by which excesses have to stay below zero where they are constraints.
+        penalised: whether limits are the planner's own penalties in the objective, not constraints.
+        backoff: excesses must be below -backoff if they are constraints.
         compiled: whether functions are compiled C code, or run by CasADi's virtual machine.
     """
 
@@ -91,7 +92,7 @@ class Program:
         self._matrices = [ca.DM(self._maps.sample_matrix(planner.nodes, d)) for d in range(ORDERS)]
         weights = join_trapezoid_weights(planner.nodes, self._maps.proportions)
         self._weights, self.num_samples = ca.DM(weights).T, len(weights)
-        self.num_told = sum(problem.sizes.values())
+        self.num_params = sum(problem.sizes.values())
         self._power = 2 * self._maps.order - 1
         self._own = planner.energy_weight * self._maps.offset_energy
         self._lay_out()
@@ -100,10 +101,10 @@ class Program:
         self.worst = self._worst()
         self.functions = [self._nlp(), self._gradient(), self._jacobian(), self._hessian()]
         if compiled:
-            self.functions = self._as_machine_code()
+            self.functions = self._compile()
 
     def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
-        """IPOPT on this program: a function of a start and of what is told, to CasADi's results."""
+        """Return IPOPT on this program: a function of a start and parameters."""
         nlp, gradient, jacobian, hessian = self.functions
         settings: dict[str, Any] = {"print_level": 0, "sb": "yes", "linear_solver": "mumps"}
         given: dict[str, Any] = {"ipopt": settings | options, "print_time": False}
@@ -117,22 +118,22 @@ class Program:
         solve = ca.nlpsol("segment", "ipopt", nlp, given)
         least = -np.inf if self.num_constraints else []
 
-        def solved(start: np.ndarray, told: np.ndarray) -> tuple[dict, dict]:
-            found = solve(x0=start, p=told, lbg=least, ubg=-self.backoff)
+        def solve_case(start: np.ndarray, params: np.ndarray) -> tuple[dict, dict]:
+            found = solve(x0=start, p=params, lbg=least, ubg=-self.backoff)
             return found, solve.stats()
 
-        return solved
+        return solve_case
 
     def _split(self, vector: Any) -> dict:
-        """What is told, by name."""
+        """Split the parameters by name."""
         ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
 
     def _lay_out(self) -> None:
-        """Which columns of the trajectory are where.
+        """Define the order of the columns of the trajectory.
 
-        Columns are counted axis by axis, each with its rows and then its offsets; x has the offsets
-        waypoint by waypoint. The outer ones are offsets, the inner ones rows and then h.
+        Columns are ordered by axis, for each axis rows and then offsets. x has the offsets ordered
+        by waypoint. The outer columns are the offsets, the inner ones are rows and then h.
         """
         planner, rows = self.problem.planner, 2 * ORDERS
         inside = planner.num_pieces - 1
@@ -144,14 +145,14 @@ class Program:
         self._scale = ca.DM(planner.scale).T
 
     def _build_ends(self) -> None:
-        """The function of the ends, with slopes and the bend of any sum of what it gives.
+        """Build the function of the ends, its slopes, and the Hessian of weighted outputs.
 
-        It gives rows axis by axis and the duration, cost, and excesses.
+        The outputs are rows by axis and the duration, cost, and excesses.
         """
         problem, planner = self.problem, self.problem.planner
         natural = ca.SX.sym("natural", problem.num_natural)
-        told = ca.SX.sym("told", self.num_told)
-        named = self._split(told)
+        params = ca.SX.sym("params", self.num_params)
+        named = self._split(params)
         tail, time, excess, cost = problem.ends(natural, named)
         duration, excess = time / planner.num_pieces, ca.vertcat(*excess)
         head = ca.reshape(named["head_state"], 3, ORDERS).T
@@ -170,23 +171,23 @@ class Program:
         weights = ca.SX.sym("weights", together.numel())
         slopes = ca.densify(ca.jacobian(together, natural))
         bend = ca.densify(ca.hessian(ca.dot(weights, together), natural)[0])
-        given, found = [natural, told], [outward, core, excess]
+        given, found = [natural, params], [outward, core, excess]
         self._ends = ca.Function("ends", given, found)
         self._ends_slopes = ca.Function("ends_slopes", given, [*found, slopes])
         self._ends_bend = ca.Function("ends_bend", [*given, weights], [bend])
 
     def _build_limits(self) -> None:
-        """The functions of a sample's limits, for all samples at once.
+        """Build the functions of a sample's limits, mapped over all samples.
 
-        They take the sample in time over h, h, and what is told. Where limits are penalties, one
-        value stands for them all: the sum of their hinges times h.
+        Their inputs are the sample in time over h, h, and the parameters. If limits are penalties,
+        they are one value: the sum of their hinges times h.
         """
         planner, factors = self.problem.planner, self.problem.factors
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
-        told = ca.SX.sym("told", self.num_told)
+        params = ca.SX.sym("params", self.num_params)
         at = [unit[i] / h**order for i, (order, _) in enumerate(PLACES)]
         vel, acc, jerk = (ca.vertcat(*at[i : i + 3]) for i in (1, 4, 7))
-        limits = ca.vertcat(*self.problem.limits(at[0], vel, acc, jerk, self._split(told)))
+        limits = ca.vertcat(*self.problem.limits(at[0], vel, acc, jerk, self._split(params)))
         values = limits
         if self.penalised:
             inside = limits + planner.margin * ca.DM(factors)
@@ -202,63 +203,63 @@ class Program:
         self._slope_places = list(zip(*slopes.sparsity().get_triplet(), strict=True))
         self._bend_places = list(zip(*bend.sparsity().get_triplet(), strict=True))
 
-        def mapped(name: str, given: list, found: list) -> Any:
-            of_sample = ca.Function(name, [unit, h, told, *given], found)
+        def map_samples(name: str, given: list, found: list) -> Any:
+            of_sample = ca.Function(name, [unit, h, params, *given], found)
             return of_sample.map(f"{name}_map", "serial", self.num_samples, [1, 2], [])
 
         filled = lambda matrix: ca.vertcat(*matrix.nonzeros())  # noqa: E731
-        self._limits = mapped("limits", [], [limits])
-        self._values = mapped("values", [], [values])
-        self._slopes = mapped("slopes", [], [values, filled(slopes)])
-        self._bends = mapped("bends", [multipliers], [ca.densify(gradient), filled(bend)])
+        self._limits = map_samples("limits", [], [limits])
+        self._values = map_samples("values", [], [values])
+        self._slopes = map_samples("slopes", [], [values, filled(slopes)])
+        self._bends = map_samples("bends", [multipliers], [ca.densify(gradient), filled(bend)])
 
     def _point(self) -> tuple[Any, Any, Any, Any]:
-        """Symbols of x and of what is told; variables of the ends, and offsets (M - 1, 3)."""
+        """Return symbols of x and parameters; variables of the ends, and offsets (M - 1, 3)."""
         num = self.problem.planner.num_offsets
-        x, told = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("told", self.num_told)
+        x, params = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("params", self.num_params)
         natural = x * self._scale.T
-        return x, told, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
+        return x, params, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
 
     def _columns(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
-        """Columns (C, 3) and h, from what the ends give and the offsets."""
+        """Return columns (C, 3) and h, from the outputs of the ends and the offsets."""
         rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
         return columns, outward[3 * rows]
 
     def _offset_energy(self, offsets: Any, h: Any) -> Any:
-        """What the energy of the offsets costs."""
+        """Return the energy cost of the offsets."""
         return self._own * ca.sumsqr(offsets) / h**self._power
 
     def _to_x(self, by_outer: Any, by_natural: Any) -> Any:
-        """Slopes (R, n) by x, from those by offsets axis by axis and by the ends' variables."""
+        """Convert slopes by offsets, ordered by axis, and by ends to slopes (R, n) by x."""
         wide = ca.horzcat(by_outer[:, self._place], by_natural)
         return wide * ca.repmat(self._scale, wide.shape[0], 1)
 
     def _worst(self) -> Any:
-        """The greatest excess at a point, of samples and ends."""
-        x, told, natural, offsets = self._point()
-        outward, _, at_ends = self._ends(natural, told)
+        """Build the function of the largest excess at a point, over samples and ends."""
+        x, params, natural, offsets = self._point()
+        outward, _, at_ends = self._ends(natural, params)
         columns, h = self._columns(outward, offsets)
-        limits = self._limits(self._unit(columns), h, told)
-        return ca.Function("worst", [x, told], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
+        limits = self._limits(self._unit(columns), h, params)
+        return ca.Function("worst", [x, params], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
 
     def _nlp(self) -> Any:
-        """Objective and constraints: limit by limit at all samples, then at the ends."""
-        x, told, natural, offsets = self._point()
-        outward, core, at_ends = self._ends(natural, told)
+        """Build objective and constraints: limit by limit at all samples, then at the ends."""
+        x, params, natural, offsets = self._point()
+        outward, core, at_ends = self._ends(natural, params)
         columns, h = self._columns(outward, offsets)
-        values = self._values(self._unit(columns), h, told)
+        values = self._values(self._unit(columns), h, params)
         f, g = core + self._offset_energy(offsets, h), ca.MX(0, 1)
         if self.penalised:
             f = f + ca.sum2(values * self._weights)
         else:
             g = ca.vertcat(ca.vec(values.T), at_ends)
-        return ca.Function("nlp", [x, told], [f, g], ["x", "p"], ["f", "g"])
+        return ca.Function("nlp", [x, params], [f, g], ["x", "p"], ["f", "g"])
 
     def _gradient(self) -> Any:
-        """The objective and its slopes by x."""
-        x, told, natural, offsets = self._point()
-        outward, core, _, by_natural = self._ends_slopes(natural, told)
+        """Build the objective and its slopes by x."""
+        x, params, natural, offsets = self._point()
+        outward, core, _, by_natural = self._ends_slopes(natural, params)
         columns, h = self._columns(outward, offsets)
         energy, num_in = self._offset_energy(offsets, h), len(self._inner) + 1
         f = core + energy
@@ -266,21 +267,21 @@ class Program:
         by_inner, by_h = ca.MX.zeros(1, len(self._inner)), -self._power * energy / h
         if self.penalised:
             unit = self._unit(columns)
-            f = f + ca.sum2(self._values(unit, h, told) * self._weights)
-            of_samples, _ = self._bends(unit, h, told, self._weights)
+            f = f + ca.sum2(self._values(unit, h, params) * self._weights)
+            of_samples, _ = self._bends(unit, h, params, self._weights)
             by_columns = self._columns_of(of_samples)
             by_outer, by_inner = by_outer + by_columns[:, self._outer], by_columns[:, self._inner]
             by_h = by_h + ca.sum2(of_samples[len(PLACES), :])
         inward = ca.horzcat(by_inner, by_h) @ by_natural[:num_in, :] + by_natural[num_in, :]
         gradient = self._to_x(by_outer, inward).T
-        return ca.Function("gradient", [x, told], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
+        return ca.Function("gradient", [x, params], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
 
     def _jacobian(self) -> Any:
-        """The constraints and their slopes by x."""
-        x, told, natural, offsets = self._point()
-        outward, _, at_ends, by_natural = self._ends_slopes(natural, told)
+        """Build the constraints and their slopes by x."""
+        x, params, natural, offsets = self._point()
+        outward, _, at_ends, by_natural = self._ends_slopes(natural, params)
         columns, h = self._columns(outward, offsets)
-        values, slopes = self._slopes(self._unit(columns), h, told)
+        values, slopes = self._slopes(self._unit(columns), h, params)
         g, jacobian = ca.MX(0, 1), ca.MX(0, x.numel())
         if not self.penalised:
             num_in, blocks = len(self._inner) + 1, []
@@ -291,13 +292,13 @@ class Program:
             none = ca.MX.zeros(self._num_at_ends, len(self._outer))
             blocks.append(self._to_x(none, by_natural[num_in + 1 :, :]))
             g, jacobian = ca.vertcat(ca.vec(values.T), at_ends), ca.vertcat(*blocks)
-        return ca.Function("jacobian", [x, told], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
+        return ca.Function("jacobian", [x, params], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
 
     def _hessian(self) -> Any:
-        """The upper triangle of the Hessian of the Lagrangian by x."""
-        x, told, natural, offsets = self._point()
+        """Build the upper triangle of the Hessian of the Lagrangian by x."""
+        x, params, natural, offsets = self._point()
         of_f, of_g = ca.MX.sym("of_f"), ca.MX.sym("of_g", self.num_constraints)
-        outward, _, _, by_natural = self._ends_slopes(natural, told)
+        outward, _, _, by_natural = self._ends_slopes(natural, params)
         columns, h = self._columns(outward, offsets)
         if self.penalised:
             multipliers, at_ends = of_f * self._weights, ca.MX.zeros(self._num_at_ends, 1)
@@ -305,9 +306,9 @@ class Program:
             count = self._num_values * self.num_samples
             multipliers = ca.reshape(of_g[:count], self.num_samples, self._num_values).T
             at_ends = of_g[count:]
-        of_samples, bends = self._bends(self._unit(columns), h, told, multipliers)
+        of_samples, bends = self._bends(self._unit(columns), h, params, multipliers)
         by_columns, full = self._columns_of(of_samples), self._hessian_of_columns(bends)
-        # The energy of the offsets adds to what the samples make.
+        # The energy of the offsets is added to the contribution of the samples.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
         num_out, num_in = len(self._outer), len(self._inner) + 1
@@ -321,7 +322,7 @@ class Program:
         by_h = ca.sum2(of_samples[len(PLACES), :]) - power * energy / h
         weights = ca.vertcat(by_columns[:, self._inner].T, by_h, of_f, at_ends)
         chain = by_natural[:num_in, :]
-        of_natural = chain.T @ of_inner @ chain + self._ends_bend(natural, told, weights)
+        of_natural = chain.T @ of_inner @ chain + self._ends_bend(natural, params, weights)
         mixed = (mixed @ chain)[self._place, :]
         hessian = ca.vertcat(
             ca.horzcat(of_outer[self._place, self._place], mixed),
@@ -329,10 +330,10 @@ class Program:
         )
         hessian = ca.triu(hessian * (self._scale.T @ self._scale))
         names = ["x", "p", "lam_f", "lam_g"]
-        return ca.Function("hessian", [x, told, of_f, of_g], [hessian], names, ["hess"])
+        return ca.Function("hessian", [x, params, of_f, of_g], [hessian], names, ["hess"])
 
     def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
-        """Slopes of one value at all samples by columns axis by axis (K, 3 C), and by h (K, 1)."""
+        """Return slopes of one value at all samples, by columns (K, 3 C), and by h (K, 1)."""
         parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
         by_h = ca.MX.zeros(self.num_samples, 1)
         for k, (i, j) in enumerate(self._slope_places):
@@ -345,24 +346,24 @@ class Program:
         return ca.horzcat(*parts), by_h
 
     def _unit(self, columns: Any) -> Any:
-        """The samples (10, K) in time over h of columns (C, 3)."""
+        """Return the samples (10, K) in time over h of columns (C, 3)."""
         sampled = [matrix @ columns for matrix in self._matrices]
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
 
     def _columns_of(self, of_samples: Any) -> Any:
-        """Slopes (1, 3 C) by columns axis by axis, from those (11, K) by the samples."""
+        """Convert slopes (11, K) by the samples to slopes (1, 3 C) by columns, ordered by axis."""
         parts = [ca.MX.zeros(1, self._num_columns)] * 3
         for i, (order, axis) in enumerate(PLACES):
             parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
         return ca.horzcat(*parts)
 
     def _hessian_of_columns(self, bends: Any) -> Any:
-        """The Hessian (3 C + 1, 3 C + 1) by columns axis by axis and h, from those of samples."""
+        """Convert Hessians of samples to a Hessian (3 C + 1, 3 C + 1) by columns and h."""
         last, num = len(PLACES), self._num_columns
         factors = {place: bends[k, :].T for k, place in enumerate(self._bend_places)}
         sizes = (num, num, num, 1)
         blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # By sample and other place in turn, so that each product with a matrix is made but once.
+        # Ordered such that each product with a matrix is computed only once.
         for i, (order, axis) in enumerate(PLACES):
             inside: dict[int, Any] = {}
             for j, (other, of) in enumerate(PLACES):
@@ -379,8 +380,8 @@ class Program:
         lower = lambda a, b: blocks[a][b] if a <= b else blocks[b][a].T  # noqa: E731
         return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
 
-    def _as_machine_code(self) -> list:
-        """The functions, compiled; loaded, they need their file no more."""
+    def _compile(self) -> list:
+        """Return the functions compiled and loaded; their temporary file may be deleted."""
         code = ca.CodeGenerator("program.c")
         for function in self.functions:
             code.add(function)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import planner_jax as pj
-from planner_jax.benchmarks.poisoned_batches import compare, poisoned, poisons
+from planner_jax.benchmarks.poisoned_batches import compare, poison, poisons
 from planner_jax.core.rules import is_sound, part_at
 from planner_jax.task.catch.decide import MOST_SEARCHED
 
@@ -41,7 +41,7 @@ def test_every_broken_rule_marks_its_lane_alone_in_both_forms(name):
     bad = poisons(pj.take(cases, 0))
     whole = jax.tree.map(lambda leaf: np.repeat(leaf[:1], 2 * len(bad), axis=0), cases)
     lanes = np.arange(0, 2 * len(bad), 2)
-    broken = poisoned(whole, lanes)
+    broken = poison(whole, lanes)
     expected = np.arange(2 * len(bad)) % 2 == 1
     np.testing.assert_array_equal(is_sound(broken), expected)
     np.testing.assert_array_equal(SOUND(broken), expected)
