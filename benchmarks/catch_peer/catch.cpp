@@ -1,4 +1,4 @@
-// One quadrotor that catches one ball: the published problem of the catch planner, by L-BFGS.
+// Plan how one quadrotor catches one ball: the published problem of the catch planner, by L-BFGS.
 //
 //     catch FILE [name=value ...]
 //
@@ -8,18 +8,18 @@
 // zero. The cost is the integral of |snap|^2, 1000 T, and penalties of speed, body rate, thrust
 // and height at 16 intervals a piece, of the net's distance from the ball and of its angle.
 //
-// With relative=1 the variables are others, and the optima the same: whitened offsets of the
-// waypoints from the smoothest way to the tail, and the net's position relative to the ball.
-// With memory=0 the search is that of BFGS with a dense matrix, for which 19 variables are few.
+// With relative=1 the optima are the same, but the variables are whitened offsets of the waypoints
+// from the smoothest trajectory to the tail, and the net's position relative to the ball. With
+// memory=0 the search is BFGS with a dense matrix, which is small for 19 variables.
 //
-// The program plans all cases of the file, one after another, some times over, and prints the
-// processor time of the quickest round (without reading and printing), then a line for each case.
+// The program plans all cases of the file, one after another, in several rounds. It prints the CPU
+// time of the fastest round (without reading and printing), then a line for each case.
 //
-// How it is made quick: in time over the duration h of a piece the spline is a constant linear map
-// of six rows, the waypoints and (p, v h, a h^2) at T, all from the head, because what is at rest
-// there adds nothing. Samples lie side by side in vectors; bounds that take neither root nor
-// division tell most vectors without a limit exceeded, and these have no gradient. Nothing is
-// allocated while planning.
+// Three choices make it fast. In time over the duration h of a piece, the spline is a constant
+// linear map of six rows: the waypoints and (p, v h, a h^2) at T, all relative to the head, whose
+// derivatives are zero. Samples are processed in vectors. Bounds without a root or a division
+// exclude most vectors, in which no limit is exceeded and the gradient is zero. Planning allocates
+// no memory.
 
 #include <algorithm>
 #include <array>
@@ -47,7 +47,7 @@ typedef double Vec __attribute__((vector_size(8 * kWidth)));
 constexpr int kPieces = 4;
 constexpr int kNodes = 16;                      // penalty intervals a piece
 constexpr int kDegree = 7;                      // of minimum snap
-constexpr int kSamples = kPieces * kNodes;      // without the head, where nothing moves
+constexpr int kSamples = kPieces * kNodes;      // without the head, which is at rest
 constexpr int kBlocks = kSamples / kWidth;
 constexpr int kInner = kPieces - 1;             // waypoints
 constexpr int kColumns = kInner + 3;            // waypoints, then p, v, a at the tail
@@ -64,7 +64,7 @@ constexpr double kLimitWeight = 1e5;
 constexpr double kGroundWeight = 1e7;
 constexpr double kMissWeight = 1e4;
 constexpr double kAngleWeight = 1e2;
-constexpr double kWidthOfHinge = 0.01;          // mu, and eps of the angle
+constexpr double kWidthOfHinge = 0.01;          // mu of the hinge, and eps of the angle
 constexpr double kMostSpeed = 5.0;
 constexpr double kMostRate = 5.0;
 constexpr double kMiddleThrust = 1.4 * kGravity;
@@ -77,7 +77,7 @@ constexpr double kNetRadius = 0.125;
 const double kSafeCosine = std::cos(std::acos(-1.0) / 6.0);
 constexpr double kHead[3] = {0.0, 0.0, 1.0};
 
-// Where the variables stand: waypoints by axis, log T, position, velocity, acceleration.
+// Order of the variables: waypoints by axis, log T, position, velocity, acceleration.
 constexpr int kLogTime = 9, kPosition = 10, kVelocity = 13, kAcceleration = 16;
 
 struct alignas(64) Point {
@@ -121,7 +121,7 @@ inline void add(Point& to, double factor, const Point& what) {
     for (int i = 0; i < kRegisters; ++i) to.reg[i] += factor * what.reg[i];
 }
 
-// The factor that differentiation of the given order puts before power k.
+// The factor of power k after differentiation of the given order.
 double falling(int k, int order) {
     double factor = 1.0;
     for (int i = 0; i < order; ++i) factor *= k - i;
@@ -130,12 +130,12 @@ double falling(int k, int order) {
 
 // Constant matrices of the spline, in time over the duration of a piece.
 struct Spline {
-    const bool relative;  // whether the first columns are offsets, not waypoints
+    const bool relative;  // whether the first columns are offsets instead of waypoints
     double coefficients[kPieces][kDegree + 1][kColumns];
     alignas(64) Vec samples[kBlocks][4][kColumns];  // by order of the derivative
     double energy[kColumns][kColumns];  // triangular: the energy is |energy . columns|^2
-    double offsets[kInner][kColumns];   // of waypoints and tail; their energy is their square
-    Vec weights[kBlocks];  // of the trapezoid rule, of a piece's duration
+    double offsets[kInner][kColumns];   // from waypoints and tail; the energy is the squared norm
+    Vec weights[kBlocks];  // of the trapezoid rule, relative to a piece's duration
 
     explicit Spline(bool relative) : relative(relative) {
         solve();
@@ -152,7 +152,7 @@ struct Spline {
         }
     }
 
-    // A derivative at a time from 0 to 4, as a linear form of the columns.
+    // A derivative at a time between 0 and 4, as a linear form of the columns.
     std::array<double, kColumns> row(double time, int order) const {
         const int piece = std::min(int(time), kPieces - 1);
         const double inside = time - piece;
@@ -165,8 +165,8 @@ struct Spline {
     }
 
   private:
-    // The coefficients, from rest at the head, the tail, the waypoints, and six continuous
-    // derivatives at each of them.
+    // The coefficients. Equations: rest at the head, the tail, the waypoints, and six continuous
+    // derivatives at each waypoint.
     void solve() {
         constexpr int size = kPieces * (kDegree + 1);
         std::vector<std::array<double, size + kColumns>> rows;
@@ -195,7 +195,7 @@ struct Spline {
                 put(smooth, joint, 0.0, order, -1.0);
             }
         }
-        for (int i = 0; i < size; ++i) {  // Gauss and Jordan, with the greatest pivot
+        for (int i = 0; i < size; ++i) {  // Gauss-Jordan elimination with partial pivoting
             const auto by_size = [i](const auto& a, const auto& b) {
                 return std::abs(a[i]) < std::abs(b[i]);
             };
@@ -212,8 +212,8 @@ struct Spline {
                     rows[i][size + c] / rows[i][i];
     }
 
-    // A triangular root of the energy's matrix. From the snap itself, at four Gauss points a
-    // piece, by Gram and Schmidt: the matrix would lose small energies to rounding.
+    // A triangular square root of the energy's matrix, by Gram-Schmidt on the snap at four Gauss
+    // points a piece. The matrix itself would lose small energies to rounding.
     void factorise() {
         const double points[2] = {0.3399810435848563, 0.8611363115940526};
         const double shares[2] = {0.6521451548625461, 0.3478548451374538};
@@ -241,7 +241,7 @@ struct Spline {
             std::copy_n(energy[i], kColumns, offsets[i]);
     }
 
-    // Offsets in the place of waypoints: what the first rows of the energy's root make of them.
+    // Replace waypoints by offsets: apply the first rows of the energy's root.
     void change_columns() {
         double waypoints[kInner][kColumns];
         for (int c = 0; c < kColumns; ++c)
@@ -273,7 +273,7 @@ struct Case {
     double guessed_time;
 };
 
-// A ball with linear drag, a time later; and its acceleration.
+// The state of a ball with linear drag after a time, and its acceleration.
 inline void fly(const Ball& ball, double time, double pos[3], double vel[3], double acc[3]) {
     const double rest = std::exp(-kDrag * time);
     for (int i = 0; i < 3; ++i) {
@@ -310,12 +310,12 @@ inline double steep(double x, double width, double& slope) {
     return width * width * width + beyond * beyond * x * unit;
 }
 
-// What happens at the end of a plan.
+// The catch at the end of a plan.
 struct Catch {
     double ball_pos[3], ball_vel[3], ball_acc[3];
     double axis[3], inverse_thrust;  // of the quadrotor
-    double miss[3];                  // from the ball to the net
-    double tail[3];                  // where the quadrotor is, from the head
+    double miss[3];                  // vector from the ball to the net
+    double tail[3];                  // position of the quadrotor relative to the head
 };
 
 inline Catch catch_at(const Spline& spline, const Case& task, const Point& x, double duration) {
@@ -335,7 +335,7 @@ inline Catch catch_at(const Spline& spline, const Case& task, const Point& x, do
     return found;
 }
 
-// What the spline is a linear map of.
+// The inputs of the spline's linear map.
 inline void fill_columns(const Spline& spline, const Point& x, const double tail[3], double h,
                          double columns[kColumns][3]) {
     for (int i = 0; i < 3; ++i) {
@@ -347,7 +347,7 @@ inline void fill_columns(const Spline& spline, const Point& x, const double tail
     }
 }
 
-// The cost and its gradient by the variables.
+// The cost and its gradient with respect to the variables.
 double cost_of(const Spline& spline, const Case& task, const Point& x, Point& slope) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
     const double rate = 1.0 / h;
@@ -356,7 +356,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     fill_columns(spline, x, at_end.tail, h, columns);
     double by_h = 0.0, by_time = kTimeWeight, cost = kTimeWeight * duration;
 
-    // Penalties along the way.
+    // Penalties along the trajectory.
     const double rates[4] = {1.0, rate, rate * rate, rate * rate * rate};
     Vec sums[kColumns][3] = {};
     Vec penalty{}, with_h{};
@@ -377,8 +377,8 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
         const Vec thrust2 = tx * tx + ty * ty + tz * tz;
         const Vec fast = v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - kMostSpeed * kMostSpeed;
         const Vec low = (kLeastHeight - kHead[2]) - z;
-        // Bounds that need neither root nor division: while the thrust points up, the squared
-        // body rate is at most twice that of the jerk over the thrust.
+        // Bounds without root or division: while the thrust points up, the squared body rate is at
+        // most twice the squared ratio of jerk and thrust.
         const Vec inside = larger(larger(thrust2 - kMostThrust * kMostThrust,
                                          kLeastThrust * kLeastThrust - thrust2),
                                   larger(2.0 * jerk2 - kMostRate * kMostRate * thrust2, -tz));
@@ -404,7 +404,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
         const Vec weight = spline.weights[block];
         penalty += weight * (kLimitWeight * (speed.value + turn.value + push.value) +
                              kGroundWeight * ground.value);
-        // Slopes by height, velocity, acceleration and jerk, times the sample's share of h.
+        // Slopes by height, velocity, acceleration and jerk, times the sample's weight and h.
         const Vec share = weight * (2.0 * kLimitWeight * h);
         const Vec by_speed = share * speed.slope, by_turn = share * turn.slope;
         const Vec by_push = share * push.slope * middle * inverse;
@@ -484,7 +484,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     for (int i = 0; i < 3; ++i) {
         const double by_tail = by_columns[kInner][i], by_miss = by_distance * at_end.miss[i];
         by_pos[i] = by_tail + by_miss;
-        // Slope by the place below the ball where the net's centre would meet it.
+        // Slope by the quadrotor's position at which the net's centre would meet the ball.
         const double by_below = spline.relative ? by_tail : -by_miss;
         by_axis[i] = by_angle * at_end.ball_vel[i] - kNetHeight * by_below;
         leaning += by_axis[i] * at_end.axis[i];
@@ -508,7 +508,8 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     return cost;
 }
 
-// From rest to rest below the ball at the guessed time, waypoints on the minimum-jerk way.
+// The initial guess: from rest to rest below the ball at the guessed time, with waypoints on the
+// minimum-jerk trajectory.
 Point guess_of(const Spline& spline, const Case& task) {
     Point x{};
     double ball[3], vel[3], acc[3];
@@ -535,11 +536,11 @@ Point guess_of(const Spline& spline, const Case& task) {
 struct Settings {
     int memory = 48;          // pairs of L-BFGS; 0 for the dense matrix of BFGS
     int past = 10;            // iterations over which the cost is compared
-    double delta = 1e-7;      // relative change that ends the search
+    double delta = 1e-7;      // relative change of the cost that ends the search
     int most_steps = 1000;
     double decrease = 1e-4, curvature = 0.9;  // of the weak Wolfe conditions
-    int relative = 0;         // whether waypoints and position are relative
-    int interpolate = 0;      // whether trials within a bracket are cubic, not halves
+    int relative = 0;         // 1: relative variables, see above
+    int interpolate = 0;      // 1: cubic interpolation within a bracket, 0: bisection
     double scale_q = 1.0, scale_t = 1.0, scale_p = 1.0, scale_v = 1.0, scale_a = 1.0;
     int repeats = 3;
 };
@@ -550,7 +551,7 @@ struct Result {
     int iterations, evaluations;
 };
 
-// The search; one object serves all cases, so that nothing is allocated for any of them.
+// The search; one object is used for all cases, so that no case allocates memory.
 class Search {
   public:
     Search(const Spline& spline, const Settings& settings) : spline_(spline), given_(settings) {
@@ -619,7 +620,7 @@ class Search {
         return cost;
     }
 
-    // A step of weak Wolfe conditions by Lewis and Overton's bracket; sets the new point and cost.
+    // A weak Wolfe line search by Lewis and Overton; sets the new point and cost.
     bool search(const Case& task, const Point& x, double& cost, const Point& g,
                 const Point& direction, double step, Point& x_new, Point& g_new) {
         const double slope = dot(g, direction), begun = cost;
@@ -659,7 +660,7 @@ class Search {
         return cost < begun;
     }
 
-    // The direction of L-BFGS, by the two loops over the pairs.
+    // The direction of L-BFGS, by the two-loop recursion over the pairs.
     void limited(const Point& s, const Point& y, double ys, bool curved, const Point& g,
                  Point& direction) {
         if (curved) {
@@ -685,7 +686,7 @@ class Search {
         }
     }
 
-    // The direction of BFGS with a dense matrix; `direction` holds the one before, -H g.
+    // The direction of BFGS with a dense matrix; `direction` holds the previous one, -H g.
     void dense(const Point& s, const Point& y, double ys, bool curved, bool reset, const Point& g,
                const Point& g_new, Point& direction) {
         if (reset) {
@@ -725,7 +726,7 @@ class Search {
     int first_ = 0, count_ = 0, evaluations_ = 0;
 };
 
-// Whether 200 samples keep the limits, and the catch the net, with five per cent to spare.
+// Return whether 200 samples keep the limits, and the catch is in the net, within five per cent.
 bool succeeds(const Spline& spline, const Case& task, const Point& x) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
     const Catch at_end = catch_at(spline, task, x, duration);
