@@ -81,7 +81,7 @@ def command(settings: InterceptFly) -> str:
     return " ".join(["planner-jax fly intercept", *words])
 
 
-def drive(
+def run_drives(
     settings: InterceptFly, first_plans: dict[tuple, InterceptPlan]
 ) -> tuple[InterceptFlights, float]:
     """Run the drives of a row; return them with their duration [s].
@@ -126,7 +126,7 @@ def main() -> None:
             settings = InterceptFly(suite=args.suite, num=args.num, seed=args.seed, **options)
             commands.append(f"{row}: {command(settings)}")
             if settings not in lines:
-                lines[settings] = drive(settings, first_plans)
+                lines[settings] = run_drives(settings, first_plans)
             print(line(row, *lines[settings]), flush=True)
     print("\n".join(["", *commands]))
 

@@ -44,60 +44,60 @@ def make_problem(planner: Any) -> Problem:
         planner=planner,
         sizes=SIZES,
         num_natural=12,
-        ends=lambda natural, read_params: ends(natural, read_params, planner.time_weight),
+        ends=lambda natural, params: ends(natural, params, planner.time_weight),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 2.0, 1.0),
         impact_weight=planner.catch_weight,
     )
 
 
-def ball_at(time: Any, read_params: dict) -> tuple[Any, Any]:
+def ball_at(time: Any, params: dict) -> tuple[Any, Any]:
     """Return position and velocity of a ball with linear drag on each axis [Yu2023catch, eq. 9]."""
-    x = read_params["ball_drag"] * time
+    x = params["ball_drag"] * time
     small = ca.fabs(x) < 0.5
     near, far = ca.if_else(small, x, 0.0), ca.if_else(small, 1.0, x)
     series = sum((-near) ** k / float(math.factorial(k + 2)) for k in range(13))
     phi_2 = ca.if_else(small, series, (1.0 + ca.expm1(-far) / far) / far)
     phi_1 = 1.0 - x * phi_2
-    fall = ca.vertcat(0.0, 0.0, -read_params["ball_gravity"])
-    pos = read_params["ball_pos"] + read_params["ball_vel"] * time * phi_1 + fall * time**2 * phi_2
-    return pos, read_params["ball_vel"] * ca.exp(-x) + fall * time * phi_1
+    fall = ca.vertcat(0.0, 0.0, -params["ball_gravity"])
+    pos = params["ball_pos"] + params["ball_vel"] * time * phi_1 + fall * time**2 * phi_2
+    return pos, params["ball_vel"] * ca.exp(-x) + fall * time * phi_1
 
 
-def ends(natural: Any, read_params: dict, time_weight: float) -> tuple[Any, Any, list, Any]:
+def ends(natural: Any, params: dict, time_weight: float) -> tuple[Any, Any, list, Any]:
     """Return the end of a catch.
 
     The variables are log T, position in the net, velocity, acceleration and jerk. Returns tail
     state, duration, excesses and cost, as `Problem.ends`.
     """
     time, place = ca.exp(natural[0]), natural[1:3]
-    pos, vel = ball_at(time, read_params)
+    pos, vel = ball_at(time, params)
     acc = natural[6:9]
-    thrust = acc + ca.vertcat(0.0, 0.0, read_params["gravity"])
+    thrust = acc + ca.vertcat(0.0, 0.0, params["gravity"])
     axis = thrust / ca.norm_2(thrust)
     across_x, across_y = body_axes(axis)
-    place = place * RIM * read_params["radius"] / ca.sqrt(1.0 + ca.sumsqr(place))
-    centre = pos - read_params["height"] * axis
+    place = place * RIM * params["radius"] / ca.sqrt(1.0 + ca.sumsqr(place))
+    centre = pos - params["height"] * axis
     tail = ca.horzcat(
         centre - place[0] * across_x - place[1] * across_y,
         natural[3:6],
         acc,
         natural[9:12],
     ).T
-    angle = ca.fmax(read_params["max_angle"], 1e-3)
+    angle = ca.fmax(params["max_angle"], 1e-3)
     facing = -ca.dot(axis, vel) / ca.norm_2(vel)
     leaning = (ca.cos(angle) - facing) / (angle * ca.sin(angle))
-    late = time / read_params["horizon"] - 1.0 + FEASIBILITY_TOLERANCE
+    late = time / params["horizon"] - 1.0 + FEASIBILITY_TOLERANCE
     return tail, time, [leaning, late], time_weight * time
 
 
-def limits(height: Any, vel: Any, acc: Any, jerk: Any, read_params: dict) -> list:
+def limits(height: Any, vel: Any, acc: Any, jerk: Any, params: dict) -> list:
     """Return squares of speed, body rate and thrust over their limits, less one; and height."""
-    squared = ca.sumsqr(acc + ca.vertcat(0.0, 0.0, read_params["gravity"]))
+    squared = ca.sumsqr(acc + ca.vertcat(0.0, 0.0, params["gravity"]))
     return [
-        ca.sumsqr(vel) / read_params["speed"] ** 2 - 1.0,
-        rate_squared(acc, jerk, read_params["gravity"]) / read_params["body_rate"] ** 2 - 1.0,
-        1.0 - squared / read_params["min_thrust"] ** 2,
-        squared / read_params["max_thrust"] ** 2 - 1.0,
-        read_params["min_height"] - height,
+        ca.sumsqr(vel) / params["speed"] ** 2 - 1.0,
+        rate_squared(acc, jerk, params["gravity"]) / params["body_rate"] ** 2 - 1.0,
+        1.0 - squared / params["min_thrust"] ** 2,
+        squared / params["max_thrust"] ** 2 - 1.0,
+        params["min_height"] - height,
     ]

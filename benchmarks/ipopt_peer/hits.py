@@ -40,7 +40,7 @@ def make_problem(planner: Any) -> Problem:
         planner=planner,
         sizes=SIZES | {"path_pos": 3 * nodes, "path_vel": 3 * nodes},
         num_natural=8,
-        ends=lambda natural, read_params: ends(natural, read_params, nodes),
+        ends=lambda natural, params: ends(natural, params, nodes),
         limits=limits,
         factors=(2.0, 2.0, 2.0, 1.0),
         impact_weight=planner.impact_weight,
@@ -55,47 +55,47 @@ def keys_kernel(distance: Any) -> Any:
     return ca.if_else(u < 1.0, near, ca.if_else(u < 2.0, far, 0.0))
 
 
-def ball_at(time: Any, read_params: dict, nodes: int) -> tuple[Any, Any]:
+def ball_at(time: Any, params: dict, nodes: int) -> tuple[Any, Any]:
     """Interpolate position and velocity of the incoming ball [Yu2023bat, eqs 8 to 10]."""
-    inside = ca.fmin(ca.fmax(time, 0.0), read_params["resolution"] * (nodes - 3))
-    place = inside / read_params["resolution"] + 1.0
+    inside = ca.fmin(ca.fmax(time, 0.0), params["resolution"] * (nodes - 3))
+    place = inside / params["resolution"] + 1.0
     weights = keys_kernel(place - ca.DM(np.arange(nodes)))
-    vel = ca.reshape(read_params["path_vel"], 3, nodes) @ weights
-    return ca.reshape(read_params["path_pos"], 3, nodes) @ weights + vel * (time - inside), vel
+    vel = ca.reshape(params["path_vel"], 3, nodes) @ weights
+    return ca.reshape(params["path_pos"], 3, nodes) @ weights + vel * (time - inside), vel
 
 
-def ends(natural: Any, read_params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
+def ends(natural: Any, params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
     """Return the end of a hit.
 
     The variables are log T, log t_post, log thrust, two tangential speeds and jerk. Returns tail
     state, duration, excesses and cost, as `Problem.ends`.
     """
     time, flight, thrust = (ca.exp(natural[k]) for k in range(3))
-    gravity, up = read_params["gravity"], ca.DM([0.0, 0.0, 1.0])
-    pos, before = ball_at(time, read_params, nodes)
-    after = (read_params["target"] - pos) / flight + 0.5 * gravity * flight * up
+    gravity, up = params["gravity"], ca.DM([0.0, 0.0, 1.0])
+    pos, before = ball_at(time, params, nodes)
+    after = (params["target"] - pos) / flight + 0.5 * gravity * flight * up
     change = after - before
     normal = change / ca.norm_2(change)
-    beta = read_params["restitution"]
+    beta = params["restitution"]
     speed = ca.dot((beta * before + after) / (1.0 + beta), normal)
     across_x, across_y = body_axes(normal)
     tail = ca.horzcat(
-        pos - read_params["racket_height"] * normal,
+        pos - params["racket_height"] * normal,
         speed * normal + natural[3] * across_x + natural[4] * across_y,
         thrust * normal - gravity * up,
         natural[5:8],
     ).T
     apex = pos[2] + ca.fmax(after[2], 0.0) ** 2 / (2.0 * gravity)
-    hitting = (tail[1, :].T / read_params["hitting_speed"]) ** 2 - 1.0
-    excess = [1.0 - apex / read_params["min_apex"], apex / read_params["max_apex"] - 1.0]
+    hitting = (tail[1, :].T / params["hitting_speed"]) ** 2 - 1.0
+    excess = [1.0 - apex / params["min_apex"], apex / params["max_apex"] - 1.0]
     return tail, time, [*excess, *ca.vertsplit(hitting)], ca.SX(0.0)
 
 
-def limits(height: Any, vel: Any, acc: Any, jerk: Any, read_params: dict) -> list:
+def limits(height: Any, vel: Any, acc: Any, jerk: Any, params: dict) -> list:
     """Return squares of speed, acceleration, body rate over their limits, less one; and height."""
     return [
-        ca.sumsqr(vel) / read_params["speed"] ** 2 - 1.0,
-        ca.sumsqr(acc) / read_params["acceleration"] ** 2 - 1.0,
-        rate_squared(acc, jerk, read_params["gravity"]) / read_params["body_rate"] ** 2 - 1.0,
-        read_params["min_height"] - height,
+        ca.sumsqr(vel) / params["speed"] ** 2 - 1.0,
+        ca.sumsqr(acc) / params["acceleration"] ** 2 - 1.0,
+        rate_squared(acc, jerk, params["gravity"]) / params["body_rate"] ** 2 - 1.0,
+        params["min_height"] - height,
     ]
