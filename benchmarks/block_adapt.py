@@ -44,10 +44,10 @@ def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
         pj.plan(planner, case)
     seconds, busy, plans = [], [], []
     for case in lanes:
-        began, begun = time.perf_counter(), time.process_time()
+        began, cpu_began = time.perf_counter(), time.process_time()
         plans.append(pj.plan(planner, case))
         seconds.append(time.perf_counter() - began)
-        busy.append(time.process_time() - begun)
+        busy.append(time.process_time() - cpu_began)
     together: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
     success, claims = pj.block.judge(cases, together).success, pj.solved(together)
     refused = int((claims & ~success).sum())

@@ -44,7 +44,7 @@ def main() -> None:
         bench.say(
             f"{hard.size} of {options.num} throws have no straight motion: "
             f"{hard.size / min(seconds):.0f}/s, {100 * success.mean():.1f} % of them blocked, "
-            f"{refused} claims rejected."
+            f"{refused} plans solved by status but rejected."
         )
         median = gap_figures(gaps)["cost_gap_median"]
         if median is not None:

@@ -129,7 +129,7 @@ def main() -> None:
             f"{options.num} other throws, {options.regime}, "
             f"{'wide' if options.wide else 'strict'}; angles [rad]",
             "",
-            "| home | start after | blocked | straight motions alone | claims rejected |",
+            "| home | start after | blocked | straight motions alone | solved, rejected |",
             "|---|---|---|---|---|",
         )
         home_poses = {"the authors'": authors[0]}

@@ -108,7 +108,7 @@ def referee(bench: Bench, library: Library, num: int, name: str) -> None:
     wrong = int((found.claimed & ~found.verdict.success).sum())
     bench.say(
         f"{name}: {100 * found.verdict.success.mean():.2f} % of {num} balls through stored tunnels "
-        f"are blocked; of {found.claimed.sum()} claims the referee rejects {wrong}."
+        f"are blocked; of {found.claimed.sum()} claimed blocks the referee rejects {wrong}."
     )
     bench.note(**{f"refused_{name}": wrong, f"claims_{name}": int(found.claimed.sum())})
 
@@ -136,7 +136,7 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
                 bench.say(
                     f"{suite}, {met}, delay {delay} s: stored for {100 * found.mean():.1f} %, "
                     f"{100 * verdict.success.mean():.1f} % of {num} blocked, "
-                    f"{refused} of {claims.sum()} claims rejected"
+                    f"{refused} of {claims.sum()} claimed blocks rejected"
                 )
                 bench.row(
                     suite=suite,

@@ -79,7 +79,7 @@ PARTS = ("errors", "images", "pipeline", "planning")
 PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
-    "once, when it has to": (0.02, (0.2, 0.3, 60.0), {"patient": True, "again": False}),
+    "once, at the last moment": (0.02, (0.2, 0.3, 60.0), {"patient": True, "again": False}),
     "again, 10 Hz": (0.02, (0.25, 0.75, 10.0), {}),
     "again, 20 Hz": (0.02, (0.25, 0.75, 20.0), {}),
     "again, 20 Hz, stereo": (None, (0.25, 0.75, 20.0), {}),
@@ -161,11 +161,11 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
         for rate in RATES:
             times = jnp.asarray(frame_times(eye(rate=rate), max(MOMENTS)), jnp.float32)
             for std in (*STDS, None):
-                seer = eye(rate=rate, std=std)
-                places = watch(cases, seer, times, jax.random.key(seed))
+                sensor = eye(rate=rate, std=std)
+                places = watch(cases, sensor, times, jax.random.key(seed))
                 found = [
                     np.asarray(each)
-                    for each in errors_after(cases, seer, times, places, moments, middle)
+                    for each in errors_after(cases, sensor, times, places, moments, middle)
                 ]
                 table.line(suite, rate, "stereo" if std is None else f"{100 * std:g} cm", *found)
                 if (suite, rate, std, BAR[3]) == BAR:
@@ -181,20 +181,20 @@ def report_images(bench: Bench, num: int, seed: int) -> None:
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
-    seer, thresholds = eye(rate=RENDERED_RATE), ball_thresholds()
-    assert isinstance(seer.noise, StereoNoise)
+    sensor, thresholds = eye(rate=RENDERED_RATE), ball_thresholds()
+    assert isinstance(sensor.noise, StereoNoise)
     cases = pj.block.draw(num, "short", seed)
-    camera, found = calibrate_camera(irb1600(), seer.camera, seer.noise, seed=seed)
-    off = 1e3 * np.linalg.norm(camera.position - np.asarray(seer.camera.position))
+    camera, found = calibrate_camera(irb1600(), sensor.camera, sensor.noise, seed=seed)
+    off = 1e3 * np.linalg.norm(camera.position - np.asarray(sensor.camera.position))
     bench.say("", f"Calibration from 20 views: {off:.2g} mm off, residual {found.residual:.2f}")
-    times = frame_times(seer, max(MOMENTS))
+    times = frame_times(sensor, max(MOMENTS))
     paths = jax.jit(jax.vmap(jax.vmap(drag_free_flight, (None, 0, None)), (0, None, 0)))
     truth = np.asarray(paths(cases.ball, jnp.asarray(times, jnp.float32), cases.gravity).pos)
     scene = jax.tree.map(lambda leaf: np.asarray(leaf)[0], cases.scene)
     noisy, seen_in = jax.jit(noisy_depth), jax.jit(sighting)
     places, seconds, frame_seconds = np.full_like(truth, np.nan), [], []
     try:
-        scene_camera = SceneCamera(seer.camera, scene)
+        scene_camera = SceneCamera(sensor.camera, scene)
     except RenderError as error:
         bench.say("", f"No images: {error}")
         return
@@ -205,28 +205,30 @@ def report_images(bench: Bench, num: int, seed: int) -> None:
                 began = time.perf_counter()
                 image, depth = scene_camera.take(place)
                 seconds.append(time.perf_counter() - began)
-                depth, trust = map(np.asarray, noisy(keys[k, n], seer.camera, seer.noise, depth))
+                depth, trust = map(
+                    np.asarray, noisy(keys[k, n], sensor.camera, sensor.noise, depth)
+                )
                 began = time.perf_counter()
                 places[k, n] = np.asarray(seen_in(image, depth, trust, camera, thresholds).place)
                 frame_seconds.append(time.perf_counter() - began)
-    report_frames(bench, seer, truth, places)
+    report_frames(bench, sensor, truth, places)
     bench.say(f"Rendering takes {1e3 * np.median(seconds):.0f} ms a frame (median).", "")
     table, moments, middle = Table(bench), jnp.asarray(MOMENTS), middle_of(cases)
     times = jnp.asarray(times, jnp.float32)
-    modelled_places = watch(cases, seer, times, jax.random.key(seed))
+    modelled_places = watch(cases, sensor, times, jax.random.key(seed))
     for name, given in (("images", jnp.asarray(places)), ("stereo", modelled_places)):
-        errors = errors_after(cases, seer, times, given, moments, middle)
+        errors = errors_after(cases, sensor, times, given, moments, middle)
         table.line(f"short, {num} throws", RENDERED_RATE, name, np.asarray(errors[0]), errors[1])
-    report_times(bench, seer, times, places[0], frame_seconds[1:])
+    report_times(bench, sensor, times, places[0], frame_seconds[1:])
 
 
-def report_frames(bench: Bench, seer: Eye, truth: np.ndarray, places: np.ndarray) -> None:
+def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarray) -> None:
     """Report the errors of balls in images.
 
     Pixel errors are in pixels. Depth errors are in units of the noise model's standard deviation.
     """
-    camera: Any = seer.camera
-    noise: Any = seer.noise
+    camera: Any = sensor.camera
+    noise: Any = sensor.noise
     seen = np.asarray(np.isfinite(places).all(axis=-1))
     pixels, depths = map(np.asarray, project(camera, jnp.asarray(truth)))
     found, deep = map(
@@ -244,10 +246,10 @@ def report_frames(bench: Bench, seer: Eye, truth: np.ndarray, places: np.ndarray
 
 
 def report_times(
-    bench: Bench, seer: Eye, times: Array, places: np.ndarray, frame_seconds: list[float]
+    bench: Bench, sensor: Eye, times: Array, places: np.ndarray, frame_seconds: list[float]
 ) -> None:
     """Report the duration of a frame and of a fit."""
-    camera, noise = seer.camera, seer.noise
+    camera, noise = sensor.camera, sensor.noise
 
     @jax.jit
     def fit(times: Array, places: Array, gravity: Array) -> Any:
@@ -292,9 +294,9 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
     planner = pj.block.planner()
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
     for name, (std, (first, last, rate), options) in PIPELINES.items():
-        seer, began = eye(std=std), time.perf_counter()
+        sensor, began = eye(std=std), time.perf_counter()
         moments = moments_of(first, last, rate)
-        done = decide(planner, cases, seer, moments, overhead=OVERHEAD, seed=seed, **options)
+        done = decide(planner, cases, sensor, moments, overhead=OVERHEAD, seed=seed, **options)
         met = end_at_contact(done.cases, done.plans)
         some = pj.solved(met)
         verdict = pj.block.judge(done.cases, met)
@@ -335,8 +337,10 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
 def planning(bench: Bench, num: int, seed: int) -> None:
     """Report planning times for one throw: for the first motion, and for the next ones."""
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
-    planner, seer = pj.block.planner(), eye(std=0.02)
-    known = [see(cases, seer, moment, overhead=OVERHEAD, seed=seed).cases for moment in (0.25, 0.3)]
+    planner, sensor = pj.block.planner(), eye(std=0.02)
+    known = [
+        see(cases, sensor, moment, overhead=OVERHEAD, seed=seed).cases for moment in (0.25, 0.3)
+    ]
     first, later = (jax.tree.map(np.asarray, each) for each in known)
     plans, seconds = time_with_aims(planner, first)
     tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)

@@ -5,7 +5,7 @@
 
 Planning time is not subtracted. Each row has these columns, in percent of all throws:
 * end pose: there is a pose of the shield that meets the ball, is free of collision and, by the
-  joints' limits, can be reached in time by a straight motion. Collisions on the way are ignored.
+  joints' limits, can be reached in time by a straight motion. Its collisions are ignored.
   This is nearly an upper bound, limited by the set of poses that is searched;
 * straight: this straight motion is free of collision too;
 * planner: the planner that is measured;

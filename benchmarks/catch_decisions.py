@@ -1,4 +1,4 @@
-"""Compare ways to choose catching order and times, as in Table III of [Yu2023catch].
+"""Compare methods to choose catching order and times, as in Table III of [Yu2023catch].
 
     python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
         [--policy FILE] [--timed 200] [--out DIR]

@@ -61,13 +61,13 @@ class Estimator:
         )
         first, unravel = ravel_pytree(unknown)
 
-        def look(vector: jax.Array) -> jax.Array:
+        def advance(vector: jax.Array) -> jax.Array:
             """Update the belief with an observation and predict one period ahead, as vectors."""
             state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
             return ravel_pytree(ahead)[0]
 
-        self._look = jax.jit(look)
+        self._advance = jax.jit(advance)
         self._first = self._belief = np.asarray(first)
 
     def begin(self, observation: np.ndarray) -> None:
@@ -77,7 +77,7 @@ class Estimator:
 
     def see(self, observation: np.ndarray) -> BallState:
         """Return the predicted ball one period after this observation (3,), leaves (1, 3)."""
-        belief: Any = np.asarray(self._look(np.concatenate([self._belief, observation])))
+        belief: Any = np.asarray(self._advance(np.concatenate([self._belief, observation])))
         self._belief = belief
         return BallState(pos=belief[None, :3], vel=belief[None, 3:6])
 
@@ -136,13 +136,13 @@ def warm_up(case: CatchCase) -> None:
 
 
 def fly(
-    case: CatchCase, looks: np.ndarray, estimator: Estimator, period: float, out: Times
+    case: CatchCase, observations: np.ndarray, estimator: Estimator, period: float, out: Times
 ) -> tuple[CatchPlan, CatchPlan]:
     """Fly one throw from its first observation to the catch.
 
     Args:
         case: starts one period after the observation at which planning starts.
-        looks: (K, 3) [m], observations, one a period.
+        observations: (K, 3) [m], observations, one a period.
         estimator: filter of the ball.
         period: [s].
         out: receives the times.
@@ -151,21 +151,21 @@ def fly(
         The flown trajectory as a plan, and the first plan.
     """
     before = round(SEEN / period)
-    estimator.begin(looks[0])
-    for look in looks[:before]:
-        estimator.see(look)
-    ball = estimator.see(looks[before])
+    estimator.begin(observations[0])
+    for observation in observations[:before]:
+        estimator.see(observation)
+    ball = estimator.see(observations[before])
     began = time.perf_counter()
     targets = dataclasses.replace(balls_of(case), ball=ball)
     task, current = first_plan(dataclasses.replace(case, targets=targets))
     out.first.append(time.perf_counter() - began)
     first, flown, elapsed = current, [], 0.0
-    for look in looks[before + 1 :]:
+    for observation in observations[before + 1 :]:
         elapsed += period
         if current.times[0] - elapsed < AGAIN.shortest:
             break
         began = time.perf_counter()
-        ball = estimator.see(look)
+        ball = estimator.see(observation)
         seen = time.perf_counter()
         targets = dataclasses.replace(balls_of(task), ball=ball)
         left = AGAIN.begin(task, current, elapsed, targets=targets)
@@ -250,7 +250,7 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
     paths = jax.tree.map(lambda leaf: leaf[:, 0], suite.targets)
     states = jax.vmap(lambda path: jax.vmap(path.at)(times))(paths)
     random = np.random.default_rng(0)
-    looks = np.asarray(states.pos) + noise * random.standard_normal(states.pos.shape)
+    observations = np.asarray(states.pos) + noise * random.standard_normal(states.pos.shape)
     ahead = jax.vmap(lambda path: path.at(jnp.asarray(period)))(paths)
     begins = dataclasses.replace(
         suite,
@@ -259,7 +259,7 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
         ),
         horizon=suite.horizon - period,
     )
-    return jax.tree.map(np.asarray, begins), looks.astype(np.float32)
+    return jax.tree.map(np.asarray, begins), observations.astype(np.float32)
 
 
 def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
@@ -316,7 +316,7 @@ def main() -> None:
     period = 1.0 / options.rate
     compute_in_place()
     with begin(parser, options) as bench:
-        cases, looks = throws(options.num, period, options.noise)
+        cases, observations = throws(options.num, period, options.noise)
         lanes = [pj.take(cases, k) for k in range(options.num)]
         began = time.perf_counter()
         warm_up(lanes[0])
@@ -328,21 +328,24 @@ def main() -> None:
         if options.alone:
             time_replans(bench, lanes, period, options.noise)
         else:
-            fly_all(bench, cases, looks, period, options.noise)
+            fly_all(bench, cases, observations, period, options.noise)
 
 
-def fly_all(bench: Bench, cases: CatchCase, looks: np.ndarray, period: float, noise: float) -> None:
+def fly_all(
+    bench: Bench, cases: CatchCase, observations: np.ndarray, period: float, noise: float
+) -> None:
     """Fly every throw, with everything compiled, and report."""
-    lanes = [pj.take(cases, k) for k in range(len(looks))]
+    lanes = [pj.take(cases, k) for k in range(len(observations))]
     path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
-    for lane, seen in zip(lanes[:WARM_UP], looks, strict=False):
+    for lane, seen in zip(lanes[:WARM_UP], observations, strict=False):
         fly(lane, seen, estimator, period, Times())
     times = Times()
     gc.collect()
     gc.disable()  # as in any loop with deadlines: a garbage collection takes milliseconds
     flights = [
-        fly(lane, seen, estimator, period, times) for lane, seen in zip(lanes, looks, strict=True)
+        fly(lane, seen, estimator, period, times)
+        for lane, seen in zip(lanes, observations, strict=True)
     ]
     flown, first = (list(plans) for plans in zip(*flights, strict=True))
     report_times(bench, "estimate", times.estimate)

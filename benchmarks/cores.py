@@ -71,8 +71,8 @@ def main() -> None:
     rates: dict[str, list[float]] = {name: [] for name in groups}
     for _ in range(options.turns):
         for name, children in groups.items():
-            begun = [child.submit(_time_plan, num) for child in children]
-            rates[name].append(sum(num / one.result() for one in begun))
+            running = [child.submit(_time_plan, num) for child in children]
+            rates[name].append(sum(num / one.result() for one in running))
     load = os.getloadavg()[0]
     for children in groups.values():
         for child in children:

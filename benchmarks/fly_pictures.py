@@ -34,14 +34,14 @@ def main() -> None:
         "--out", type=Path, default=Path("docs"), metavar="DIR", help="default: docs"
     )
     args = parser.parse_args()
-    for name, (settings, look) in PICTURES.items():
+    for name, (settings, style) in PICTURES.items():
         task = settings.flight()
         cases = task.cases()
         flights = task.fly(cases, record=True)
         good = flights.success
         lane = int(np.argmax(good))
         recording = task.recording(cases, flights, np.array([lane]))
-        draw_flight(args.out / name, task, recording, 0, **look)
+        draw_flight(args.out / name, task, recording, 0, **style)
         print(f"{name}: flight {lane}; {good.sum()} of {len(good)} succeed", flush=True)
 
 

@@ -80,8 +80,8 @@ def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
     flight = launch_ball(loop, flight, balls, drag, guess, ball=0, seen=SEEN)
     known = predict_case(loop, flight, jnp.array([True]), jnp.asarray(cases.horizon))
     plans = plan(catch.planner(), jax.tree.map(np.asarray, known))
-    begun = jax.tree.map(jnp.asarray, plans)
-    flight = with_catch(flight, begun, jnp.ones((few, 1), bool)).replace(key=None)
+    on_device = jax.tree.map(jnp.asarray, plans)
+    flight = with_catch(flight, on_device, jnp.ones((few, 1), bool)).replace(key=None)
     many = lambda leaf: jnp.resize(leaf, (worlds, *leaf.shape[1:]))  # noqa: E731
     keys = jax.random.split(jax.random.key(1), worlds)
     flight = dataclasses.replace(jax.tree.map(many, flight), key=keys)

@@ -32,8 +32,8 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     columns, rows = (origin[k] + CELL * np.arange(count[k]) for k in (0, 1))
     # The position of a mover is rounded to whole cells, so its set shrinks by as much once more.
     movers = [_draw_polygon(corners, radius - _SLACK) for corners in scene.movers]
-    ways = _limit_steps(scene)
-    guard = max([int(ways.max() / CELL) + 2, *(drawn.shape[1] for _, drawn in movers)])
+    steps = _limit_steps(scene)
+    guard = max([int(steps.max() / CELL) + 2, *(drawn.shape[1] for _, drawn in movers)])
     stride = int(count[0]) + guard
     blocked = np.zeros((count[1], count[0]), bool)
     for corners in scene.walls:
@@ -41,8 +41,8 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     free = as_integer(~blocked, stride)
     stencils = [(low, drawn.shape[::-1], as_integer(drawn, stride)) for low, drawn in movers]
     plane, earliest, meets = 1 << int(first[1] * stride + first[0]), np.inf, False
-    for half, way in enumerate(ways, 1):
-        plane = _grow(plane, way / CELL, stride) & free
+    for half, distance in enumerate(steps, 1):
+        plane = _grow(plane, distance / CELL, stride) & free
         for velocity, (low, size, stencil) in zip(scene.velocities, stencils, strict=True):
             moved = (0.5 * velocity * half * scene.dt - origin) / CELL
             cell = np.floor(moved + 0.5).astype(int) + low
@@ -78,11 +78,11 @@ def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
     return low, near(x, y, corners, radius)
 
 
-def _grow(plane: int, way: float, stride: int) -> int:
-    """Return the cells that hold a point at most `way` cells from any point of a plane's cells."""
+def _grow(plane: int, distance: float, stride: int) -> int:
+    """Return the cells with a point at most `distance` cells from a point of a plane's cells."""
     grown, wide, width = 0, plane, 0
-    for row in range(int(way) + 1, -1, -1):
-        reach = int(np.sqrt(way**2 - max(row - 1, 0) ** 2)) + 1
+    for row in range(int(distance) + 1, -1, -1):
+        reach = int(np.sqrt(distance**2 - max(row - 1, 0) ** 2)) + 1
         for by in range(width + 1, reach + 1):
             wide |= plane << by | plane >> by
         width = reach

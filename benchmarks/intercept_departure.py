@@ -63,10 +63,10 @@ def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
         most = np.arctan(scene.wheelbase * most)
         turned = np.clip(steering + span * rates, -most, most)
         curvature = np.tan(0.5 * (steering + turned)) / scene.wheelbase
-        way = 0.5 * span * (speed + faster)
-        middle = heading + 0.5 * way * curvature
-        x, y = x + way * np.cos(middle), y + way * np.sin(middle)
-        heading, speed, steering = heading + way * curvature, faster, turned
+        distance = 0.5 * span * (speed + faster)
+        middle = heading + 0.5 * distance * curvature
+        x, y = x + distance * np.cos(middle), y + distance * np.sin(middle)
+        heading, speed, steering = heading + distance * curvature, faster, turned
         free = is_free(scene, x, y, heading, time + (part + 1) * span)
         x, y, heading, speed, steering, rates, pedals = (
             each[free] for each in (x, y, heading, speed, steering, rates, pedals)

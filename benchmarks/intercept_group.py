@@ -1,4 +1,4 @@
-"""Compare ways to order three targets for one car, beside a lower bound on the time.
+"""Compare methods to order three targets for one car, beside a lower bound on the time.
 
     python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
 
@@ -75,20 +75,21 @@ def limit_times(groups: InterceptGroup) -> np.ndarray:
         limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
     )
     speed = np.sqrt(v**2 + (ahead**2 * limits.curvature * limits.lateral_acceleration)[:, None])
-    way = np.cumsum(STEP * np.concatenate([0.0 * speed[:, :1], speed[:, 1:]], axis=1), axis=1)
+    travel = np.cumsum(STEP * np.concatenate([0.0 * speed[:, :1], speed[:, 1:]], axis=1), axis=1)
     start, tolerance = np.asarray(shared.start), np.asarray(shared.tolerance)
     heading = start[:, 2]
     middle = start[:, :2] + ahead[:, None] * np.stack([np.cos(heading), np.sin(heading)], 1)
     orders = itertools.permutations(range(TARGETS))
     return np.min(
-        [_meet_in_order(order, middle, way, times, places, tolerance) for order in orders], axis=0
+        [_meet_in_order(order, middle, travel, times, places, tolerance) for order in orders],
+        axis=0,
     )
 
 
 def _meet_in_order(
     order: tuple[int, ...],
     place: np.ndarray,
-    way: np.ndarray,
+    travel: np.ndarray,
     times: np.ndarray,
     places: np.ndarray,
     tolerance: np.ndarray,
@@ -98,17 +99,17 @@ def _meet_in_order(
     Args:
         order: indices of the targets.
         place: (B, 2) [m], position of the point at time 0.
-        way: (B, T) [m], greatest distance covered up to each time.
+        travel: (B, T) [m], greatest distance covered up to each time.
         times: (B, T) [s].
         places: (B, N, T, 2) [m], positions of the targets.
         tolerance: (B,) [m].
     """
-    lanes, at, slack = np.arange(len(way)), np.zeros(len(way), int), tolerance
-    met = np.ones(len(way), bool)
+    lanes, at, slack = np.arange(len(travel)), np.zeros(len(travel), int), tolerance
+    met = np.ones(len(travel), bool)
     for target in order:
         far = np.linalg.norm(places[:, target] - place[:, None], axis=2)
-        meets = far <= way - way[lanes, at, None] + slack[:, None]
-        meets &= np.arange(way.shape[1]) >= at[:, None]
+        meets = far <= travel - travel[lanes, at, None] + slack[:, None]
+        meets &= np.arange(travel.shape[1]) >= at[:, None]
         met &= meets.any(axis=1)
         # It may meet the target between the time step before and this one.
         at = np.maximum(meets.argmax(axis=1) - 1, at)

@@ -73,7 +73,7 @@ class Reach:
 
     at_end: bool  # whether the target can be met at the case's time
     earliest: float  # [s], first layer at which it can be met; inf if there is none
-    way: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed; None if not requested
+    path: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed; None if not requested
 
 
 def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
@@ -303,21 +303,21 @@ class Lattice:
         ]
         return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
 
-    def reach(self, keep_way: bool = False) -> Reach:
-        """Return whether and when the target can be met; `keep_way` adds a path to that meeting."""
-        earliest, at_end, kept, way = np.inf, False, [], None
+    def reach(self, keep_path: bool = False) -> Reach:
+        """Return whether and when the target can be met; `keep_path` adds a path to it."""
+        earliest, at_end, kept, path = np.inf, False, [], None
         for layer, planes in enumerate(self.sets()):
-            if keep_way and way is None:
+            if keep_path and path is None:
                 kept.append(planes)
             found = self.meets(planes, layer) if layer else []
             at_end = bool(found)
             if found and np.isinf(earliest):
                 earliest = layer * self.scene.dt
-                way = self._trace_back(kept, found[0]) if keep_way else None
-        return Reach(at_end=at_end, earliest=earliest, way=way)
+                path = self._trace_back(kept, found[0]) if keep_path else None
+        return Reach(at_end=at_end, earliest=earliest, path=path)
 
     def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """Trace a path (2 n + 1, 5) back from a state through n layers; see `Reach.way`."""
+        """Trace a path (2 n + 1, 5) back from a state through n layers; see `Reach.path`."""
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):
             bit, level, heading = state

@@ -93,7 +93,9 @@ def split_planner(planner: Any) -> dict[str, Callable]:
             "speed": jax.jit(lambda found: planner.best_drive(*found)),
         }
     if isinstance(planner, PaperIntercept):
-        smooth = jax.jit(lambda case, way: (case, planner.path(case, way[0], way[1], way[2])))
+        smooth = jax.jit(
+            lambda case, searched: (case, planner.path(case, searched[0], searched[1], searched[2]))
+        )
         return {
             "path": lambda case: smooth(case, planner.search_path(case)),
             "speed": jax.jit(

@@ -196,7 +196,7 @@ class Drives:
 
     def judge(self, truth: InterceptCase) -> InterceptVerdict:
         """Return the referee's verdict on the whole drives, against the true targets."""
-        asked = dataclasses.replace(truth, tolerance=np.full_like(truth.tolerance, SUCCESS))
+        loose = dataclasses.replace(truth, tolerance=np.full_like(truth.tolerance, SUCCESS))
         whole = dataclasses.replace(
             self.plans,
             start=truth.start,
@@ -204,22 +204,22 @@ class Drives:
             speed=self.speed,
             curvature=self.curvature,
         )
-        return pj.intercept.judge(asked, whole)
+        return pj.intercept.judge(loose, whole)
 
 
-def drive(cases: InterceptCase, looks: Observations | None, until: float) -> Drives:
+def drive(cases: InterceptCase, observed: Observations | None, until: float) -> Drives:
     """Drive B cases, and re-plan at every observation before a time [s].
 
     Args:
         cases: the true cases.
-        looks: observations of the targets; None if the targets are known.
+        observed: observations of the targets; None if the targets are known.
         until: [s]; 0 drives the first plans.
     """
-    if looks is None:
+    if observed is None:
         return Drives.start(cases)
-    drives = Drives.start(dataclasses.replace(cases, target=looks.paths(0.0)))
-    for now in looks.times[(looks.times > 0.0) & (looks.times < until)]:
-        drives.renew(now, looks.paths(now))
+    drives = Drives.start(dataclasses.replace(cases, target=observed.paths(0.0)))
+    for now in observed.times[(observed.times > 0.0) & (observed.times < until)]:
+        drives.renew(now, observed.paths(now))
     return drives
 
 
@@ -274,13 +274,13 @@ def report(
 
 
 def report_bound(
-    bench: Bench, looks: Observations, truth: InterceptCase, turning: np.ndarray
+    bench: Bench, observed: Observations, truth: InterceptCase, turning: np.ndarray
 ) -> None:
     """Print the predictor's share within the success radius at the case's time, and the bound's."""
     times = np.asarray(truth.time)
     there = positions(truth.target, times)
-    off = np.linalg.norm(positions(looks.paths(0.0), times) - there, axis=1)
-    before = looks.times[looks.times <= 0.0].astype(np.float32)
+    off = np.linalg.norm(positions(observed.paths(0.0), times) - there, axis=1)
+    before = observed.times[observed.times <= 0.0].astype(np.float32)
     bound = compute_bound(truth.target, np.tile(before, (len(off), 1)), times)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         mine, least = (off[is_of_mode] <= SUCCESS).mean(), np.asarray(bound)[is_of_mode].mean()
@@ -300,15 +300,15 @@ def main() -> None:
         truth = take_lanes(pj.intercept.draw(options.num, options.suite, options.seed), slice(None))
         turning = np.asarray(cast("Any", truth.target).turn_rate) != 0.0
         end = float(truth.time[0])  # equal for all cases of a suite
-        looks = Observations(
+        observed = Observations(
             *pj.intercept.observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end)
         )
         device = jax.devices()[0].device_kind
         bench.say(f"{options.num} cases, suite {options.suite}, seed {options.seed}; {device}", "")
         rows = {}
         for name, seen, until in (
-            ("one shot", looks, 0.0),
-            ("re-planned", looks, end),
+            ("one shot", observed, 0.0),
+            ("re-planned", observed, end),
             ("known", None, 0.0),
         ):
             began = time.perf_counter()
@@ -316,7 +316,7 @@ def main() -> None:
         bench.say(HEADER, "|---" * HEADER.count(" | ") + "|---|")
         report(bench, rows, truth, turning)
         bench.say("")
-        report_bound(bench, looks, truth, turning)
+        report_bound(bench, observed, truth, turning)
 
 
 if __name__ == "__main__":

@@ -188,8 +188,8 @@ class Soak:
             state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)
             planned = answer if answer.motion is Motion.PLAN else planned
             if planned is not None and time.monotonic() > planned.contact:
-                looks = began + period * np.arange(len(path))
-                at = np.array([np.interp(planned.contact, looks, x) for x in path.T])
+                times = began + period * np.arange(len(path))
+                at = np.array([np.interp(planned.contact, times, x) for x in path.T])
                 off = distance_off(planned, self.height, self.gravity, at)
                 self.met += off < self.radius
                 break

@@ -85,14 +85,14 @@ def _add_constraint(cases: Any, extra: Any) -> Any:
 
 
 def add_spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add a sphere with a radius of 10 to 30 cm in the way."""
+    """Add a sphere with a radius of 10 to 30 cm on the trajectory."""
     place = _point_on_plan(row, cases, random)
     centre = place + random.normal(0.0, 0.08, place.shape)
     return _add_constraint(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
 
 
 def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add a box with sides of 20 to 60 cm in the way."""
+    """Add a box with sides of 20 to 60 cm on the trajectory."""
     place = _point_on_plan(row, cases, random)
     middle = place + random.normal(0.0, 0.08, place.shape)
     half = random.uniform(0.1, 0.3, place.shape)

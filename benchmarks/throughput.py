@@ -79,7 +79,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     bench.say(
         f"{card.name}, {len(used)} x {used[0].device_kind}, jax {jax.__version__}, load average "
         f"{os.getloadavg()[0]:.1f}" + (f"; first round: {first} iterations" if first else ""),
-        "| plans | first call [s] | compiling of it [s] | fastest [ms] | median [ms] | plans/s | "
+        "| plans | first call [s] | its compilation [s] | fastest [ms] | median [ms] | plans/s | "
         "refereed | cost above a longer search (median, p90, p99) | memory [GiB] |",
         "|---|---|---|---|---|---|---|---|---|",
     )

@@ -145,9 +145,9 @@ def test_free_cells_are_free_by_the_referee(drawn, rules):
 
 def test_a_path_leads_from_start_to_target_within_the_limits_and_touches_nothing(drawn):
     for one in (*drawn[:2], gate(0.1)):
-        found = Lattice(one, STRICT).reach(keep_way=True)
-        assert found.way is not None
-        time, x, y, heading, speed = found.way.T
+        found = Lattice(one, STRICT).reach(keep_path=True)
+        assert found.path is not None
+        time, x, y, heading, speed = found.path.T
         np.testing.assert_allclose([x[0], y[0], heading[0]], one.start, atol=1e-9)
         assert time[-1] == found.earliest
         pos = np.stack([x, y], axis=1)

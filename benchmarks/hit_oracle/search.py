@@ -191,8 +191,8 @@ def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
     cases = jax.tree.map(np.asarray, cases)
     num = len(cases.drag)
     lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], cases) for i in range(num)]
-    look = functools.partial(find_hit, starts=starts)
+    search = functools.partial(find_hit, starts=starts)
     if workers == 1:
-        return list(tqdm(map(look, lanes), total=num, unit="case"))
+        return list(tqdm(map(search, lanes), total=num, unit="case"))
     with multiprocessing.get_context("spawn").Pool(workers) as pool:
-        return list(tqdm(pool.imap(look, lanes), total=num, unit="case"))
+        return list(tqdm(pool.imap(search, lanes), total=num, unit="case"))
