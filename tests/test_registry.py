@@ -216,7 +216,7 @@ ERRORS = [
     errors.UnknownName("task", "one of hit, catch", "hot"),
     errors.MissingExtra("paper", "numba", "baselines"),
     errors.NoRecovery("no recovery trajectory keeps the limits"),
-    WorkersFailed("be able to start the run"),
+    WorkersFailed("workers must be able to start the run"),
 ]
 
 

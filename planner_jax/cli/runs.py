@@ -230,7 +230,7 @@ def _tell_how_to_continue(
     except KeyboardInterrupt:
         raise KeyboardInterrupt(f"interrupted; {remainder()}") from None
     except WorkersFailed as error:
-        raise Unfinished(f"--workers must {error.rule}; {remainder()}") from None
+        raise Unfinished(f"--{error}; {remainder()}") from None
     except OSError as error:
         shown = f"{error.filename!r} ({error.strerror or error})"
         raise Unfinished(f"{rule}, got {shown}; {remainder()}") from None

@@ -218,7 +218,3 @@ class RunRows:
         rows = others.read().to_pylist() if others.files() else []
         name = self.manifest["parameters"]["planner"]
         return [(name, own), *((row["planner"], row) for row in rows)]
-
-    def columns(self, *names: str) -> pa.Table:
-        """Return some columns of all rows."""
-        return self.folder.plans.read(names)

@@ -28,13 +28,6 @@ Options = dict[str, Any]  # values by the names of their fields
 class WorkersFailed(PlannerJaxError, RuntimeError):
     """Workers could not make a chunk of a run: "workers must RULE". The run can be resumed."""
 
-    def __init__(self, rule: str):
-        super().__init__(rule)
-        self.rule = rule
-
-    def __str__(self) -> str:
-        return f"workers must {self.rule}"
-
 
 def option(default: object, metavar: str, text: str) -> Any:
     """Return a field of settings with its help text; a switch has no `metavar`."""

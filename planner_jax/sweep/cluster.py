@@ -128,7 +128,7 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None
     except ray.exceptions.RayError as error:
-        rule = f"live long enough to make a chunk, got none for chunk {number} in"
+        rule = f"workers must live long enough to make a chunk, got none for chunk {number} in"
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise WorkersFailed(f"{rule} {_RETRIES + 1} tries ({reason})") from None
 
@@ -151,10 +151,10 @@ def _maker_of(job: bytes) -> Maker:
         require_backend()
         maker = Maker.of(sweep_of(task), settings, settings.batch or 1)
     except (ValueError, OSError, ModuleNotFoundError) as error:
-        raise WorkersFailed(f"be able to start the run, got: {error}") from None
+        raise WorkersFailed(f"workers must be able to start the run, got: {error}") from None
     for what, wanted in makers.items():
         if (found := maker.makers[what]) != wanted:
-            raise WorkersFailed(f"be of {what} {wanted} as the run, got {found}")
+            raise WorkersFailed(f"workers must be of {what} {wanted} as the run, got {found}")
     if maker.run != run:
-        raise WorkersFailed("have the files that the run's settings name, got others")
+        raise WorkersFailed("workers must have the files that the run's settings name, got others")
     return maker

@@ -171,7 +171,8 @@ def write_verdicts(
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
     """Draw a histogram of iterations; success and failures are text of the page."""
-    iterations, axes = np.asarray(run.columns("iterations")["iterations"]), figure.subplots()
+    axes, rows = figure.subplots(), run.folder.plans.read(["iterations"])
+    iterations = np.asarray(rows["iterations"])
     style.label(axes, "iterations of the attempt that gave the plan", "plans", "Effort")
     axes.hist(iterations, bins=np.arange(iterations.min(), iterations.max() + 2) - 0.5)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))

@@ -46,12 +46,7 @@ class Sweep(Generic[AnySettings]):
     own_columns: ClassVar[Sequence[Column]] = ()
     single_columns: ClassVar[Sequence[Column]] = ()  # used by the command `plan`
     figures: ClassVar[tuple[RunFigure, ...]] = (
-        RunFigure(
-            "outcomes.png",
-            "Number of plans by iterations.",
-            (9.0, 4.4),
-            outcomes_figure,
-        ),
+        RunFigure("outcomes.png", "Number of plans by iterations.", (9.0, 4.4), outcomes_figure),
     )
     counts: ClassVar[type[Tally]] = Tally  # class of the counts
     single_figures: ClassVar[Sequence[RunFigure]] = ()  # used by the command `plan`
