@@ -8,6 +8,7 @@ from planner_jax.ball.flight import BallState
 from planner_jax.ball.target import BallPath
 from planner_jax.cli.plan.answer import Answer, Margin, Single
 from planner_jax.cli.plan.settings import SingleCatchSettings
+from planner_jax.core.protocol import take
 from planner_jax.task.catch.case import GRAVITY
 
 
@@ -39,11 +40,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         for index, (target, time) in enumerate(
             zip(np.asarray(answer.plan.order), np.asarray(answer.verdict.catch_times), strict=True)
         ):
-            ball = BallPath(
-                ball=BallState(targets.ball.pos[target], targets.ball.vel[target]),
-                drag=targets.drag[target],
-                gravity=targets.gravity[target],
-            ).at(jnp.asarray(time, jnp.float32))
+            ball = take(targets, int(target)).at(jnp.asarray(time, jnp.float32))
             x, y, z = np.asarray(ball.pos)
             which = f"Ball {target + 1} caught" if len(targets.gravity) > 1 else "Caught"
             off = 1e3 * float(answer.verdict.net_distance[index])
