@@ -1,3 +1,5 @@
+# Pyright cannot see the names of MuJoCo's compiled module.
+# pyright: reportAttributeAccessIssue=false
 """Reader of a quadrotor's body and rotors from MuJoCo's model format, MJCF, compiled by MuJoCo."""
 
 from pathlib import Path
@@ -23,12 +25,12 @@ def describe_mjcf(path: Path) -> dict[str, Value]:
         RobotError: the model does not have this form; one line.
     """
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))  # type: ignore[attr-defined]
+        model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         raise RobotError(f"{path}: must be MJCF, {' '.join(str(error).split())}") from None
-    data = mujoco.MjData(model)  # type: ignore[attr-defined]
-    mujoco.mj_forward(model, data)  # type: ignore[attr-defined]
-    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)  # type: ignore[attr-defined]
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    free = np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE)
     if len(free) != 1:
         raise RobotError(f"{path}: the model must have one free joint, got {len(free)}")
     root = int(model.jnt_bodyid[free[0]])
@@ -39,7 +41,7 @@ def describe_mjcf(path: Path) -> dict[str, Value]:
         raise RobotError(
             f"{path}: inertia must be along the body's axes, got a product of {skew:.3g} kg m^2"
         )
-    of_site = mujoco.mjtTrn.mjTRN_SITE  # type: ignore[attr-defined]
+    of_site = mujoco.mjtTrn.mjTRN_SITE
     rotors = [
         _rotor(path, model, data, k, centre, turn)
         for k in range(model.nu)
