@@ -136,7 +136,6 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
 
 
 def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
-    """Random balls reach the farthest crossing and do not pass it."""
     rng, tunnel = np.random.default_rng(1), tunnels_of(LAYOUTS["D"])
     pair = rng.choice(np.flatnonzero(tunnel.is_centred))
     outer, inner = tunnel.outer[pair], tunnel.inner[pair]

@@ -231,7 +231,6 @@ def test_timed_paths_are_confirmed_by_the_referee(name, regime):
 
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_splines_are_confirmed_by_the_referee(regime):
-    """They end at rest if required, else the arm waits and moves as late as possible."""
     cases, plans, verdict = plan_and_confirm("insat", regime)
     rests = cases.ends_at_rest
     ends = jnp.sum(plans.motion.durations, axis=1)

@@ -121,7 +121,6 @@ def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
 
 
 def test_shortfall_is_how_far_out_of_reach_a_target_stays(pairs):
-    """In less than 4 s the quadrotor cannot fly 100 m."""
     for missing in (shortfall(pairs, greedy(pairs))[2], shortfall(pairs, best(pairs))[2, 0]):
         assert 101.0 - 0.9 * 5.0 * 4.0 < missing < 101.0
 
@@ -360,7 +359,6 @@ def test_what_is_taken_of_a_swarm_is_caught_and_counted(swarm, caught):
 
 
 def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
-    """With another position of a ball the plan fails, and one catch fewer is counted."""
     moved = np.array(swarm.targets.ball.pos)
     moved[np.arange(NUM), caught.order[:, 0]] += 1.0
     ball = dataclasses.replace(swarm.targets.ball, pos=moved)

@@ -254,7 +254,6 @@ def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
 
 @float64
 def test_recursive_least_squares_is_the_batch_solution():
-    """Count the prior as one additional measurement."""
     rng = np.random.default_rng(8)
     h, y = rng.normal(size=30), rng.normal(size=30)
     estimate, variance = 0.3, 2.0

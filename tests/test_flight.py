@@ -163,7 +163,6 @@ def test_energy_decays_with_drag_and_is_kept_without():
 
 @float64
 def test_flight_gradient_matches_finite_differences():
-    """Differentiate by the ball, the duration, the drag and gravity."""
 
     def landing(args):
         final, _ = fly(*args, num_steps=2)

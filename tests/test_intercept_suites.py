@@ -61,7 +61,6 @@ def test_a_case_is_the_same_in_every_batch(name):
 
 
 def test_a_suite_depends_on_its_name_and_the_seed_alone():
-    """Compare numbers of published cases."""
     np.testing.assert_allclose(draw(1, "hard", 0).start[0, 1], 5.625709, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "maze", 0).start[0, 1], 4.843411, rtol=1e-5)
     np.testing.assert_allclose(draw(2, "rush", 0).time, [4.8589745, 5.8846154], rtol=1e-5)

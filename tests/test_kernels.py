@@ -35,13 +35,6 @@ def gpu(monkeypatch):
     monkeypatch.setattr(kernels, "has_gpu", lambda: True)
 
 
-@pytest.fixture
-def no_triton(monkeypatch):
-    """Simulate a JAX without Pallas' Triton backend."""
-    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
-    monkeypatch.delitem(sys.modules, "planner_jax.lanes.pallas", raising=False)
-
-
 def kernels_in(function, *args):
     """Return the number of kernels of each name in the function's program for CUDA."""
     device = jax.sharding.AbstractDevice("NVIDIA H100", None, "gpu")
@@ -104,7 +97,9 @@ def test_the_switch_removes_all_kernels(gpu, monkeypatch):
     assert kernels_in(round_of(ExactHit()), serves()) == {}
 
 
-def test_without_triton_programs_have_no_kernels_and_the_doctor_reports_it(gpu, no_triton):
+def test_without_triton_programs_have_no_kernels_and_the_doctor_reports_it(gpu, monkeypatch):
+    monkeypatch.setitem(sys.modules, "jax.experimental.pallas.triton", None)
+    monkeypatch.delitem(sys.modules, "planner_jax.lanes.pallas", raising=False)
     assert kernels.kernels() is kernels.Kernels.MISSING
     assert kernels_in(small(), X) == {}
     finding = doctor._kernels()

@@ -70,7 +70,9 @@ def test_greater_handicaps_put_a_target_last():
 def test_attention_does_not_see_the_order_of_targets_or_absent_ones(fresh):
     """The same numbers for targets that are listed otherwise, and with room for more."""
     network = NETWORKS["attention"]()
-    params = _moved(fresh["attention"])
+    rng = np.random.default_rng(2)  # noise on all weights, as the last layer is zero
+    noise = lambda leaf: 0.1 * rng.normal(size=leaf.shape).astype(np.float32)  # noqa: E731
+    params = jax.tree.map(lambda leaf: leaf + noise(leaf), fresh["attention"])
     cases = cases_of("hexagon6")
     seen = jax.jit(jax.vmap(lambda case: observe(case, timetable(case))))(cases)
     apply = jax.jit(network.apply)
@@ -80,13 +82,6 @@ def test_attention_does_not_see_the_order_of_targets_or_absent_ones(fresh):
     np.testing.assert_allclose(apply(params, seen[:, mixed]), numbers[:, mixed], atol=1e-5)
     more = jnp.pad(seen, ((0, 0), (0, 2), (0, 0)))
     np.testing.assert_allclose(apply(params, more)[:, :6], numbers, atol=1e-5)
-
-
-def _moved(params: Any) -> Any:
-    """Weights with noise, so that the last layer is not zero."""
-    rng = np.random.default_rng(2)
-    add = lambda leaf: leaf + 0.1 * rng.normal(size=leaf.shape).astype(np.float32)  # noqa: E731
-    return jax.tree.map(add, params)
 
 
 def test_the_shipped_policy_is_solved_and_confirmed_by_the_referee():

@@ -113,7 +113,6 @@ def test_the_body_rate_is_never_below_the_rate_at_which_the_thrust_tilts():
 @float64
 @pytest.mark.parametrize("acc", [(0.0, 0.0, 0.0), (3.0, -5.0, 2.0), (4.0, 1.0, -12.0)])
 def test_the_gradient_of_the_body_rate_matches_finite_differences(acc):
-    """Check in hover, tilted, and with the thrust pointing down."""
     point = (np.array(acc), np.array([20.0, -7.0, 11.0]), GRAVITY)
     assert_gradient_matches_differences(lambda point: body_rate_squared(*point), point, rtol=1e-6)
 

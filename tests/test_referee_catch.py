@@ -300,17 +300,6 @@ def test_a_tilted_thrust_tilts_the_net():
     assert verdict.net_distance[0, 0] == pytest.approx(math.hypot(0.1, 0.003))
 
 
-def test_free_fall_has_no_attitude():
-    leaves = one_target()
-    leaves["coeffs"] = cut(
-        [Polynomial([0.0]), Polynomial([0.0]), Polynomial([9.0, 0.0, -0.5 * GRAVITY])], (0.4, 0.7)
-    )[None]
-    leaves["head_state"][0, 0, 2], leaves["head_state"][0, 2, 2] = 9.0, -GRAVITY
-    leaves["limits.speed"][:], leaves["limits.min_thrust"][:] = np.inf, 0.0
-    verdict = assert_fails(leaves, "body rate", says="without attitude")
-    assert np.isinf(verdict.max_body_rate[0]) and not verdict.caught.any()
-
-
 @pytest.mark.parametrize("drag", [0.0, 1e-9, 1e-3, 0.3, (0.1, 0.6, 4.0), -0.2])
 def test_a_ball_with_linear_drag_is_where_integration_puts_it(drag):
     drag, time = np.broadcast_to(drag, 3).astype(float), 1.7
@@ -412,8 +401,10 @@ def test_caught_targets_are_counted_and_none_is_caught_by_a_broken_plan():
     np.testing.assert_array_equal(judge(lanes).num_caught, [2, 2, 1, 2, 1, 0])
     lanes["gravity"][0] = np.nan
     assert not judge(lanes).caught[0].any()
+    assert not judge(FAILURES["body rate: free fall"][0]).caught.any()
 
 
+FALL = Polynomial([9.0, 0.0, -0.5 * GRAVITY])
 PERIOD = TIMES[1] / 4  # the two pieces that are not flown do not count
 # Arguments of the tests in `test_referees`.
 FAILURES = {
@@ -424,6 +415,14 @@ FAILURES = {
         )
         for k in range(4)
     },
+    "body rate: free fall": failure(
+        one_target(START)
+        | {"coeffs": cut([Polynomial([0]), Polynomial([0]), FALL], (0.4, 0.7))[None]}
+        | {"head_state": np.array([[[0, 0, 9.0], [0, 0, 0], [0, 0, -GRAVITY], [0, 0, 0]]])}
+        | {"limits.speed": np.array([np.inf]), "limits.min_thrust": np.zeros(1)},
+        np.inf,
+        says="without attitude",
+    ),
     "continuity: position": failure(
         edit(good(), {("coeffs", (2, 3, 4, 5), 0, 1): add(0.01)}), 0.01, TIMES[0]
     ),

@@ -54,11 +54,6 @@ def no_report(monkeypatch):
     monkeypatch.setattr(HitSweep, "other_planners", lambda *_: {})
 
 
-@pytest.fixture
-def no_figures(monkeypatch):
-    monkeypatch.setattr(HitSweep, "figures", ())
-
-
 class TestRun(RunTests):
     sweep = HitSweep(TASK)
     figures = ("court.png", "motion.png", "outcomes.png")
@@ -142,9 +137,9 @@ def test_rows_are_picked_across_the_row_groups_of_parts(tmp_path):
 
 
 @pytest.mark.parametrize("step", ["plan_baselines", "write_report"])
-def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(
-    tmp_path, monkeypatch, no_figures, step
-):
+def test_a_sweep_interrupted_behind_its_rows_is_resumed_to_its_report(tmp_path, monkeypatch, step):
+    monkeypatch.setattr(HitSweep, "figures", ())
+
     def interrupt(*_):
         raise KeyboardInterrupt
 
