@@ -31,7 +31,7 @@ def cases_of(suite: str = "triangle3", **how: Any) -> Any:
 
 @pytest.fixture(scope="module")
 def fresh() -> Any:
-    """Weights of every network before any training."""
+    """Return the weights of every network before any training."""
     seen = jnp.zeros((1, 6, FEATURES))
     return {name: kind().init(jax.random.key(0), seen) for name, kind in NETWORKS.items()}
 
@@ -91,7 +91,7 @@ def test_the_shipped_policy_is_solved_and_confirmed_by_the_referee():
 
 
 def test_the_policy_of_hurried_targets_keeps_more_deadlines_than_greedy():
-    """That is, its times lie before the horizons; the name is that of a shipped policy."""
+    """Compare the shares of cases whose decided times all lie before the horizons."""
     cases = jax.tree.map(np.asarray, pj.catch.draw(128, "rush6", 5))
     named = pj.catch.planner(decide="policy:rush6").decision
     kept = {}
@@ -175,7 +175,7 @@ def test_bad_settings_of_a_training_are_a_line(given, says, capsys, tmp_path):
 
 @pytest.mark.parametrize("suite", ["parabola2", "harmonic2", "hexagon6"])
 def test_cases_drawn_by_a_key_are_of_the_suites_distribution(suite):
-    """Means and deviations of where targets are, and of the horizon, are those of `draw`."""
+    """Compare means and deviations of all leaves of the cases with the cases of `draw`."""
     by_key = jax.jit(draw_by_key, static_argnums=(1, 2))(jax.random.key(1), 4000, suite)
     drawn = pj.catch.draw(4000, suite, 3)
     for a, b in zip(jax.tree.leaves(by_key), jax.tree.leaves(drawn), strict=True):

@@ -1,4 +1,4 @@
-"""A training learns, can be watched, and goes on bit for bit where it was interrupted."""
+"""A training learns, can be watched, and continues bit for bit after an interruption."""
 
 import dataclasses
 import json
@@ -29,7 +29,7 @@ PART = training.Part(steps=ROWS * LANES, learning_rate=1e-3)
 
 @pytest.fixture(scope="module")
 def hasty() -> Policy:
-    """A policy whose times are a quarter too early."""
+    """Return a policy whose times are a quarter too early."""
     network = Mlp()
     params: Any = network.init(jax.random.key(0), jnp.zeros((1, 3, FEATURES)))
     params = jax.tree.map(np.array, params)
@@ -39,7 +39,7 @@ def hasty() -> Policy:
 
 @pytest.fixture(scope="module")
 def asked(hasty, tmp_path_factory) -> Any:
-    """A training by the estimate that begins with it."""
+    """Return a training by the estimate that starts from the hasty policy."""
     path = tmp_path_factory.mktemp("hasty") / "hasty.npz"
     save_checkpoint(path, hasty.params, hasty.network, {})
     return training.Training(
@@ -56,13 +56,13 @@ def asked(hasty, tmp_path_factory) -> Any:
 
 @pytest.fixture(scope="module")
 def trained(asked, tmp_path_factory) -> Any:
-    """The policy and folder of that training."""
+    """Return the trained policy and the folder of its training."""
     out = tmp_path_factory.mktemp("trained")
     return training.train(asked, out, progress=False), out
 
 
 def feasible(found: Policy) -> float:
-    """The share of decisions that the estimate has within reach."""
+    """Return the share of decisions that are within reach by the estimate."""
     cases = draw_by_key(jax.random.key(9), 500, SUITE)
     far = jax.jit(jax.vmap(shortfall))(cases, first_choice(found, cases))
     return float((np.asarray(far) <= 0.0).mean())
@@ -112,7 +112,7 @@ def test_a_run_of_other_settings_is_not_gone_on_with(asked, trained):
 
 @pytest.mark.slow
 def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, monkeypatch):
-    """In the middle of its second part, of which a torn checkpoint was left."""
+    """Interrupt the second part in its middle, and leave a torn checkpoint of it."""
     asked = dataclasses.replace(asked, parts=(PART, PART))
     whole, cut = tmp_path / "whole", tmp_path / "cut"
     one = training.train(asked, whole, progress=False)
@@ -121,12 +121,12 @@ def test_training_goes_on_bit_for_bit_where_it_was_interrupted(asked, tmp_path, 
     def stopping(asked: Any, part: Any, number: int, *others: Any) -> Any:
         *others, tell = others
 
-        def told(decisions: int, metrics: Any) -> None:
+        def report_or_interrupt(decisions: int, metrics: Any) -> None:
             tell(decisions, metrics)
             if number == 1 and decisions > PART.steps // 2:
                 raise KeyboardInterrupt
 
-        return plain(asked, part, number, *others, told)
+        return plain(asked, part, number, *others, report_or_interrupt)
 
     monkeypatch.setattr(training, "_train_part", stopping)
     with pytest.raises(KeyboardInterrupt):
