@@ -122,19 +122,19 @@ def optimal_plan(
     if case.batch_shape != ():
         shown = f"batch shape {case.batch_shape}; for batches use pj.gradient or jax.vmap"
         raise ArgumentError("case", "one case", shown=shown)
-    planner, case = planner.settle(case)
+    minimiser, case = planner.settle(case)
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
-    context = planner.prepare(case)
-    start = lax.stop_gradient(planner.guesses(context, 1)[0])
+    context = minimiser.prepare(case)
+    start = lax.stop_gradient(minimiser.guesses(context, 1)[0])
     # Gradients of this size, relative to the cost, can be due to rounding alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:
-        return planner.objective(point, context).cost
+        return minimiser.objective(point, context).cost
 
     def solve(_: Callable, start: Array) -> tuple[Array, Array]:
         def objective(point: Array):
-            return planner.objective(point, context)
+            return minimiser.objective(point, context)
 
         found = minimise(objective, start, solver)
         tolerance = stationarity * jnp.abs(found.evaluation.cost)
@@ -145,6 +145,6 @@ def optimal_plan(
         return jnp.linalg.solve(jax.jacobian(hessian_product)(rhs), rhs)
 
     point, excess = lax.custom_root(jax.grad(cost), start, solve, tangent_solve, has_aux=True)
-    plan = planner.decode(point, context).replace(cost=cost(point))
+    plan = minimiser.decode(point, context).replace(cost=cost(point))
     plan = plan.replace(status=status_of(plan.cost, plan.violation, excess <= 1e3))
     return mark_bad_input(plan, case)

@@ -83,7 +83,8 @@ def minimise_lanes(
     def search(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
         @over_lanes
         def step(state: PyTree, context: PyTree) -> PyTree:
-            by_point = curved and (lambda x: curved(x, context))
+            own = curved
+            by_point = own and (lambda x: own(x, context))
             return _step(lambda x: objective(x, context), by_point, state, config)
 
         if steps <= _COUNTED:

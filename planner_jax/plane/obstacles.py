@@ -65,7 +65,7 @@ def obstacles(
     if shape not in ((), (2,), (len(checked), 2)):
         rule = f"the shape (2,) or ({len(checked)}, 2)"
         raise ArgumentError("velocities", rule, shape, verb="have")
-    if not np.isfinite(velocities).all():
+    if not np.isfinite(np.asarray(velocities)).all():
         raise ArgumentError("velocities", "finite", velocities)
     speeds = np.broadcast_to(np.asarray(velocities, float), (len(checked), 2))
     centre, velocity = np.zeros((num, 2)), np.zeros((num, 2))

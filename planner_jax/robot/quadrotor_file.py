@@ -360,8 +360,9 @@ def _parse(part: Value, kind: str, span: bool) -> list[float]:
         if not math.isfinite(part):
             raise QuantityError(f"must be finite, got {part}")
         return [float(part)]
-    text = part.replace(" to ", " ") if span and isinstance(part, str) else part
-    match = _QUANTITY.fullmatch(text) if isinstance(text, str) and len(part) <= _LONGEST else None
+    match = None
+    if isinstance(part, str) and len(part) <= _LONGEST:
+        match = _QUANTITY.fullmatch(part.replace(" to ", " ") if span else part)
     if match is None:
         raise QuantityError(rule)
     unit = " ".join((match[2] or "").replace("*", " ").split())

@@ -116,9 +116,10 @@ class SumOfSquares:
     Only the entries of g that may differ from zero are multiplied.
     """
 
-    def __init__(self, size: int, sums: dict[tuple[int, int], Array] | None = None):
+    def __init__(self, size: int, sums: Mapping[tuple[int, int], Array] | None = None):
         """Start from the sums of the entries (a, b), a <= b, of a matrix of a size."""
-        self._size, self._sums = size, dict(sums or {})
+        self._size = size
+        self._sums: dict[tuple[int, int], Array | float] = dict(sums or {})
 
     def add(self, row: Mapping[int, Array | float], weight: Array | float = 1.0) -> None:
         """Add the products of the entries of one residual's g, by their indices."""
