@@ -49,7 +49,7 @@ def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
         seconds.append(time.perf_counter() - began)
         busy.append(time.process_time() - cpu_began)
     together: Any = jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
-    success, claims = pj.block.judge(cases, together).success, pj.solved(together)
+    success, claims = pj.block.judge(cases, together).success, pj.are_solved(together)
     refused = int((claims & ~success).sum())
     p50, p99 = 1e3 * np.percentile(seconds, [50, 99])
     mean = 1e3 * float(np.mean(seconds))

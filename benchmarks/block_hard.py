@@ -29,7 +29,7 @@ def main() -> None:
     planner = pj.block.planner()
     with begin(parser, options) as bench:
         cases = pj.block.draw(options.num, "pole", options.seed, regime=options.regime)
-        hard = np.flatnonzero(~pj.solved(pj.plan(STRAIGHT, cases)))
+        hard = np.flatnonzero(~pj.are_solved(pj.plan(STRAIGHT, cases)))
         if not hard.size:
             bench.say("A straight motion blocks every throw.")
             return
@@ -37,7 +37,7 @@ def main() -> None:
         calls = [measure_warm(lambda: pj.plan(planner, some)) for _ in range(options.repeat)]
         (plans, _), seconds = calls[0], [each for _, each in calls]
         success = pj.block.judge(some, plans).success
-        refused = int((pj.solved(plans) & ~success).sum())
+        refused = int((pj.are_solved(plans) & ~success).sum())
         gaps = cost_gaps(planner, some, plans, card=task_named("block"))
         bench.count(success, gaps)
         bench.note(seconds=min(seconds), refused=refused)

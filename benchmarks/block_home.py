@@ -58,7 +58,7 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
     """Return the share of throws that the planner reports as solved, for each home pose, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
-    return pj.solved(plans).reshape(len(homes), -1).mean(axis=1)
+    return pj.are_solved(plans).reshape(len(homes), -1).mean(axis=1)
 
 
 def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
@@ -140,7 +140,7 @@ def main() -> None:
                 plans = pj.plan(planner, cases)
                 success = pj.block.judge(cases, plans).success
                 straight = success & (np.asarray(plans.iterations) == 0)
-                refused = (pj.solved(plans) & ~success).sum()
+                refused = (pj.are_solved(plans) & ~success).sum()
                 bench.say(
                     f"| {name} ({', '.join(f'{angle:.3f}' for angle in home)}) | {delay:g} s "
                     f"| {100 * success.mean():.1f} % | {100 * straight.mean():.1f} % | {refused} |"

@@ -131,7 +131,7 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
                 plans = pj.plan(planner, cases)
                 verdict: Any = pj.block.judge(cases, plans)
                 found = np.asarray(plans.status) != pj.Status.OUT_OF_REACH
-                claims = pj.solved(plans)
+                claims = pj.are_solved(plans)
                 refused = int((claims & ~verdict.success).sum())
                 bench.say(
                     f"{suite}, {met}, delay {delay} s: stored for {100 * found.mean():.1f} %, "

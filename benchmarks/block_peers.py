@@ -134,7 +134,7 @@ def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
 
 def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
     """Return which plans (B,) are free of collision, in time or not."""
-    claims = pj.solved(plans)
+    claims = pj.are_solved(plans)
     late = np.isfinite(plans.violation) & (verdict.failed_limit == "time")
     return (claims & verdict.success) | (late & ~claims)
 

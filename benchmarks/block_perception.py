@@ -298,7 +298,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
         moments = moments_of(first, last, rate)
         done = decide(planner, cases, sensor, moments, overhead=OVERHEAD, seed=seed, **options)
         met = end_at_contact(done.cases, done.plans)
-        some = pj.solved(met)
+        some = pj.are_solved(met)
         verdict = pj.block.judge(done.cases, met)
         anywhere = dataclasses.replace(
             done.cases,
@@ -344,11 +344,11 @@ def planning(bench: Bench, num: int, seed: int) -> None:
     first, later = (jax.tree.map(np.asarray, each) for each in known)
     plans, seconds = time_with_aims(planner, first)
     tasks = ReplanBlock().begin(first, plans, later.delay - first.delay, ball=later.ball)
-    moving = pj.take(tasks, np.flatnonzero(pj.solved(plans)))
+    moving = pj.take(tasks, np.flatnonzero(pj.are_solved(plans)))
     again, more = time_with_aims(ReplanBlock(), moving)
     rows = (("first", seconds, plans), ("next", more, again))
     for name, spent, found in rows:
-        some = pj.solved(found)
+        some = pj.are_solved(found)
         quick, slow = 1e3 * np.percentile(spent, [50, 99])
         bench.say(
             "",
@@ -379,7 +379,7 @@ def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
             entry = pj.take(each, k)
             plan, spent = measure_warm(lambda entry=entry: pj.plan(planner, entry))
             seconds[k] += spent
-            if pj.solved(plan):
+            if pj.are_solved(plan):
                 break
         found.append(plan)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *found), seconds

@@ -98,7 +98,7 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
         here = index[first : first + size]
         some = pj.take(cases, np.resize(here, size))
         plans = jax.device_get(long_search(some, *given))
-        good = pj.block.judge(some, plans).success & pj.solved(plans)
+        good = pj.block.judge(some, plans).success & pj.are_solved(plans)
         found.append(good[: len(here)])
     return np.concatenate([np.zeros(0, bool), *found])
 
@@ -106,7 +106,7 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
 def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
     """Return which cases (B,) a planner blocks, by the referee."""
     plans = pj.plan(planner, cases)
-    return np.asarray(pj.block.judge(cases, plans).success & pj.solved(plans))
+    return np.asarray(pj.block.judge(cases, plans).success & pj.are_solved(plans))
 
 
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:

@@ -294,7 +294,7 @@ def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: flo
     report_times(bench, "from scratch, with order and time fixed", scratch)
     report_times(bench, "re-plan alone", seconds)
     cases, plans = stack(replans)
-    bench.say(f"solved {100.0 * pj.solved(plans).mean():.2f} %")
+    bench.say(f"solved {100.0 * pj.are_solved(plans).mean():.2f} %")
     success = judge(cases.case, [found for _, found in replans])["success"]
     bench.count(success, cost_gaps(AGAIN, cases, plans))
 

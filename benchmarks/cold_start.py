@@ -20,7 +20,7 @@ FIRST_PLANS = """
 import planner_jax as pj
 pj.keep_compiled_programs()
 plans = pj.plan(pj.hit.planner("exact"), pj.hit.draw({num}))
-print(int(pj.solved(plans).sum()), "of {num} solved")
+print(int(pj.are_solved(plans).sum()), "of {num} solved")
 plans.save({path!r})
 """
 

@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from planner_jax.core.protocol import solved
+from planner_jax.core.protocol import are_solved
 from planner_jax.core.registry import Task
 from planner_jax.optimise.planner import OptimisedPlanner
 from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stage
@@ -55,7 +55,7 @@ def cost_gaps(
     if longer is None:
         return None
     best = plan(longer, cases, devices=devices)
-    both = solved(plans) & solved(best)
+    both = are_solved(plans) & are_solved(best)
     return plans.cost[both] / best.cost[both] - 1.0
 
 

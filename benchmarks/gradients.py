@@ -149,7 +149,7 @@ def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few:
     found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
         best = differentiate(_double(few), curvature="whole", solver=_LONG)
-    num, lanes = len(found.value), np.flatnonzero(pj.solved(best.plans))
+    num, lanes = len(found.value), np.flatnonzero(pj.are_solved(best.plans))
     gradient = [_flat(each, num) for each in (found, best)]
     residual = np.nanquantile(np.asarray(found.residual)[lanes], (0.5, 0.9))
     late = np.abs(np.asarray(found.value) - np.asarray(best.value))[lanes]

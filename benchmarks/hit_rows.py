@@ -74,7 +74,7 @@ def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
         "plans_per_second_warm": success.size / warm,
         "median_cost": np.median(plans.cost),
         **gap_figures(gaps),
-        "refused_by_referee_alone": (pj.solved(plans) & ~success).sum(),
+        "refused_by_referee_alone": (pj.are_solved(plans) & ~success).sum(),
         "largest_landing_error": verdict.landing_error[success].max(initial=0.0),
     }
 

@@ -28,7 +28,7 @@ from planner_jax.runs.timing import measure_plans
 def begin_replans(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
     """Return the re-planner and its problems, `elapsed` seconds into solved plans of a batch."""
     plans = pj.plan(planner, cases)
-    lanes = np.flatnonzero(pj.solved(plans) & (np.asarray(plans.time) > elapsed))
+    lanes = np.flatnonzero(pj.are_solved(plans) & (np.asarray(plans.time) > elapsed))
     cases, plans = jax.tree.map(np.asarray, pj.take((cases, plans), lanes))
     since: Any = np.full(len(lanes), elapsed, cases.time.dtype)
     again = planner.replanner()

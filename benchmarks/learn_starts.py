@@ -304,7 +304,7 @@ def compare(bench: Bench, task: str, num: int) -> None:
     for iterations in spec.iterations:
         for name, planner in planners.items():
             plans = pj.plan(planner.with_solver(pj.LbfgsConfig(max_steps=iterations)), cases)
-            holds = pj.solved(plans)
+            holds = pj.are_solved(plans)
             quantiles = np.quantile(plans.cost / best - 1.0, (0.5, 0.9, 0.99))
             text = ", ".join(f"{100.0 * each:.2f} %" for each in quantiles)
             bench.say(f"| {name} | {iterations} | {100.0 * holds.mean():.2f} % | {text} |")

@@ -126,7 +126,7 @@ def main() -> None:
             points, iterations, seconds = runs[name](budget)
             cost = np.asarray(final(cases, points))
             success = pj.hit.judge(cases, decode(cases, points)).success
-            gaps = (cost / best.cost - 1.0)[success & pj.solved(best)]
+            gaps = (cost / best.cost - 1.0)[success & pj.are_solved(best)]
             bench.say(
                 f"| {name} | {iterations:.0f} of {budget} | {1e3 * seconds / options.num:.3f} | "
                 f"{np.median(cost):.3g} | {cost.mean():.3g} | {100 * success.mean():.1f} % |"

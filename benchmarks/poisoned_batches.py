@@ -76,7 +76,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
         "others": others.size,
         "unchanged": int(same[others].sum()),
         "marked_others": int((found.status[others] == pj.Status.BAD_INPUT).sum()),
-        "solved_others": int(pj.solved(found)[others].sum()),
+        "solved_others": int(pj.are_solved(found)[others].sum()),
     }
 
 

@@ -187,7 +187,7 @@ def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
     plans = jax.device_get(pj.plan(planner, cases))
     seconds = time.perf_counter() - began
     verdict = row.card.judge(cases, plans, **row.judge)
-    claimed, accepted = np.asarray(pj.solved(plans)), np.asarray(verdict.success)
+    claimed, accepted = np.asarray(pj.are_solved(plans)), np.asarray(verdict.success)
     refused, unclaimed = claimed & ~accepted, accepted & ~claimed
     return {
         "num": claimed.size,

@@ -14,7 +14,7 @@ for all tasks:
 * `keep_compiled_programs`: keeps compiled programs on the disk
 * `replan`: plans again from a plan that is being executed
 * `gradient`: differentiates a number of every plan; `optimal_plan`: does so inside a loss
-* `take`, `solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
+* `take`, `are_solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
 * `export`: writes one plan to a file for a controller
 
 Classes for parts of cases and plans:

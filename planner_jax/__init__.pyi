@@ -13,8 +13,8 @@ from .core.planner import Planner as Planner
 from .core.protocol import Attempt as Attempt
 from .core.protocol import Plan as Plan
 from .core.protocol import Status as Status
+from .core.protocol import are_solved as are_solved
 from .core.protocol import outcome as outcome
-from .core.protocol import solved as solved
 from .core.protocol import take as take
 from .core.registry import Task as Task
 from .core.registry import task_named as task_named

@@ -29,7 +29,7 @@ from brax.training.distribution import NormalTanhDistribution
 from jax import Array
 
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import solved
+from planner_jax.core.protocol import are_solved
 from planner_jax.host import signals as stopping
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
@@ -172,7 +172,7 @@ def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, 
     for suite in training.suites:
         cases: Any = jax.tree.map(np.asarray, draw(training.eval_cases, suite, _EVAL_SEED))
         plans = plan(decided, cases)
-        good = solved(plans)
+        good = are_solved(plans)
         figures[suite] = {
             "success": float(good.mean()),
             "last": float(plans.times[good, -1].mean()) if good.any() else None,

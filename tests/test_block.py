@@ -202,7 +202,7 @@ def test_claims_are_confirmed_by_the_referee():
         plans = pj.plan(planner, cases)
         verdict: Any = pj.block.judge(cases, plans)
         assert verdict.success.mean() >= least
-        np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+        np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
     one = pj.plan(planner, pj.take(cases, 3))
     assert one.status == plans.status[3]
     np.testing.assert_allclose(one.contact_time, plans.contact_time[3], atol=1e-4)
@@ -223,8 +223,8 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
     assert names == ["OUT_OF_REACH", "BAD_INPUT", "BLOCKED", "OUT_OF_REACH"]
     assert verdict.failed_limit[2] == "not finite" and not verdict.success[6]
     others = [0, 3, 4, 5]
-    assert pj.solved(plans)[others].sum() >= 3
-    np.testing.assert_array_equal(verdict.success[others], pj.solved(plans)[others])
+    assert pj.are_solved(plans)[others].sum() >= 3
+    np.testing.assert_array_equal(verdict.success[others], pj.are_solved(plans)[others])
     setpoints = plans.sample(100.0)
     np.testing.assert_allclose(setpoints.angles[0, 0], cases.angles[0], atol=1e-6)
 
@@ -234,8 +234,8 @@ def test_brisk_motions_end_before_the_ball_is_there():
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
     plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))
-    some = pj.solved(quick)
-    np.testing.assert_array_equal(some, pj.solved(plans))
+    some = pj.are_solved(quick)
+    np.testing.assert_array_equal(some, pj.are_solved(plans))
     assert some.sum() >= 4 and some[4]
     verdict: Any = pj.block.judge(cases, quick)
     assert verdict.success[some].all()

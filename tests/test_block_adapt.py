@@ -145,7 +145,7 @@ def test_statuses_name_the_reason_and_the_referee_confirms_solved_plans(planned)
     assert plans.status[1] == S.OUT_OF_REACH and plans.status[2] == S.BAD_INPUT
     assert [S(int(s)) for s in plans.status[3:6]] == [S.BLOCKED] * 3
     verdict: Any = pj.block.judge(cases, plans)
-    assert pj.solved(plans)[GOOD].all() and verdict.success[GOOD].all()
+    assert pj.are_solved(plans)[GOOD].all() and verdict.success[GOOD].all()
 
 
 def test_invalid_files_and_cases_are_rejected(tmp_path):
@@ -173,6 +173,6 @@ def test_the_referee_confirms_warped_and_refined_motions(tmp_path):
     for efforts in (own.efforts[:1], own.efforts):
         plans = pj.plan(dataclasses.replace(own, efforts=efforts), cases)
         verdict: Any = pj.block.judge(cases, plans)
-        assert not (pj.solved(plans) & ~verdict.success).any()
-        blocked.append(pj.solved(plans))
+        assert not (pj.are_solved(plans) & ~verdict.success).any()
+        blocked.append(pj.are_solved(plans))
     assert (blocked[1] | ~blocked[0]).all() and blocked[1].sum() > blocked[0].sum() > 0

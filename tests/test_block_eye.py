@@ -71,7 +71,7 @@ def test_an_unseen_ball_is_a_status_of_fit_and_plan():
 def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime=regime, wide=True))
     plans = pj.plan(SMALL, cases)
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     met = end_at_contact(cases, plans)
     assert solved.sum() >= 3
     np.testing.assert_allclose(met.contact_time[solved], plans.contact_time[solved], atol=2e-4)
@@ -84,7 +84,7 @@ def test_a_late_ball_meets_the_braking_arm():
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
     near_middle = cautious(cases, offset=0.01)
     plans = pj.plan(SMALL, jax.tree.map(np.asarray, near_middle))
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     assert solved.sum() >= 3
     back = jax.vmap(drag_free_flight)(cases.ball, np.full(6, -0.01, np.float32), cases.gravity)
     late = dataclasses.replace(cases, ball=back)

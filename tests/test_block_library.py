@@ -462,7 +462,7 @@ def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypa
     assert not (found.claimed & ~found.verdict.success).any()
     planner = pj.block.planner(f"library:{path}")
     plans = pj.plan(planner, found.cases)
-    np.testing.assert_array_equal(pj.solved(plans), found.claimed)
+    np.testing.assert_array_equal(pj.are_solved(plans), found.claimed)
     # 0.1 m farther, where some of the motions pass and the arm at home is free.
     shifted: Any = np.array([0.8926, 0.05], np.float32)
     scene = dataclasses.replace(paper_scene(), pole=shifted)

@@ -113,8 +113,8 @@ def test_direct_is_confirmed_by_the_referee_and_reports_each_failure():
     plans = jax.device_get(pj.plan(planner, jax.tree.map(jnp.asarray, cases)))
     verdict = pj.block.judge(cases, plans)
     assert list(plans.status[[1, 2]]) == [pj.Status.OUT_OF_REACH, pj.Status.BAD_INPUT]
-    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
-    assert pj.solved(plans)[[0, 3, 4, 5]].all()
+    np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
+    assert pj.are_solved(plans)[[0, 3, 4, 5]].all()
     np.testing.assert_allclose(verdict.execution_time[3:], plans.cost[3:], rtol=1e-5)
     cases.limits.acceleration[:] = 0.5
     late = jax.device_get(pj.plan(planner, jax.tree.map(jnp.asarray, cases)))

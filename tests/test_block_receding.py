@@ -32,16 +32,16 @@ def cases():
 
 def judge(done):
     plans = end_at_contact(done.cases, done.plans)
-    return pj.block.judge(done.cases, plans), pj.solved(plans)
+    return pj.block.judge(done.cases, plans), pj.are_solved(plans)
 
 
 def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
     done = decide(SMALL, cases, eye(std=1e-6), [0.25], aims=AIMS[:1])
     aimed = cautious(dataclasses.replace(cases, delay=done.cases.delay), offset=AIMS[0].offset)
     plans = pj.plan(SMALL, jax.tree.map(np.asarray, aimed))
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     assert solved.sum() >= 2
-    np.testing.assert_array_equal(pj.solved(done.plans), solved)
+    np.testing.assert_array_equal(pj.are_solved(done.plans), solved)
     np.testing.assert_allclose(
         done.plans.contact_time[solved], plans.contact_time[solved], atol=1e-3
     )
@@ -86,12 +86,12 @@ def test_a_ball_that_is_never_seen_leaves_the_arm_at_home(cases):
 @pytest.mark.slow
 def test_replanning_starts_from_the_motion_with_the_new_ball(cases):
     plans = pj.plan(SMALL, cases)
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     off = np.array([0.0, 0.03, 0.03], np.float32)
     ball = dataclasses.replace(cases.ball, pos=cases.ball.pos + off)
     tasks = AGAIN.begin(cases, plans, 0.1, ball=ball)
     warm = pj.plan(AGAIN.warm, tasks)
-    both = solved & pj.solved(warm)
+    both = solved & pj.are_solved(warm)
     assert both.sum() >= 3
     assert pj.block.judge(take(tasks.case, both), take(warm, both)).success.all()
     again = pj.replan(AGAIN, cases, plans, 0.1, ball=ball)
@@ -100,7 +100,7 @@ def test_replanning_starts_from_the_motion_with_the_new_ball(cases):
 
 def test_a_late_motion_has_a_later_contact_or_fails(cases):
     plans = pj.plan(SMALL, cases)
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     in_time = delay_motion(cases, plans, np.zeros(6, np.float32))
     np.testing.assert_array_equal(in_time.contact_time, plans.contact_time)
     assert pj.block.judge(cases, in_time).success[solved].all()

@@ -276,11 +276,11 @@ def test_every_status_is_a_status_and_solved_says_which_are_good(entry):
     plans = entry.plans
     assert isinstance(plans, Plan)
     assert plans.status.dtype == plans.iterations.dtype == np.int32
-    good = pj.solved(plans)
+    good = pj.are_solved(plans)
     assert good.dtype == bool and good.shape == (NUM,)
     for k in range(NUM):
         status = pj.Status(plans.status[k])
-        assert good[k] == is_solved(status) == pj.solved(pj.take(plans, k))
+        assert good[k] == is_solved(status) == pj.are_solved(pj.take(plans, k))
         assert good[k] == (status in (pj.Status.CONVERGED, pj.Status.FEASIBLE))
         assert not good[k] or plans.violation[k] <= 5e-4
 
@@ -411,7 +411,7 @@ def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
         return
     found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
     if not searches_first:  # the search continues from the plans
-        assert (pj.solved(found.plans) | ~pj.solved(entry.plans)).all()
+        assert (pj.are_solved(found.plans) | ~pj.are_solved(entry.plans)).all()
     there = np.isfinite(found.residual)
     assert found.residual.shape == found.value.shape == (NUM,)
     by = entry.gradient["by"]

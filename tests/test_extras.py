@@ -177,12 +177,12 @@ def test_a_case_gives_its_extras_the_shape_of_the_batch():
 def test_plans_avoid_obstacles_and_the_referee_rejects_plans_through_them(
     hits, free, blocked, around
 ):
-    assert pj.solved(free).all() and pj.hit.judge(hits, free).success.all()
+    assert pj.are_solved(free).all() and pj.hit.judge(hits, free).success.all()
     verdict = pj.hit.judge(blocked, free)
     assert (verdict.failed_limit == "extra").all() and (verdict.worst_extra == 0).all()
     assert verdict.failed_excess.min() > 0.7
     assert "beyond extras[0] of the case at " in verdict.sentence(0)
-    assert pj.solved(around).all()
+    assert pj.are_solved(around).all()
     verdict = pj.hit.judge(blocked, around)
     assert verdict.success.all(), [verdict.sentence(k) for k in range(4)]
 
@@ -278,7 +278,7 @@ def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
         low = middle + random.normal(0.0, 0.08, (NUM, 3)) - half
         cases = having(hits, low=low, size=2.0 * half)
         plans = pj.plan(HIT, cases)
-        verdict, solved = pj.hit.judge(cases, plans), pj.solved(plans)
+        verdict, solved = pj.hit.judge(cases, plans), pj.are_solved(plans)
         num_solved += solved.sum()
         assert verdict.success[solved].all(), [verdict.sentence(k) for k in range(NUM)]
         broken = verdict.failed_limit == "extra"
@@ -334,7 +334,7 @@ def test_catches_stay_inside_a_fence():
     assert (verdict.failed_limit == "extra").all() and (verdict.worst_extra == 0).all()
     kept = pj.plan(CATCH, fenced)
     verdict = pj.catch.judge(fenced, kept)
-    assert pj.solved(kept).all() and verdict.success.all(), verdict.failed_limit
+    assert pj.are_solved(kept).all() and verdict.success.all(), verdict.failed_limit
 
 
 @pytest.mark.slow

@@ -135,7 +135,7 @@ def planned():
 def test_the_referee_confirms_the_planner(planned):
     cases, plans = planned
     verdict = pj.intercept.judge(cases, plans)
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     assert solved.sum() >= 10
     np.testing.assert_array_equal(verdict.success, solved)
     assert verdict.miss[solved].max() <= 0.05
@@ -147,12 +147,12 @@ def test_best_also_solves_starts_beside_walls_without_space_for_margins():
     cases = pj.take(pj.intercept.draw(600, "hard", 1), np.array([20, 176, 291, 506]))
     usual, best = (pj.plan(pj.intercept.planner(name), cases) for name in ("spacetime", "best"))
     success = pj.intercept.judge(cases, best).success
-    assert success.sum() > pj.solved(usual).sum() and (success | ~pj.solved(best)).all()
+    assert success.sum() > pj.are_solved(usual).sum() and (success | ~pj.are_solved(best)).all()
 
 
 def test_a_plan_is_sampled_at_a_rate_up_to_its_end(planned):
     cases, plans = planned
-    k = int(np.argmax(pj.solved(plans)))
+    k = int(np.argmax(pj.are_solved(plans)))
     one = pj.take(plans, k).sample(50.0)
     assert one.time.shape == (501,) and one.pos.shape == (501, 2)
     np.testing.assert_allclose(one.pos[0], cases.start[k, :2], atol=1e-5)
@@ -248,13 +248,13 @@ def test_an_early_meeting_is_little_later_than_a_straight_drive(early):
 @pytest.mark.slow
 def test_a_plan_stays_the_same_for_an_unchanged_target(planned):
     cases, plans = planned
-    good = np.flatnonzero(pj.solved(plans))
+    good = np.flatnonzero(pj.are_solved(plans))
     cases, plans = pj.take((cases, plans), good)
     elapsed = 2.0
     target = jax.vmap(lambda path: path.at(elapsed))(cases.target)
     turned = pj.TurningPath(target.pos, target.vel, cases.target.turn_rate)
     again = pj.replan(PLANNER, cases, plans, elapsed, target=turned)
-    assert pj.solved(again).all()
+    assert pj.are_solved(again).all()
     np.testing.assert_allclose(again.time, 8.0, atol=1e-5)
     np.testing.assert_allclose(again.meeting, plans.meeting, atol=1e-3)
     before, after = plans.sample(10.0), again.sample(10.0)
@@ -282,12 +282,12 @@ def test_latency_plans_the_remainders_of_solved_plans_again(planned):
     cases, plans = planned
     planner, tasks = begin_replans(PLANNER, cases, 2.0)
     assert planner == PLANNER.replanner()
-    assert len(tasks.case.time) == pj.solved(plans).sum()
+    assert len(tasks.case.time) == pj.are_solved(plans).sum()
     np.testing.assert_allclose(tasks.case.time, 8.0, atol=1e-5)
     goals = [
         jax.vmap(lambda path, t: path.at(t).pos)(c.target, c.time) for c in (tasks.case, cases)
     ]
-    np.testing.assert_allclose(goals[0], goals[1][pj.solved(plans)], atol=1e-4)
+    np.testing.assert_allclose(goals[0], goals[1][pj.are_solved(plans)], atol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ def test_a_batch_has_gradients_of_its_plans():
     found = pj.gradient(planner, cases, of="time", by=["limits.acceleration", "movers.centre"])
     np.testing.assert_allclose(found.value, found.plans.time)
     assert found.by["movers.centre"].shape == cases.movers.centre.shape
-    good = pj.solved(found.plans)
+    good = pj.are_solved(found.plans)
     by_limit = found.by["limits.acceleration"][good]
     assert good.sum() > 4 and (by_limit < 1e-3).all() and (by_limit < -0.1).any()
 
@@ -134,7 +134,7 @@ def test_an_optimal_plan_has_the_same_gradient(float64):
         return plan.time, plan
 
     slope, plan = jax.jit(jax.grad(time, has_aux=True))(case.limits.acceleration)
-    assert pj.solved(plan)
+    assert pj.are_solved(plan)
     smooth, case = planner.settle(case)
     found = differentiate(smooth, duration, BY, 1)(move_to_optimum(smooth, case))
     assert slope == pytest.approx(float(found.by["limits.acceleration"]), rel=1e-3)

@@ -129,7 +129,7 @@ def test_the_referee_confirms_solved_groups(planned, decide):
     groups, plans = planned[0], planned[1][decide]
     verdict = pj.group.judge(groups, plans)
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(plans))
-    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
     assert verdict.success[:5].sum() >= 4 and plans.status[5] == pj.Status.NO_PATH
     good = np.flatnonzero(verdict.success)
     assert (verdict.num_met[good] == 2).all()
@@ -148,8 +148,8 @@ def test_groups_can_be_planned_inside_a_compiled_function(planned):
 
 def test_the_best_order_is_no_later_than_the_greedy_one(planned):
     best, greedy = planned[1]["best"], planned[1]["greedy"]
-    both = pj.solved(best) & pj.solved(greedy)
-    assert pj.solved(best).sum() >= pj.solved(greedy).sum()
+    both = pj.are_solved(best) & pj.are_solved(greedy)
+    assert pj.are_solved(best).sum() >= pj.are_solved(greedy).sum()
     assert np.all(best.cost[both] <= greedy.cost[both] + 1e-3)
     same = both & (best.order == greedy.order).all(axis=1)
     assert same.any()
@@ -158,7 +158,7 @@ def test_the_best_order_is_no_later_than_the_greedy_one(planned):
 
 @pytest.mark.parametrize("decide", ["best", "greedy"])
 def test_one_group_is_planned_as_in_a_batch(planned, decide):
-    k = int(np.argmax(pj.solved(planned[1][decide])))
+    k = int(np.argmax(pj.are_solved(planned[1][decide])))
     one, batch = pj.plan(planner(decide), pj.take(planned[0], k)), pj.take(planned[1][decide], k)
     assert one.status == batch.status and one.order.tolist() == batch.order.tolist()
     np.testing.assert_allclose(one.cost, batch.cost, atol=1e-3)
@@ -167,7 +167,7 @@ def test_one_group_is_planned_as_in_a_batch(planned, decide):
 
 def test_each_leg_starts_where_the_previous_leg_ends(planned):
     plans = planned[1]["best"]
-    plan = pj.take(plans, int(np.argmax(pj.solved(plans))))
+    plan = pj.take(plans, int(np.argmax(pj.are_solved(plans))))
     first, second = (pj.take(plan.legs, k) for k in (0, 1))
     end = pose_at(first.start, first.time, first.speed, first.curvature, first.time)
     np.testing.assert_allclose(second.start, end, atol=1e-5)
@@ -184,7 +184,7 @@ def test_one_target_is_planned_as_an_interception(planned):
     leg = jax.vmap(lambda group, car: group.leg(0, jnp.float32(0.0), car))
     alone = pj.plan(LEGS, numpy(jax.jit(leg)(groups, cars)))
     np.testing.assert_array_equal(plans.status, alone.status)
-    solved = pj.solved(alone)
+    solved = pj.are_solved(alone)
     assert solved.sum() >= 4
     np.testing.assert_allclose(plans.cost[solved], alone.time[solved], rtol=1e-6)
     np.testing.assert_allclose(plans.legs.speed[solved, 0], alone.speed[solved], atol=1e-6)
@@ -198,7 +198,7 @@ def change_legs(plans, **changes):
 
 def test_the_referee_rejects_a_plan_with_a_wrong_leg(planned):
     groups, plans = planned[0], planned[1]["best"]
-    good = np.flatnonzero(pj.solved(plans))
+    good = np.flatnonzero(pj.are_solved(plans))
     groups, plans = pj.take((groups, plans), good)
     legs = plans.legs
     shorter = np.array([1.0, 0.9, 1.0, 1.0], np.float32)

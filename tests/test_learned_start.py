@@ -30,7 +30,7 @@ def test_the_learnt_guess_costs_a_hundredth_and_little_more_than_the_optimum(tas
         for own in (planner, dataclasses.replace(planner, learned=False))
     )
     ended = pj.plan(planner, cases)
-    assert pj.solved(ended).all()
+    assert pj.are_solved(ended).all()
     assert np.median(smooth / ended.cost) > 1.5
     assert np.median(learnt / ended.cost) < 1.1
     assert np.all(learnt <= smooth)
@@ -42,7 +42,7 @@ def test_late_hits_begin_where_a_few_iterations_find_what_all_guesses_do_not():
 
     def share(learned):
         planner = pj.hit.ExactHit(learned=learned, rounds=(search,))
-        return pj.solved(pj.plan(planner, late)).mean()
+        return pj.are_solved(pj.plan(planner, late)).mean()
 
     assert share(True) > share(False) + 0.1
 

@@ -185,7 +185,7 @@ def exact(meet, float64):
 def test_a_lane_that_is_not_finite_says_so_and_leaves_its_neighbours_alone(meet, name):
     cases, planner = jax.tree.map(np.array, meet.draw(6, seed=1)), meet.planner(name)
     plans = pj.plan(planner, cases)
-    assert pj.solved(plans).all() and meet.judge(cases, plans).success.all()
+    assert pj.are_solved(plans).all() and meet.judge(cases, plans).success.all()
     cases.pos[2] = np.nan
     broken = pj.plan(planner, cases)
     assert broken.status[2] == pj.Status.NON_FINITE

@@ -305,7 +305,7 @@ def test_a_case_is_solved_or_has_a_failure_status_and_the_referee_agrees(scenes,
 def test_the_referee_confirms_claims_about_drawn_cases(scenes):
     cases = jax.tree.map(np.asarray, pj.intercept.draw(8, "hard", 7))
     plans = pj.plan(PLANNER, cases)
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     assert solved.sum() >= 4
     np.testing.assert_array_equal(pj.intercept.judge(cases, plans).success, solved)
 

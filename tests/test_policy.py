@@ -119,7 +119,7 @@ def test_of_several_proposals_the_earliest_stays():
     cases = cases_of()
     one = pj.plan(pj.catch.planner(decide=policy()), cases)
     some = pj.plan(pj.catch.planner(decide=policy(proposals=3)), cases)
-    assert pj.solved(some).all()
+    assert pj.are_solved(some).all()
     assert (some.times[:, -1] <= 1.001 * one.times[:, -1]).all()
 
 

@@ -82,7 +82,7 @@ def test_impossible_hits_are_given_up_after_the_first_round(serves):
     assert hits_too_far(serves).tolist() == [False, True, True, False]
     plans = pj.plan(HIT, serves)
     assert plans.status[1] == plans.status[2] == Status.TOO_FAR
-    assert pj.solved(plans).tolist() == [True, False, False, True]
+    assert pj.are_solved(plans).tolist() == [True, False, False, True]
     assert not is_unsolved(plans.status).any()
     assert (plans.iterations[1:3] <= HIT.rounds[0].solver.max_steps).all()
     assert Status.TOO_FAR.message.startswith("no plan exists")
@@ -121,7 +121,7 @@ def test_impossible_catches_are_given_up_after_the_first_round():
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *cases)
     assert catches_too_far(cases).tolist() == [False, True, True]
     plans = pj.plan(CATCH, cases)
-    assert pj.solved(plans).tolist() == [True, False, False]
+    assert pj.are_solved(plans).tolist() == [True, False, False]
     assert (plans.status[1:] == Status.TOO_FAR).all()
 
 
@@ -144,6 +144,6 @@ def test_no_solved_case_is_too_far_with_tight_limits(draw, too_far, planner):
     cases = draw()
     plans = pj.plan(planner, jax.tree.map(np.asarray, cases))
     ruled_out = np.asarray(too_far(cases))
-    assert ruled_out.any() and pj.solved(plans).any()
-    assert not (ruled_out & pj.solved(plans)).any()
+    assert ruled_out.any() and pj.are_solved(plans).any()
+    assert not (ruled_out & pj.are_solved(plans)).any()
     np.testing.assert_array_equal(plans.status == Status.TOO_FAR, ruled_out)

@@ -1,4 +1,4 @@
-"""Reading batches by `pj.take` and `pj.solved`, verdicts on single cases, further draws."""
+"""Reading batches by `pj.take` and `pj.are_solved`, verdicts on single cases, further draws."""
 
 import jax
 import jax.numpy as jnp
@@ -46,12 +46,12 @@ def test_solved_is_read_from_the_status():
     status = np.array(list(pj.Status), np.int32)
     blank = np.zeros(status.shape)
     plans = pj.Plan(cost=blank, violation=blank, iterations=blank, status=status)
-    good = pj.solved(plans)
+    good = pj.are_solved(plans)
     assert good.tolist() == [True, True] + 9 * [False]
     assert isinstance(good, np.ndarray) and good.dtype == bool
-    resident = pj.solved(jax.tree.map(jnp.asarray, plans))
+    resident = pj.are_solved(jax.tree.map(jnp.asarray, plans))
     assert isinstance(resident, np.ndarray) and resident.tolist() == good.tolist()
-    assert pj.solved(pj.take(plans, 1)) and not pj.solved(pj.take(plans, 4))
+    assert pj.are_solved(pj.take(plans, 1)) and not pj.are_solved(pj.take(plans, 4))
     # Broken, blocked, unreachable or too distant cases are unsolved, but need no further attempt.
     assert is_unsolved(status).tolist() == [False, False, True, True, False, True, *5 * [False]]
 

@@ -68,7 +68,7 @@ def states(path, time=None):
 
 
 def test_a_recovery_continues_the_trajectory_to_standstill(hits, braked):
-    assert pj.solved(braked).all()
+    assert pj.are_solved(braked).all()
     assert pj.hit.judge(hits, braked).success.all()
     for k in range(NUM):
         plan = pj.take(braked, k)
@@ -133,7 +133,7 @@ def test_a_fast_flight_ends_at_the_requested_position(to):
     home = np.tile(np.float32([1.0, 0.0, 1.0]), (NUM, 1))
     case = RecoveryCase(head_state=head, home=home, gravity=9.81 * ones, limits=limits)
     plans = pj.plan(RecoveryPlanner(to=to), case)
-    assert pj.solved(plans).all()
+    assert pj.are_solved(plans).all()
     ends = np.stack([states(pj.take(plans.trajectory, k))[0] for k in range(NUM)])
     if to == "home":
         np.testing.assert_allclose(ends, home, atol=1e-3)
@@ -146,7 +146,7 @@ def test_catches_that_end_too_fast_for_the_limits_are_planned_slower():
     cases = jax.tree.map(np.asarray, pj.catch.draw(24, "triangle3", 3))
     plans = pj.plan(pj.catch.planner("exact", decide="greedy", recovery="brake"), cases)
     verdict = pj.catch.judge(cases, plans)
-    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
     assert verdict.success.all(), verdict.failed_limit
 
 

@@ -48,7 +48,7 @@ def test_no_time_and_a_target_as_before_give_back_the_motion_of_a_catch(catches)
 def test_no_time_and_a_ball_as_before_give_back_the_motion_of_a_hit(hits):
     """The search starts at the smoothest trajectory to the stroke and finds the plan's again."""
     cases, plans, news = hits
-    solved = pj.solved(plans)
+    solved = pj.are_solved(plans)
     assert solved.any()
     start = pj.replan(ReplanHit(HIT, rounds=NONE), cases, plans, 0.0, **news)
     for name in ("time", "flight_time", "ball_pos", "normal", "ball_vel_after"):
@@ -57,7 +57,7 @@ def test_no_time_and_a_ball_as_before_give_back_the_motion_of_a_hit(hits):
     ends = states_at(start.trajectory, start.stroke.time)
     np.testing.assert_allclose(ends, states_at(plans.trajectory, plans.stroke.time), atol=2e-2)
     again = pj.replan(HIT, cases, plans, 0.0, **news)
-    assert pj.solved(again)[solved].all()
+    assert pj.are_solved(again)[solved].all()
     assert (again.cost[solved] <= 1.05 * plans.cost[solved]).all()
     np.testing.assert_allclose(again.stroke.time[solved], plans.stroke.time[solved], atol=0.05)
 

@@ -92,7 +92,7 @@ def hits():
 def test_plans_keep_to_what_the_rotors_can_do(hits):
     cases, plans = hits
     verdict = pj.hit.judge(cases, plans)
-    np.testing.assert_array_equal(verdict.success, pj.solved(plans))
+    np.testing.assert_array_equal(verdict.success, pj.are_solved(plans))
     assert verdict.success.mean() > 0.9
     least, most = cases.limits.rotors.min_thrust, cases.limits.rotors.max_thrust
     kept = verdict.success

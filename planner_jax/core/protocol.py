@@ -245,7 +245,7 @@ def take(tree: Tree, k: int | np.integer | slice | Numbers) -> Tree:
     return jax.tree.map(lambda leaf: leaf[k], tree)
 
 
-def solved(plans: Plan) -> np.ndarray:
+def are_solved(plans: Plan) -> np.ndarray:
     """Return whether each plan keeps every limit of its planner, bool; see `Status`.
 
     Raises:

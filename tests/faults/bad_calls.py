@@ -127,7 +127,7 @@ hit_plans.save(5) | path must be the path of a file
 HitPlan.load('junk') | path must be
 CatchPlan.load(save(hit_plans)) | path must be a file of CatchPlan of version 1
 pj.require_sound(5) | cases must be a case or a batch, got a int
-pj.solved(hits.drag) | plans must be
+pj.are_solved(hits.drag) | plans must be
 pj.task_named('x') | task must be one of
 pj.target_at('x', 0.1) | table must
 pj.table_path(**{**TABLE, **dict(times=(0, 1, 1))}) | times must be finite and rise

@@ -37,7 +37,7 @@ from planner_jax.baselines.block.library.table import (
 )
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.choices import require
-from planner_jax.core.protocol import solved
+from planner_jax.core.protocol import are_solved
 from planner_jax.host.files import replacing
 from planner_jax.planning.plan import plan
 from planner_jax.robot.arm import shield_pose
@@ -228,7 +228,7 @@ def plan_pairs(
         coarse = np.full(len(lanes), is_coarse)
         leaves = (outer[lanes], inner[lanes], coarse, found.entry[lanes], start, given[lanes])
         plans = _plan_batch(planner, PairCase(*map(host_leaf, leaves)))
-        cost = np.where(solved(plans), plans.cost, np.inf).reshape(len(some), -1)
+        cost = np.where(are_solved(plans), plans.cost, np.inf).reshape(len(some), -1)
         first = np.arange(0, len(lanes), len(starts)) + np.argmin(cost, axis=1)
         cost = np.min(cost, axis=1)
         better = cost < found.entry[some]

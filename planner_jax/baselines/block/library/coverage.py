@@ -14,7 +14,7 @@ from planner_jax.baselines.block.library.planner import LibraryBlock
 from planner_jax.baselines.block.library.table import Library, Row, unpack_rows
 from planner_jax.core.arithmetic import host_leaf
 from planner_jax.core.errors import ArgumentError
-from planner_jax.core.protocol import solved
+from planner_jax.core.protocol import are_solved
 from planner_jax.planning.plan import plan
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
@@ -98,7 +98,7 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
     cases = _throw_balls(library, tunnel, pairs, rng, home)
     plans = plan(LibraryBlock(library), cases)
     return Check(
-        cases=cases, pairs=pairs, claimed=solved(plans), verdict=referee_blocks(cases, plans)
+        cases=cases, pairs=pairs, claimed=are_solved(plans), verdict=referee_blocks(cases, plans)
     )
 
 
