@@ -372,7 +372,7 @@ def test_observed_balls_are_blocked_from_the_command_line(tmp_path, capsys):
     command = ["fly", "block", "--num", "4", "--regime", "R1", "--suite", "open", "--wide"]
     assert main([*command, "--perception", "--replan", "10", "--out", str(out)]) == 0
     said = capsys.readouterr().out
-    assert "The flight as it was first seen was" in said and "anew at 10 Hz" in said
+    assert "the first fit of the flight was" in said and "anew at 10 Hz" in said
     summary = json.loads((out / "manifest.json").read_text())["summary"]
     assert summary["motions"] >= 4 and summary["blocked"] >= 3
     assert summary["last_fit_error_median"] < summary["fit_error_median"]

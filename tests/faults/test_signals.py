@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from tests.faults.commands import is_stopped, start, wait_for
+from tests.faults.commands import is_stopped, start, wait_for, wait_until_listening
 from tests.faults.runs import make_flights
 
 PREPARED = """
@@ -90,8 +90,7 @@ def test_nohup_is_respected_and_a_background_job_hears_ctrl_c():
 
 def test_a_command_that_imports_is_ended_without_a_traceback(tmp_path):
     process = start("sweep", "hit", "--out", "run", cwd=tmp_path)
-    with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(0.7)
+    wait_until_listening(process)
     process.send_signal(signal.SIGINT)
     ended = wait_for(process)
     assert is_stopped(ended, signal.SIGINT) and "there is nothing to resume" in ended.err
