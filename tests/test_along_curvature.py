@@ -37,7 +37,7 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
         along = flight_along(MAPS, 2, case, 0.03, 0.1)
         columns = jnp.asarray(np.random.default_rng(0).normal(size=(10, 3)))
         theta, parameters = jnp.log(0.2), (case.gravity, case.limits, case.extras)
-        power = np.where(np.arange(10) < given, np.arange(10), 0)[:given, None]
+        power = np.where(np.arange(10) < given, np.arange(10.0), 0.0)[:given, None]
 
         def penalty(moving, at):
             head = columns[:given] * jnp.exp(at - theta) ** power
