@@ -80,6 +80,30 @@ def _hard(steps: int) -> LbfgsConfig:
     return LbfgsConfig(max_steps=steps, memory=12, tolerance=1e-6, patience=5)
 
 
+# The first two rounds solve easy cases. The others search for any feasible plan, almost without
+# the energy. Rounds three and four start at a network's point; round four is longer and only
+# for violations below 0.1. The last two start at all fixed guesses and continue the best of
+# them; the last one is for violations below 0.04.
+_ROUNDS = (
+    Round(1, LbfgsConfig(max_steps=3)),
+    Round(1, LbfgsConfig(max_steps=60)),
+    Round(1, _hard(150), WITH_VELOCITIES),
+    Round(1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES, keep=1),), within=0.1),
+    Round(12, _hard(240), WITH_VELOCITIES, (Stage(_hard(50), _FROM_GUESSES, keep=2),)),
+    Round(
+        starts=12,
+        solver=_hard(300),
+        settings=_SMALL_MARGIN,
+        stages=(
+            Stage(_hard(60), _FROM_GUESSES, keep=6),
+            Stage(_hard(150), _FROM_GUESSES, keep=2),
+            Stage(_hard(400), WITH_VELOCITIES, keep=1),
+        ),
+        within=0.04,
+    ),
+)
+
+
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactHit(ChainPlanner[HitCase, HitPlan]):
@@ -113,30 +137,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     num_table_nodes: int = 36
     drag_after_impact: bool = False
     impact_weight: float = 0.3  # [s], of the hinges of apex and hitting speed
-    # The first two rounds solve easy cases. The others search for any feasible plan, almost without
-    # the energy. Rounds three and four start at a network's point; round four is longer and only
-    # for violations below 0.1. The last two start at all fixed guesses and continue the best of
-    # them; the last one is for violations below 0.04.
-    rounds: tuple[Round, ...] = (
-        Round(1, LbfgsConfig(max_steps=3)),
-        Round(1, LbfgsConfig(max_steps=60)),
-        Round(1, _hard(150), WITH_VELOCITIES),
-        Round(
-            1, _hard(500), _SMALL_MARGIN, (Stage(_hard(800), WITH_VELOCITIES, keep=1),), within=0.1
-        ),
-        Round(12, _hard(240), WITH_VELOCITIES, (Stage(_hard(50), _FROM_GUESSES, keep=2),)),
-        Round(
-            starts=12,
-            solver=_hard(300),
-            settings=_SMALL_MARGIN,
-            stages=(
-                Stage(_hard(60), _FROM_GUESSES, keep=6),
-                Stage(_hard(150), _FROM_GUESSES, keep=2),
-                Stage(_hard(400), WITH_VELOCITIES, keep=1),
-            ),
-            within=0.04,
-        ),
-    )
+    rounds: tuple[Round, ...] = _ROUNDS
     velocities: bool = False  # whether the velocities at the waypoints are variables
     learned: bool = True  # whether a network improves the first guess of usual cases
 
