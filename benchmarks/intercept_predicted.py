@@ -234,6 +234,9 @@ def report(
     # Cases that no row solves, not even with a known target, are left out of the last share.
     solvable = np.any([verdict.success for verdict in verdicts.values()], axis=0)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
+        if not solvable[is_of_mode].any():
+            bench.say(f"{mode}: no case that any row solves")
+            continue
         for name, verdict in verdicts.items():
             drives, seconds = rows[name]
             good, miss = verdict.success[is_of_mode], verdict.miss[is_of_mode]
@@ -283,6 +286,8 @@ def report_bound(
     before = observed.times[observed.times <= 0.0].astype(np.float32)
     bound = compute_bound(truth.target, np.tile(before, (len(off), 1)), times)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
+        if not is_of_mode.any():
+            continue
         mine, least = (off[is_of_mode] <= SUCCESS).mean(), np.asarray(bound)[is_of_mode].mean()
         bench.say(
             f"{mode}: {100 * mine:.1f} % of first predictions are within {SUCCESS:g} m at the "
