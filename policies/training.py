@@ -305,7 +305,8 @@ def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONe
 
     def numbers(_: Any, params: Any, flat: Array) -> Array:
         found = network.apply(params, unflatten(flat))
-        # Constant distributions for absent targets keep them out of the divergence.
+        # Absent targets get constant distributions, which add nothing to the KL divergence by which
+        # PPO adapts its learning rate.
         found = jnp.where(unflatten(flat)[..., -1:] > 0.5, found, 0.0)
         means, spreads = found[..., :PER_TARGET], found[..., PER_TARGET:]
         shape = (*flat.shape[:-1], -1)

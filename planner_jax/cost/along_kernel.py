@@ -54,7 +54,10 @@ class Grid:
 
     @property
     def shares(self) -> int:
-        """Number of threads that share the samples of one trajectory of a lane."""
+        """Number of GPU threads, 1 to 8, among which the samples of one trajectory are divided.
+
+        Small batches need several threads a trajectory to occupy the GPU.
+        """
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:

@@ -204,7 +204,7 @@ def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
 
 
 def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
-    """Return the field of the limits for each excess of `flight_excess`."""
+    """Return, for each entry of `flight_excess`, the name of its field in `QuadrotorLimits`."""
     return tuple(kind.field for kind in _kinds(limits) for _ in kind.measures)
 
 

@@ -79,7 +79,7 @@ class CatchServe(ServeSettings):
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
     def stroke(self) -> "CatchStroke":
-        """Return a catch."""
+        """Return the `CatchStroke` that plans catches with this robot and drag."""
         from planner_jax.live.strokes import CatchStroke
         from planner_jax.robot.quadrotor_model import PAPER_CATCHER
 

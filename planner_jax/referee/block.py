@@ -261,7 +261,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Return measurements, tests, and the joint (B,) str with the greatest excess of each test."""
+    """Return measurements, tests by name, and each test's worst joint, (B,) of str."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:

@@ -248,7 +248,7 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 
 
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate positions and velocities (B, N, 3) in tables with node k at (k - 1) resolution.
+    """Interpolate positions and velocities (B, N, 3) of tables; node k is at (k - 1) * resolution.
 
     Cubic convolution with a = -1/2 [Keys1981] is the cubic between two nodes whose slopes are the
     central differences there. Outside the table the target keeps its first or last velocity.

@@ -58,7 +58,8 @@ class Difference(NamedTuple):
     difference: float  # difference of the rates, -1 to 1
     difference_low: float  # ends of its 95 % interval
     difference_high: float
-    # Numbers of cases that one run alone solves, and McNemar's exact p-value; None for other cases.
+    # Numbers of cases that one run alone solves, and McNemar's exact p-value. None if the two runs
+    # have different cases.
     first_only: int | None = None
     this_only: int | None = None
     mcnemar_p: float | None = None

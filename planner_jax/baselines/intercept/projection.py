@@ -79,7 +79,7 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
     step = path.length / (path.curvature.shape[0] - 1)
     bend = jnp.maximum(jnp.abs(path.curvature[1:]), jnp.abs(path.curvature[:-1]))
     lateral = jnp.sqrt(limits.lateral_acceleration / jnp.maximum(bend, 1e-6))
-    # The steering angle changes fastest at the smallest curvature.
+    # d atan(L kappa) / d kappa = L / (1 + L^2 kappa^2) is greatest at the smallest |kappa|.
     before, after = path.curvature[:-1], path.curvature[1:]
     least = jnp.where(before * after > 0.0, jnp.minimum(before**2, after**2), 0.0)
     gain = body.wheelbase / (1.0 + body.wheelbase**2 * least)

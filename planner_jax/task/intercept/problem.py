@@ -87,7 +87,7 @@ class MotionProblem:
 
     @property
     def weights(self) -> Weights:
-        """The weights of the last stage."""
+        """The cost weights of the last stage of least squares; early meetings weigh the time."""
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:
