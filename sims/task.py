@@ -45,7 +45,7 @@ class Flights(abc.ABC):
     @property
     @abc.abstractmethod
     def success(self) -> np.ndarray:
-        """Whether each flight succeeded, (B,) bool."""
+        """Mask of the successful flights, (B,) bool."""
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,13 +8,12 @@ A citation is `[KEY, eq. N]`. A bare `eq. N` counts for the one paper that its f
 
 import ast
 import re
-import subprocess
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from tests.tracked import ROOT, tracked_files
+
 PAGE = ROOT / "docs" / "equations.md"
 PAPERS = {
     "Yu2023catch": "Catch Planner",
@@ -70,15 +69,8 @@ def name_at(tree: ast.Module, line: int) -> str:
 
 def table() -> str:
     """Return the page with a table for each paper."""
-    files = subprocess.run(
-        ["git", "ls-files", "planner_jax/*.py", "sims/*.py", "policies/*.py"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
     places: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
-    for file in files:
+    for file in tracked_files("planner_jax/*.py", "sims/*.py", "policies/*.py"):
         path = ROOT / file
         if path.is_file() and not path.is_symlink():
             text = path.read_text()

@@ -13,12 +13,12 @@ Properties and tests are left out: a property's docstring says what it holds, a 
 
 import ast
 import re
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from tests.tracked import ROOT, tracked_files
+
 CODE = ("planner_jax", "sims", "policies", "benchmarks")
 PAGES = (*CODE, "docs", "notebooks", "tests", "README.md", "CONTRIBUTING.md")
 VERBS = set(
@@ -51,10 +51,7 @@ VERBS_IN_ED = {"embed", "exceed", "feed", "need", "proceed", "seed", "shed", "sp
 
 def _files(paths: tuple[str, ...], endings: tuple[str, ...]) -> Iterator[Path]:
     """Yield the tracked files below some paths whose names have one of some endings."""
-    names = subprocess.run(
-        ["git", "ls-files", *paths], cwd=ROOT, capture_output=True, text=True, check=True
-    ).stdout.split()
-    yield from (ROOT / name for name in names if name.endswith(endings))
+    yield from (ROOT / name for name in tracked_files(*paths) if name.endswith(endings))
 
 
 def _functions(paths: tuple[str, ...]) -> Iterator[tuple[str, ast.FunctionDef]]:

@@ -3,25 +3,18 @@
 import re
 import subprocess
 import sys
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+from tests.tracked import ROOT, tracked_files
+
 REFERENCES = ROOT / "docs" / "references.md"
 KEY = r"[A-Z][A-Za-z]+(?:19|20)\d\d[a-z]*"
 
 
 def cited_keys() -> dict[str, str]:
     """Return each key that a tracked text cites in brackets, with one file that cites it."""
-    names = subprocess.run(
-        ["git", "ls-files", "*.py", "*.pyi", "*.md", "*.ipynb", "*.cff"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    ).stdout.split()
     return {
         key: name
-        for name in names
+        for name in tracked_files("*.py", "*.pyi", "*.md", "*.ipynb", "*.cff")
         for cited in re.findall(rf"\[{KEY}[^\[\]]*\]", (ROOT / name).read_text())
         for key in re.findall(KEY, cited)
     }

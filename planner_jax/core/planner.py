@@ -39,12 +39,12 @@ class Drive(Protocol):
 
     @property
     def is_pure(self) -> bool:
-        """Whether this runs inside a compiled program, where arrays have no values yet."""
+        """True inside a compiled program, where arrays have no values yet."""
         ...
 
     @property
     def is_over(self) -> bool:
-        """Whether the caller's time limit has passed, so that no further attempt may start."""
+        """True if the caller's time limit has passed, after which no attempt may start."""
         ...
 
     def __call__(

@@ -1,4 +1,4 @@
-"""Where a car can be, and when: a reach set in space and time, one bit per cell.
+"""The reach set of a car in space and time, with one bit per cell.
 
 The set has a layer for each of some equally spaced times. A layer holds one bit for every level of
 speed, every heading and every cell of a square grid: whether the car can be there at that time,

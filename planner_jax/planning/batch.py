@@ -95,12 +95,12 @@ class Watch:
 
     @property
     def waits(self) -> bool:
-        """Whether the planner must wait for each step, because its end time matters."""
+        """True if the planner must wait for each step, because its end time matters."""
         return self._limit is not None or self._progress is not None
 
     @property
     def is_over(self) -> bool:
-        """Whether the time limit has passed."""
+        """True if the time limit has passed."""
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
     def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:

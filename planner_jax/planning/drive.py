@@ -33,7 +33,7 @@ class Driver:
 
     @property
     def is_over(self) -> bool:
-        """Whether the caller's time limit has passed."""
+        """True if the caller's time limit has passed."""
         return self.watch.is_over
 
     def __call__(

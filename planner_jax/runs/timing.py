@@ -54,7 +54,7 @@ class CompileClock:
 
     @property
     def compiled(self) -> bool:
-        """Whether anything was compiled."""
+        """True if the call compiled a program."""
         return bool(self._spans)
 
 

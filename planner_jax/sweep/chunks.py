@@ -44,7 +44,7 @@ _MEASURED = {
 
 
 class Record(TypedDict):
-    """How the rows of a part were made; the part's metadata hold it."""
+    """Provenance of the rows of a part, stored in the part's metadata."""
 
     run: str  # digest of the `Maker`
     number: int

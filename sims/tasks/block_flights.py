@@ -98,12 +98,12 @@ class BlockFlights(Flights):
 
     @property
     def touched(self) -> np.ndarray:
-        """Whether each arm touched an obstacle before the contact, (B,) bool."""
+        """Mask of the arms that touched an obstacle before the contact, (B,) bool."""
         return self.clearance < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each ball was blocked by an arm that touched nothing, (B,) bool."""
+        """Mask of the balls blocked by an arm that touched nothing, (B,) bool."""
         return self.blocked & ~self.touched
 
 

@@ -127,12 +127,12 @@ class CatchFlights(Flights):
 
     @property
     def caught(self) -> np.ndarray:
-        """Whether each ball fell into the net, (B, N) bool."""
+        """Mask of the balls that fell into the net, (B, N) bool."""
         return np.asarray(self.flown.contact.met)
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each flight caught all balls, (B,) bool."""
+        """Mask of the flights that caught all balls, (B,) bool."""
         return np.all(self.caught, axis=1)
 
 

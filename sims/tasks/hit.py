@@ -192,7 +192,7 @@ class HitFlights(Flights):
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each ball landed near the target, (B,) bool."""
+        """Mask of the balls that landed near the target, (B,) bool."""
         return self.miss <= _NEAR
 
 

@@ -217,12 +217,12 @@ class InterceptFlights(Flights):
 
     @property
     def touched(self) -> np.ndarray:
-        """Whether each car touched an obstacle, (B,) bool."""
+        """Mask of the cars that touched an obstacle, (B,) bool."""
         return np.minimum(self.wall_clearance, self.mover_clearance) < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each car met its target and touched nothing, (B,) bool."""
+        """Mask of the cars that met their target and touched nothing, (B,) bool."""
         return (self.miss <= SUCCESS) & ~self.touched
 
 

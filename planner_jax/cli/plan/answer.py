@@ -64,7 +64,7 @@ class Answer:
 
     @property
     def success(self) -> bool:
-        """Whether the referee accepts the plan."""
+        """True if the referee accepts the plan."""
         return bool(self.verdict.success)
 
 

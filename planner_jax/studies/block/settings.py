@@ -68,7 +68,7 @@ class StudySettings(SweepSettings):
 
     @property
     def is_study(self) -> bool:
-        """Whether the run has a camera or a clock."""
+        """True if the run has a camera or a clock."""
         return self.perception or self.planning_budget is not None
 
     @property

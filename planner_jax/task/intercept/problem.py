@@ -82,7 +82,7 @@ class MotionProblem:
 
     @property
     def is_time_free(self) -> bool:
-        """Whether the meeting time is an unknown."""
+        """True if the meeting time is an unknown."""
         return self.meet != "given"
 
     @property

@@ -114,7 +114,7 @@ class Reachability:
 
     @property
     def is_reached(self) -> Array:
-        """Whether a path of cells meets the target, () bool."""
+        """True if a path of cells meets the target, () bool."""
         return jnp.any(self.layers)
 
 

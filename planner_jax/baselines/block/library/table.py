@@ -185,7 +185,7 @@ class Library:
 
     @property
     def found(self) -> np.ndarray:
-        """Whether each pair has a motion, (H, P) bool."""
+        """Mask of the pairs with a motion, (H, P) bool."""
         return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
