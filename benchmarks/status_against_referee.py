@@ -39,9 +39,8 @@ class Row:
     draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the planner
     judge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    change: Callable[["Row", Any, np.random.Generator], Any] | None = (
-        None  # changes the drawn cases
-    )
+    # Changes the drawn cases
+    change: Callable[["Row", Any, np.random.Generator], Any] | None = None
     every: int = 1  # one in this number of cases is planned
 
     @property

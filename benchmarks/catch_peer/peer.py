@@ -50,9 +50,8 @@ AS_GOOD = 1e-3  # relative cost above the published cost that counts as equal
 class Settings:
     """Settings of the search; the fields are the program's command-line arguments."""
 
-    relative: bool = (
-        False  # whitened offsets and the net relative to the ball, instead of q and p(T)
-    )
+    # Whitened offsets and the net relative to the ball, instead of q and p(T)
+    relative: bool = False
     memory: int = 48  # pairs of L-BFGS, at most 64; 0 for BFGS with a dense matrix
     past: int = 10  # iterations over which the cost is compared
     delta: float = 1e-7  # relative change of the cost over `past` iterations that ends the search

@@ -45,9 +45,8 @@ TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     ),
 }
 MOST_STEPS = 300
-AS_GOOD = (
-    1e-3  # relative excess over the least objective, in nine of ten cases, that counts as equal
-)
+# Relative excess over the least objective, in nine of ten cases, that counts as equal
+AS_GOOD = 1e-3
 
 
 @dataclasses.dataclass

@@ -70,11 +70,8 @@ def require_path_name(name: str, value: object) -> None:
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-_HOSTS = (
-    np.ndarray,
-    np.generic,
-    float,
-)  # types that `isinstance` quickly separates from JAX's arrays
+# Types that `isinstance` quickly separates from JAX's arrays
+_HOSTS = (np.ndarray, np.generic, float)
 
 
 def numeric(value: object) -> Numbers | None:

@@ -113,9 +113,8 @@ class Plan:
     """
 
     cost: Array  # (), the planner's own objective
-    violation: (
-        Array  # (), largest relative excess over a limit that the planner checks; feasible if <= 0
-    )
+    # (), largest relative excess over a limit that the planner checks; feasible if <= 0
+    violation: Array
     iterations: Array  # () int32
     status: Array  # () int32, a `Status`
 

@@ -39,9 +39,8 @@ NOT_NEGATIVE = Rule(">= 0", lambda value, part: value >= 0.0)
 NOT_ZERO = Rule(  # for a vector
     "other than zero", lambda value, part: (value != 0.0) | (value != 0.0).any(-1, keepdims=True)
 )
-POSITIVE_OR_NONE = Rule(
-    "> 0", lambda value, part: value > 0.0, infinite=True
-)  # infinity means no limit
+# For limits, where infinity means no limit
+POSITIVE_OR_NONE = Rule("> 0", lambda value, part: value > 0.0, infinite=True)
 
 
 def within(low: float, high: float, words: str) -> Rule:

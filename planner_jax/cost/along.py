@@ -47,9 +47,8 @@ class Along:
     hinge_width: float
     # Rate of a case's extras. They take the whole position, which kernels do not compute.
     rate: Rate | None = None
-    orders: int = (
-        4  # derivatives of the motion that the excess takes, position included: 5 with the snap
-    )
+    # Derivatives of the motion that the excess takes, position included: 5 with the snap
+    orders: int = 4
     # Slots (order, axis) of the motion that occur in common limits, for `along_curvature`: the
     # penalty is a sum of functions of one group each. By default all slots are one group.
     groups: tuple[tuple[tuple[int, int], ...], ...] = ()

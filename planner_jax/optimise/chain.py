@@ -229,9 +229,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     def curvature_at(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
         """Return evaluation, gradient, and second derivatives; see `chain_curvature`."""
-        from planner_jax.optimise.chain_curvature import (
-            chain_curvature,
-        )  # only Newton's method needs it
+        # Only Newton's method needs it
+        from planner_jax.optimise.chain_curvature import chain_curvature
 
         case = context.case
         offsets, natural = self.split(point)

@@ -116,9 +116,8 @@ class Watch:
         self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
-_Call = tuple[
-    np.ndarray, int
-]  # lanes of one call, padded with its first one; number before padding
+# The lanes of one call, padded with the first lane, and their number before padding
+_Call = tuple[np.ndarray, int]
 
 
 def plan_batch(

@@ -90,9 +90,8 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     """
     num = speed.shape[0] - 1
     step = end / num
-    length = jnp.clip(
-        time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step
-    )  # time driven in each piece
+    # Time driven in each piece
+    length = jnp.clip(time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step)
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step
     v, c = speed[:-1], curvature[:-1]

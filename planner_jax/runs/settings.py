@@ -62,9 +62,8 @@ class SweepSettings:
 
     planner: str | None = option(None, "NAME", "")  # None selects the first of the task
     suite: str | None = option(None, "NAME", "")  # None selects the first of the task
-    num: int | None = option(
-        None, "N", "number of cases"
-    )  # None: `DEFAULT_NUM`, or all of a folder
+    # None: `DEFAULT_NUM`, or all of a folder
+    num: int | None = option(None, "N", "number of cases")
     batch: int | None = option(
         None, "B", "cases planned, judged and written at once; bounds the memory"
     )

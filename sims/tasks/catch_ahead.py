@@ -150,9 +150,8 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 class _EveryAttempt(Driver):
     """A driver that makes all attempts of a planner concurrently, needed or not."""
 
-    watch: Watch = dataclasses.field(
-        default_factory=lambda: Watch(0.0)
-    )  # starts no further attempts
+    # Starts no further attempts
+    watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
         self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None

@@ -71,9 +71,8 @@ class Net:
 
     height: Array  # () l [m], of the hoop's centre above the propeller plane
     radius: Array  # () [m]
-    max_angle: (
-        Array  # () theta_safe [rad], between the net's axis and the reversed velocity of the ball
-    )
+    # () theta_safe [rad], between the net's axis and the reversed velocity of the ball
+    max_angle: Array
 
 
 @struct.dataclass

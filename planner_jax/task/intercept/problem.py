@@ -335,9 +335,8 @@ class SmoothIntercept(OptimisedPlanner):
         """
         model = self._model(point, context)
         gradient = jax.grad(lambda x: self.objective(x, context).cost)(point)
-        return dataclasses.replace(
-            model, gradient=0.5 * gradient
-        )  # a `Model` holds half the gradient
+        # The `gradient` of a `Model` is half the slope of the cost
+        return dataclasses.replace(model, gradient=0.5 * gradient)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
         """Return the sum of squares and the largest violation at a point (n,)."""
