@@ -1,1 +1,4 @@
-"""Measurements of speed, success and cost."""
+"""Measurements of speed, success and cost.
+
+Each module with a `main` is a benchmark of the planners, run as `python -m benchmarks.NAME`.
+"""

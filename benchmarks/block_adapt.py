@@ -3,11 +3,13 @@
     taskset -c 0 python -m benchmarks.block_adapt [--library FILE] [--layout full] [--regime R2]
         [--num 1000] [--seed 7] [--out DIR]
 
-Throws are drawn from the suite `pole`, balls meet the middle of the shield straight on, and the arm
-may start at once. Without --library a library is built first. All planners get the same throws:
-`adapt` with its first effort alone and with both efforts, straight motions alone (6 and 48 of
-them), and `online`. The library's stored motions without adaptation may meet a ball anywhere on the
-shield. Each planner is compiled for one ball by `BallByBall`.
+Throws are drawn from the suite `pole`. Each ball must meet the middle of the shield at a right
+angle, and the arm may start at time 0. Without --library a library of motions is built first. All
+planners get the same throws:
+* `adapt`, with its short search alone, and with a longer search if the short one fails;
+* planners that try 6 or 48 straight motions of the joints;
+* the default planner `online`;
+* the library's motions without adaptation, which may meet a ball anywhere on the shield.
 
 Wall-clock times are from the ball's arrays to the plan's arrays. The process's CPU time is printed
 beside them, because other load on the machine changes it less. Success is judged by the referee.
@@ -34,7 +36,7 @@ WARM = 50  # balls planned before the measurement
 
 
 def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
-    """Measure one planner on all throws."""
+    """Plan a batch of throws one by one; report success, planning times and compile time."""
     cases = jax.tree.map(np.asarray, cases)
     lanes = [pj.take(cases, k) for k in range(cases.batch_shape[0])]
     began = time.perf_counter()
@@ -77,7 +79,7 @@ def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Measure all planners."""
+    """Build or load the library, draw the throws, and measure every planner on them."""
     path = options.library
     if path is None:
         path = bench.path / "library.bin"
@@ -104,7 +106,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments and measure."""
+    """Parse the arguments, and measure all planners into a run folder."""
     parser = argument_parser("block_adapt", __doc__, num=1000, seed=7)
     options = library_options(parser, layout="full")
     with begin(parser, options) as bench:

@@ -1,12 +1,14 @@
-"""Measure how many hard balls per second all cores plan for: balls that no straight motion blocks.
+"""Measure how many hard balls per second are planned, on all cores of the machine.
 
     python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3]
         [--out DIR]
 
-Throws are drawn from the suite `pole`. Throws that a straight motion blocks, nearly three in four
-with R2, are left out. The others need least squares, or cannot be blocked at all. They are planned
-in one call that is already compiled, and the fastest of --repeat calls is reported. Printed are
-also the share that the referee accepts, and how much longer the motions last than `brisk`'s.
+A ball is hard if no straight motion of the joints blocks it. Throws are drawn from the suite
+`pole`, and throws that a straight motion blocks are left out: nearly three in four with the joint
+limits R2. A hard ball needs a search by least squares, or cannot be blocked at all. All hard balls
+are planned in one call of a compiled program, and the fastest of --repeat calls is reported. The
+program also prints the share of balls that the referee accepts as blocked. Durations of the motions
+are compared with the planner `brisk`, which minimises them.
 """
 
 import jax
@@ -22,7 +24,7 @@ from planner_jax.sweep.block.settings import REGIMES
 
 
 def main() -> None:
-    """Measure planning of hard balls."""
+    """Select the throws that no straight motion blocks, time their planning, and print results."""
     parser = argument_parser("block_hard", __doc__, num=2000, seed=20261, repeat=3)
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
     options = parser.parse_args()

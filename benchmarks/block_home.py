@@ -2,16 +2,17 @@
 
     python -m benchmarks.block_home [--num 500] [--candidates 48] [--rounds 4] [--out DIR]
 
-A home pose consists of six joint angles. The cross-entropy method draws candidates, first
-uniformly, then from a normal distribution around the best eighth of all candidates so far. Poses in
-collision, or within 3 cm of the pole, are left out. The score of a candidate is the share of its
-round's throws that one of 48 straight motions blocks in time without a collision. Straight motions
-are quick to compute, and the planner's other motions can only raise the share. In the search the
-arm starts 0.133 s late, which spreads the scores.
+A home pose is the pose in which the arm waits for a ball: six joint angles. The cross-entropy
+method draws candidate poses in several rounds, first uniformly, then from a normal distribution
+around the best eighth of all candidates so far. Poses in collision, or within 3 cm of the pole, are
+left out. The score of a candidate is the share of the round's throws that one of 48 straight
+motions of the joints blocks in time and without a collision. Straight motions are quick to compute,
+and the planner's other motions can only raise the share. In the search the arm may start only after
+0.133 s. This makes blocking harder, so that good and bad poses get more different scores.
 
-The best candidates of all rounds are compared on other throws. The three best of these are judged
-on `--num` further throws that no selection used, by the whole planner and the referee, beside the
-home pose of [Natarajan2024].
+The best candidates of all rounds are compared on other throws. Finally the three best poses and the
+home pose of [Natarajan2024] are compared on `--num` further throws, which no selection used. For
+this comparison the default planner plans the motions, and the referee judges them.
 """
 
 import dataclasses
@@ -30,19 +31,20 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
-# Bounds of the uniform distribution [rad]: reachable by the arm, and in front of it.
+# [rad] Bounds of the joint angles of the first candidates. These poses are in front of the arm.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])
 HIGHEST = np.array([0.8, 1.5, 0.95, 0.5, 1.9, 0.8])
-MARGIN, POLE_MARGIN = 0.005, 0.03  # [m], clearance of a home pose: of all, of the pole
-ELITE = 8  # one candidate in this number is an elite, from which the next round draws
-LATE = 0.133  # [s], start of the arm in the search
-REPORTED = 3
-DELAYS = (0.0, 0.133)  # [s], starts of the arm in the report
+# [m] Least clearance of a home pose from every obstacle and the arm itself, and from the pole.
+MARGIN, POLE_MARGIN = 0.005, 0.03
+ELITE = 8  # The best candidates, one in ELITE, define the distribution of the next round.
+LATE = 0.133  # [s] In the search the arm may start this long after the ball is first seen.
+REPORTED = 3  # Number of best home poses in the printed table.
+DELAYS = (0.0, 0.133)  # [s] In the printed table the arm may start at each of these times.
 STRAIGHT = OnlineBlock(searches=(Search(straight=48, tries=0),))
 
 
 def from_home(cases: Any, homes: np.ndarray) -> Any:
-    """Return the same B throws for each of H home poses (H, 6), as H x B cases."""
+    """Combine B throws with H home poses (H, 6) [rad]: return H x B cases, ordered by pose."""
     num = len(homes)
 
     def repeat(leaf: Any) -> np.ndarray:
@@ -62,7 +64,11 @@ def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
 
 
 def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
-    """Draw collision-free candidates (num, 6) [rad], uniformly or around good ones (E, 6)."""
+    """Draw home poses (num, 6) [rad] that are free of collision.
+
+    Joint angles are uniform within the bounds if `around` is None. Otherwise they have a normal
+    distribution with the mean and the spread of the good poses `around` (E, 6) [rad].
+    """
     arm, scene = irb1600(), paper_scene()
 
     @jax.jit
@@ -84,7 +90,7 @@ def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | 
 
 
 def main() -> None:
-    """Search for home poses, then report the best."""
+    """Search for home poses, compare the best ones on other throws, and print the table."""
     parser = argument_parser(
         "block_home", __doc__, num=500, seed=7, candidates=48, rounds=4, throws=96
     )

@@ -1,17 +1,20 @@
-"""Measure the library of block motions: build, coverage, queries, repair and blocked balls.
+"""Measure the library of stored block motions: build, coverage, lookups, and blocked balls.
 
     python -m benchmarks.block_library [--library FILE] [--layout B] [--regime R2] [--num 2000]
         [--queries 20000] [--batch 1048576] [--shift -0.1] [--skip-repair] [--out DIR]
 
-Without --library a library is built, after a few pairs of cells have compiled everything. Then
-* coverage of the pairs of cells that a ball can pass through, and memory;
-* random balls through stored tunnels, judged by the referee, and the claims that it rejects;
-* balls of the suites `pole` and `short` that no tuning used (seed 20260), met anywhere on the
-  shield and as `wide`, with a delay of 0 and of 0.133 s;
-* queries of one ball, from host to host on the CPU, with balls of the suite `pole`;
-* queries of a batch on the default device. The table is an argument of the compiled program, so
-  that the compiler cannot fold it into the program. Answers stay on the device;
-* the pole moved by --shift along y: a repair, and how many of its motions the referee rejects.
+The library divides the faces of two boxes around the protected region into rectangular cells. It
+stores a motion for each pair of an outer and an inner cell. The tunnel of a pair is the space
+between its two cells. Without --library a library is built first. Then the program reports:
+* coverage: the share of pairs with a motion, among the pairs that a ball can pass through;
+* random balls through the tunnels of stored motions: how many are blocked, judged by the referee;
+* balls of the suites `pole` and `short`, drawn with a seed that no tuning used: how many are
+  blocked if the arm may start after 0 or 0.133 s;
+* the time to look up one ball of the suite `pole`, from and to host memory, on the CPU;
+* the rate at which the default device looks up a batch of balls. The table of motions is an
+  argument of the compiled program, so that the compiler cannot evaluate parts in advance;
+* a repair, after the pole has moved by --shift along y: the time to plan again all motions that
+  collide with it, and how many of the library's motions the referee then rejects.
 """
 
 import argparse
@@ -48,7 +51,7 @@ from planner_jax.runs.timing import CompileClock
 from planner_jax.task.block.scene import paper_scene
 
 SEED = 20260
-ROUNDS = 20  # calls of a batch query that are timed together
+ROUNDS = 20  # The time of a batch lookup is measured over this number of calls.
 
 
 def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
@@ -60,7 +63,7 @@ def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
 
 
 def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
-    """Build a library into a file, and report the time."""
+    """Build a library, write it to a file, and report build time and compile time."""
     given: Any = REGIMES[regime]
     at_rest: Any = np.asarray(given.ends_at_rest)
     scene = paper_scene()
@@ -68,8 +71,8 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # Spread over all pairs, so that some need least squares too; enough of them to compile every
-    # call size.
+    # The first pairs are planned only to compile the programs of every batch size. They are spread
+    # over all pairs, so that some of them also need, and compile, the search by least squares.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
     for size in set(building.portions().lanes):
@@ -85,7 +88,7 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Report coverage and memory."""
+    """Report the shares of pairs of cells that have a stored motion, and the library's memory."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),
@@ -103,7 +106,11 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Judge random balls through stored tunnels."""
+    """Draw `num` balls through tunnels with stored motions; report the share that is blocked.
+
+    The referee judges each motion. Blocks that the planner claims and the referee rejects are
+    counted.
+    """
     found = check(library, num, SEED)
     wrong = int((found.claimed & ~found.verdict.success).sum())
     bench.say(
@@ -114,7 +121,7 @@ def referee(bench: Bench, library: Library, num: int, name: str) -> None:
 
 
 def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
-    """Report the share of balls of the suites that the library blocks."""
+    """Report the shares of balls of the suites `pole` and `short` that stored motions block."""
     planner = LibraryBlock(library)
     for suite in ("pole", "short"):
         for met in ("anywhere", "wide"):
@@ -151,15 +158,15 @@ def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
 
 
 class OneBall:
-    """Lookup of one ball after another at the least latency, by a program compiled for the CPU.
+    """Lookup of stored motions for one ball at a time, with the least latency, on the CPU.
 
-    A ball is passed as one vector, and its answer is one vector: every array that enters or leaves
-    a compiled program costs a microsecond. The motion is returned as it is stored, without
-    adaptation.
+    A ball enters the compiled program as one vector, and the answer leaves it as one vector,
+    because each argument and each result costs about a microsecond. The stored motion is not
+    adapted to the ball.
     """
 
     def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
-        """Compile the lookup of a library, for an arm that waits at one of its home poses."""
+        """Compile the lookup for an arm at the home pose with index `home`; gravity in [m/s^2]."""
         own = library.table
 
         def pack_rows(rows: Array, vector: Array) -> Array:
@@ -177,11 +184,11 @@ class OneBall:
         self._lookup = jax.jit(pack_rows).lower(self._rows, vector).compile()
 
     def answer(self, pos: ArrayLike, vel: ArrayLike) -> Answer:
-        """Look up a ball; return the answer in NumPy arrays and plain numbers.
+        """Return the stored motion for a ball, in NumPy arrays and plain numbers.
 
         Args:
-            pos: (3,) [m], position when the ball is first seen.
-            vel: (3,) [m/s].
+            pos: (3,) [m], position of the ball at time 0, when it is first seen.
+            vel: (3,) [m/s], velocity of the ball at time 0.
         """
         vector = np.empty(6, np.float32)
         vector[:3], vector[3:] = pos, vel
@@ -192,7 +199,7 @@ class OneBall:
 
 
 def single_queries(bench: Bench, library: Library, num: int) -> None:
-    """Measure queries of one ball at a time."""
+    """Time the lookup of one ball after another, `num` in total, and report quantiles."""
     one, cases = OneBall(library), pj.block.draw(min(num, 2000), "pole", SEED)
     balls = list(zip(np.asarray(cases.ball.pos), np.asarray(cases.ball.vel), strict=True))
     seconds = []
@@ -213,12 +220,12 @@ def single_queries(bench: Bench, library: Library, num: int) -> None:
 
 @jax.jit
 def look_up(table: Table, balls: BallState, gravity: Any) -> Answer:
-    """Look up a batch of balls."""
+    """Return the stored motion for each ball of a batch, leaves (B, ...)."""
     return jax.vmap(lookup, (None, 0, None))(table, balls, gravity)
 
 
 def batch_queries(bench: Bench, library: Library, batch: int) -> None:
-    """Measure queries of a batch on the default device."""
+    """Report how many balls per second the default device looks up, in batches of `batch`."""
     cases = pj.block.draw(2000, "pole", SEED)
     pick = np.random.default_rng(SEED).integers(0, 2000, batch)
     balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
@@ -241,7 +248,10 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
 
 
 def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
-    """Move the pole along y, and measure the repair."""
+    """Move the pole along y by `shift` [m], and time planning again all motions that now collide.
+
+    Then `num` balls through the tunnels of the repaired library are judged by the referee.
+    """
     scene = library.setting.scene
     pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)
     moved = dataclasses.replace(scene, pole=pole)
@@ -256,7 +266,7 @@ def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> No
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Measure everything."""
+    """Build or load the library, and report all measurements of the module's docstring."""
     if options.library is None:
         path = bench.path / "library.bin"
         library = build_timed(bench, path, options.layout, options.regime)
@@ -272,9 +282,10 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Namespace:
-    """Parse the arguments, after adding --library, --layout (with this default) and --regime.
+    """Add the options --library, --layout and --regime to a parser, and parse the arguments.
 
-    An unknown layout or regime exits with an error.
+    `layout` is the default of --layout. The program exits with an error if the layout or the regime
+    is unknown.
     """
     parser.add_argument("--library", type=Path, help="file of a built library; default: build one")
     known = ", ".join(LAYOUTS)
@@ -289,7 +300,7 @@ def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Na
 
 
 def main() -> None:
-    """Parse the arguments and measure."""
+    """Parse the arguments, and write all measurements to a run folder."""
     counts = {"num": 2000, "queries": 20000, "batch": 1 << 20}
     parser = argument_parser("block_library", __doc__, **counts)
     parser.add_argument(

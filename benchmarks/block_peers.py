@@ -2,23 +2,24 @@
 
     python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
 
-A block counts only if the referee accepts it, whatever the planner reports. `found` counts
-collision-free motions, in time or not. Every throw is planned alone, from NumPy arrays to NumPy
-arrays, by one call on one core. A call that compiles something is repeated.
+A block counts only if the referee accepts it, whatever the planner reports. The column `found`
+counts collision-free motions, even if they are too late for the ball. Each throw is planned by one
+call on one core, from NumPy arrays to NumPy arrays. A call that compiles something is repeated.
 
-The second block rate counts planning time: planning and motion together must fit between the moment
-at which the arm may start and the contact. Motions of `online` and `brisk` always end at the
-contact, so these planners plan again for an arm that starts later, by the 90 % quantile of all
-planning times. Calls that take longer than this quantile count as failures.
+The column `with query time` adds the planning time: planning and motion must together fit between
+the time at which the arm may start and the contact. Motions of `online` and `brisk` always end at
+the contact, so any planning time would make them late. These two planners therefore plan a second
+time, for an arm that starts later by the 90 % quantile of all planning times. Plans that take
+longer than this quantile count as failures.
 
-The execution time is how long the arm moves. Torques are root mean squares over that time, by
-inverse dynamics with the masses of the links and a massless shield. Both are averaged over the
-blocks of each planner, and over the throws that all planners of the run block.
+The execution time is how long the arm moves. Torques are root mean squares over the execution time,
+computed by inverse dynamics with the masses of the links and a massless shield. Execution times and
+torques are averaged over the blocks of each planner, and over the throws that all planners block.
 
 The paper's rows are quoted as printed. They come from 200 throws that are not published, on a
-Threadripper Pro 5995WX, with limits, poses and torques that the paper does not state. Its
-percentages are multiples of 1/209. Therefore compare rows only within one table, and use ratios of
-the paper's numbers.
+Threadripper Pro 5995WX. The paper does not state its limits, poses and definition of torques, and
+its percentages are multiples of 1/209. Absolute numbers of the paper are therefore not comparable
+with numbers measured here. Compare the ratios between the planners of each table instead.
 """
 
 import dataclasses
@@ -44,8 +45,8 @@ from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
-# Row name -> planner and its options. `direct-soonest` tries a single motion. Plain planners take
-# the first path that they find, as the paper's baselines must have done.
+# Row name -> planner and its options. `direct-soonest` tries a single motion. Planners named
+# "plain" return the first path that they find, as the baselines of the paper presumably do.
 PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "online": ("online", {}),
     "brisk": ("brisk", {}),
@@ -59,10 +60,13 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
-RESERVE = 90.0  # [%], quantile of planning times by which such a planner plans for a later start
-WARM = 2  # throws of another seed, planned before the measurement
-# Tables I and II as printed: found, blocked with and without query time [%]; query [ms] and
-# execution [s], each with its standard deviation; torques [N m].
+# [%] Planners of LASTS_UNTIL_CONTACT assume that planning takes this quantile of their planning
+# times, and plan for an arm that starts later by that time.
+RESERVE = 90.0
+WARM = 2  # Number of throws, drawn with another seed, that are planned before the measurement.
+# Tables I and II of [Natarajan2024] as printed. Columns of Table I: motion found [%], blocked if
+# query time counts [%], blocked if it does not count [%], query time [ms] and execution time [s],
+# each as (mean, standard deviation). Table II: root mean square torques of joints 1 to 6 [N m].
 TABLE_I = {
     "paper: theirs": (70.33, 68.9, 68.9, (0.109, 0.033), (0.31, 0.2)),
     "paper: RRT-Connect": (59.81, 27.27, 27.27, (17.5, 31.7), (1.3, 0.97)),
@@ -86,16 +90,16 @@ class Torques:
 def motion_torques(
     arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
 ) -> Torques:
-    """Return joint torques over a motion: sqrt(1/T int tau^2 dt) as in Table II of [Natarajan2024].
+    """Return RMS and peak joint torques: sqrt(1/T int tau^2 dt) as in Table II of [Natarajan2024].
 
-    The midpoint rule approximates the integral, because accelerations may jump at the ends. The
-    paper states neither whether gravity is included nor how torques are sampled. Pass gravity 0 to
-    leave it out.
+    The midpoint rule approximates the integral, because accelerations may jump at the ends of the
+    motion. The paper states neither whether gravity is included nor how torques are sampled. Pass
+    gravity 0 for torques without gravity.
 
     Args:
         arm: one arm.
         motion: joint trajectory, longer than 0 s.
-        gravity: () [m/s^2], magnitude, along -z of the base frame.
+        gravity: () [m/s^2], magnitude of gravity, which acts along -z of the base frame.
         samples: number of equal time steps; 256 give steps below 4 ms for motions up to a second.
     """
     shares = (np.arange(samples) + 0.5) / samples
@@ -113,7 +117,7 @@ def motion_torques(
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Results of one planner on B throws."""
+    """Success, times and torques of one planner on B throws."""
 
     verdict: BlockVerdict
     found: np.ndarray  # (B,) bool
@@ -125,7 +129,7 @@ class Outcome:
 
 
 def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Return motions (B, ...) without the pieces in which the arm waits."""
+    """Set the durations of pieces in which no joint moves to zero, for motions (B, ...)."""
     coeffs = np.asarray(motion.coeffs)
     moves = np.any(coeffs[:, :, 1:] != 0.0, axis=(2, 3))
     durations: Any = np.where(moves, motion.durations, 0.0)
@@ -133,19 +137,20 @@ def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
 
 
 def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
-    """Return which plans (B,) are free of collision, in time or not."""
+    """Return for each plan (B,) whether its motion is free of collision, even if it is too late."""
     claims = pj.are_solved(plans)
     late = np.isfinite(plans.violation) & (verdict.failed_limit == "time")
     return (claims & verdict.success) | (late & ~claims)
 
 
 def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
-    """Plan throws one by one and judge the plans.
+    """Plan throws one by one, judge the plans, and compute their times and torques.
 
-    With `lasts`, motions always end at the contact, so that planning time is counted by planning
-    again for a later start.
+    If `lasts`, the planner's motions always end at the contact. Its planning time is then counted
+    by planning again for an arm that starts later.
     """
-    # Once each: RRT-Connect continues its random sequence, so that more calls change its paths.
+    # The warm-up plans each throw once only, because every call advances RRT-Connect's random
+    # generator: with other numbers of calls the measured paths would differ.
     for k in range(WARM):
         pj.plan(planner, pj.take(warm, k))
     plans, query = measure_plans(planner, cases)
@@ -168,14 +173,17 @@ def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
 
 
 def with_spread(values: np.ndarray, digits: int) -> str:
-    """Format the mean and standard deviation; a dash if there are no values."""
+    """Format the mean and standard deviation of values as text; a dash if there are no values."""
     if not len(values):
         return "-"
     return f"{values.mean():.{digits}f} ± {values.std():.{digits}f}"
 
 
 def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Print Table I."""
+    """Print Table I: block rates, planning times and execution times of the paper and each planner.
+
+    `common` (B,) bool marks the throws that all planners block.
+    """
     bench.say(
         "| Table I | found | blocked | with query time | query [ms] | p50 | p99 | execution [s] "
         f"| execution on the {common.sum()} common |",
@@ -208,7 +216,7 @@ def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarra
 
 
 def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Print Table II: over each planner's own blocks, and over the common blocks."""
+    """Print Table II: torques, over each planner's blocks and over the blocks common to all."""
     bench.say(
         "",
         "| Table II, RMS [N m] | throws | 1 | 2 | 3 | 4 | 5 | 6 | peak 1 | peak 2 | peak 3 |",
@@ -238,7 +246,7 @@ def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndar
 
 
 def main() -> None:
-    """Print the tables."""
+    """Plan the drawn throws with every requested planner, and print Tables I and II."""
     parser = argument_parser("block_peers", __doc__, num=100, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="pole", help="default: pole")
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")

@@ -1,31 +1,35 @@
-"""Measure how accurately arms locate thrown balls, and how many balls they then block.
+"""Measure how accurately a camera locates thrown balls, and how many balls an arm then blocks.
 
     python -m benchmarks.block_perception [--num 2000] [--throws 1000] [--timed 50]
                                           [--rendered 12] [--seed 7] [--out DIR]
                                           [--parts errors,images,pipeline,planning]
 
-Part `errors`: balls are observed from the first frame, at time 0, up to some moment. Their flight
-is fitted once, with gravity known [Natarajan2024, eqs 5 to 8]. The error is the distance of the
-fitted position from the true one, perpendicular to the flight, when the ball is midway between the
-two boxes. A shield that may meet the ball 0.1 m off its middle tolerates an error of 0.1 m.
-Isotropic noise is equally large in every direction. The stereo camera has the noise of
-`stereo_noise`; its observations are weighted by this noise, or equally as in the paper's eq. 8. The
-summary's success is the share of errors below 0.1 m for the suite `short`, 60 Hz, 2 cm, 0.25 s.
+Part `errors`: balls are observed from the first frame, at time 0, up to a given time. Then the
+ball's flight is fitted to all observations, with known gravity [Natarajan2024, eqs 5 to 8]. The
+error is evaluated when the ball is midway between the two boxes. It is the distance of the fitted
+position from the true position, perpendicular to the flight. A shield that may meet the ball 0.1 m
+off its middle tolerates an error of 0.1 m. Observations have equal noise in all directions, or the
+noise of a stereo camera. Stereo observations are weighted by their noise, or equally as in the
+paper's eq. 8. The summary's success is the share of errors below 0.1 m for the suite `short`, with
+frames at 60 Hz, 2 cm of noise, and a fit at 0.25 s.
 
-Part `images`: throws of `short` are rendered at 60 Hz. The images pass depth noise, colour mask,
-outlier rejection, centroid, the frame of a simulated calibration, and the fit. The same throws with
-the stereo camera's noise model, without images, stand beside them. Frames are timed from image and
-depth on the host to the centroid, fits from observations to the flight, on one core, compiled
-before. The times contain neither the simulated noise nor a real camera's depth computation.
+Part `images`: throws of `short` are rendered at 60 Hz. Each image gets depth noise. The ball is
+found by a colour mask and outlier rejection, and its centroid is converted to the world frame with
+a simulated calibration. Then the flight is fitted. The table also has errors for the same throws
+with the stereo noise model instead of images. Two times are measured on one core, without
+compilation: from image and depth to the centroid, and from observations to the flight. They contain
+neither the simulation of the noise nor a real camera's depth computation.
 
-Part `pipeline`: throws of `short` with the limits R1, wide (up to 0.1 m off the middle and 30
-degrees aslant), are observed, fitted, planned for, and judged against the true ball. An arm decides
-once at a fixed moment; or once, at the last frame after which a motion is still in time; or
-repeatedly. Its motion starts 50 ms after the frame. The column `on the shield` counts balls that
-meet the shield anywhere on its face. The times stand beside [Natarajan2024, eq. 1]: sensing,
-overhead and motion must end before the ball arrives.
+Part `pipeline`: throws of `short` are observed, fitted, planned for, and judged against the true
+ball. The arm has the joint limits R1, and may meet a ball up to 0.1 m off the shield's middle and
+up to 30 degrees aslant. It decides once at a fixed time, or once at the last frame after which a
+motion is still in time, or repeatedly. Its motion starts 50 ms after the frame, a time called
+overhead. The column `on the shield` counts balls that meet the shield anywhere on its face. The
+table compares times as in [Natarajan2024, eq. 1]: sensing, overhead and motion must end before the
+ball arrives.
 
-Part `planning`: planning is timed one throw at a time. It should take less than the overhead.
+Part `planning`: plans are timed for one throw at a time. A plan should take less time than the
+overhead.
 """
 
 import dataclasses
@@ -65,17 +69,19 @@ from planner_jax.task.block.case import ANYWHERE
 from planner_jax.task.block.end_poses import flight_of
 from planner_jax.task.block.replan import ReplanBlock
 
-RATES = (30.0, 60.0, 120.0)  # [Hz]
-STDS = (0.01, 0.02, 0.03)  # [m]
-MOMENTS = (0.08, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # [s], moments at which flights are fitted
-ROOM = 0.1  # [m]
+RATES = (30.0, 60.0, 120.0)  # [Hz] Frame rates of the camera.
+STDS = (0.01, 0.02, 0.03)  # [m] Standard deviations of each observed coordinate.
+MOMENTS = (0.08, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # [s] Times at which flights are fitted.
+ROOM = 0.1  # [m] A smaller error of the fitted position counts as success.
+# Suite, frame rate [Hz], noise [m] and time of the fit [s] that define the summary's success.
 BAR = ("short", 60.0, 0.02, 0.25)
-RENDERED_RATE = 60.0  # [Hz]
-TIMED = 200  # number of frames, and of fits, that are timed
-OVERHEAD = 0.05  # [s]
+RENDERED_RATE = 60.0  # [Hz] Frame rate of rendered images.
+TIMED = 200  # Number of camera frames, and of flight fits, that are timed.
+OVERHEAD = 0.05  # [s] Time from a camera frame until the motion that uses it may start.
 PARTS = ("errors", "images", "pipeline", "planning")
-# Row -> noise [m] of each coordinate (None: the stereo camera's noise); first and last moment of
-# fits [s] and their rate [Hz]; options of `decide`.
+# Row name -> (noise, fits, options). Noise is the standard deviation [m] of each coordinate, or
+# None for the stereo camera's noise. Fits are (first time [s], last time [s], rate [Hz]). The
+# options are passed to the function `decide`.
 PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
@@ -91,9 +97,10 @@ PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, A
 def errors_after(
     cases: Any, eye: Eye, times: Array, places: Array, moments: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Return the errors of fits at moments (M,) [s], and their estimated standard deviations.
+    """Fit each ball's flight at the times `moments` (M,) [s]; return errors of the positions.
 
-    Both are (B, M) [m], perpendicular to the flight.
+    Returns the errors at the times `middle` (B,) [s], and their standard deviations as estimated by
+    the fit. Both are (B, M) [m], perpendicular to the flight.
     """
 
     def one(ball: BallState, gravity: Array, places: Array, middle: Array) -> Any:
@@ -117,7 +124,10 @@ def middle_of(cases: Any) -> Array:
 
 
 class Table:
-    """Printed table of median errors and shares within `ROOM`, with a column for each moment."""
+    """Printed table of position errors, with a column for each time at which flights are fitted.
+
+    A cell has the median error, and the share of errors below `ROOM`.
+    """
 
     def __init__(self, bench: Bench):
         self.bench = bench
@@ -126,11 +136,12 @@ class Table:
         bench.say("|---|---|---|" + "---|" * len(heads))
 
     def line(self, suite: str, rate: float, noise: str, errors: np.ndarray, stds: Any) -> None:
-        """Print a row from errors (B, M) and their stated standard deviations.
+        """Print the row of one suite, frame rate and kind of noise.
 
-        The error of a ball that was not seen is NaN.
+        `errors` (B, M) [m] are NaN for balls that were not seen. `stds` (B, M) [m] are the standard
+        deviations that the fits estimate for these errors.
         """
-        within = np.mean(errors < ROOM, axis=0)  # false for NaN: a ball that was not seen
+        within = np.mean(errors < ROOM, axis=0)  # A ball that was not seen (NaN) is not within.
         medians = np.nanmedian(errors, axis=0)
         cells = [
             f"{median:.3f} m, {100 * share:.1f} %"
@@ -152,7 +163,7 @@ class Table:
 
 
 def report_models(bench: Bench, num: int, seed: int) -> None:
-    """Print the tables of the noise models without images."""
+    """Print the part `errors`: errors of `num` fitted flights for each suite, rate and noise."""
     bench.say(f"Median error, and share of {num} throws within {ROOM:g} m", "")
     table, moments = Table(bench), jnp.asarray(MOMENTS)
     for suite in ("short", "pole"):
@@ -171,13 +182,13 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
                 if (suite, rate, std, BAR[3]) == BAR:
                     bench.count(found[0][:, MOMENTS.index(BAR[3])] < ROOM)
                 if std is None and rate == RENDERED_RATE:
-                    alike = eye(rate=rate, std=1.0)  # constant noise: equal weights
+                    alike = eye(rate=rate, std=1.0)  # Constant noise weights all frames equally.
                     found = errors_after(cases, alike, times, places, moments, middle)
                     table.line(suite, rate, "stereo, unweighted", np.asarray(found[0]), found[1])
 
 
 def report_images(bench: Bench, num: int, seed: int) -> None:
-    """Print the table of rendered images, beside the noise model, and the times."""
+    """Print the part `images`: errors with rendered images and with the noise model, and times."""
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
@@ -223,9 +234,10 @@ def report_images(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarray) -> None:
-    """Report the errors of balls in images.
+    """Report how far observed ball positions (B, K, 3) are from the true positions in the image.
 
-    Pixel errors are in pixels. Depth errors are in units of the noise model's standard deviation.
+    Errors in the image plane are in pixels. Depth errors are in units of the noise model's standard
+    deviation.
     """
     camera: Any = sensor.camera
     noise: Any = sensor.noise
@@ -248,7 +260,7 @@ def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarr
 def report_times(
     bench: Bench, sensor: Eye, times: Array, places: np.ndarray, frame_seconds: list[float]
 ) -> None:
-    """Report the duration of a frame and of a fit."""
+    """Report quantiles of the time to process a camera frame, and of the time to fit a flight."""
     camera, noise = sensor.camera, sensor.noise
 
     @jax.jit
@@ -256,7 +268,8 @@ def report_times(
         weights = information(camera, noise, places)
         return belief_at(fit_flight(times, places, weights, gravity), times[0], gravity)
 
-    # As a camera provides positions: one by one on the host, in a buffer of constant size.
+    # A camera delivers positions one by one to the host. They are passed as NumPy arrays of
+    # constant size, so that the fit is compiled only once.
     until, gravity = np.asarray(times), np.float32(9.81)
     jax.block_until_ready(fit(until, places, gravity))
     fit_seconds = []
@@ -279,12 +292,12 @@ def report_times(
 
 
 def moments_of(first: float, last: float, rate: float) -> list[float]:
-    """Return the moments [s] of fits at a rate [Hz]."""
+    """Return the times [s] of fits from `first` to `last` [s] at a rate [Hz]."""
     return [first + k / rate for k in range(int(np.floor((last - first) * rate + 1e-6)) + 1)]
 
 
 def pipeline(bench: Bench, num: int, seed: int) -> None:
-    """Report the share of balls blocked by arms that observe the balls."""
+    """Print the part `pipeline`: the share of balls blocked from noisy observations."""
     bench.say("", f"{num} throws of short, R1 wide, seed {seed}: the whole pipeline", "")
     bench.say(
         "| decided | noise | success % (95 %) | on the shield, % | without a plan, % | motions | "
@@ -335,7 +348,7 @@ def pipeline(bench: Bench, num: int, seed: int) -> None:
 
 
 def planning(bench: Bench, num: int, seed: int) -> None:
-    """Report planning times for one throw: for the first motion, and for the next ones."""
+    """Report planning times for one throw: for the arm's first motion, and for a re-planned one."""
     cases = jax.tree.map(np.asarray, pj.block.draw(num, "short", seed, regime="R1", wide=True))
     planner, sensor = pj.block.planner(), eye(std=0.02)
     known = [
@@ -362,9 +375,10 @@ def planning(bench: Bench, num: int, seed: int) -> None:
 
 
 def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
-    """Plan entries one by one for the aims in turn until one is solved, as `plan_with_aims` does.
+    """Plan B problems one by one, and time the planner, as `plan_with_aims` does for a batch.
 
-    Returns the plans, and the seconds (B,) spent on planning alone.
+    An aim is a reserve for the error of the fitted ball. Each problem is planned with one aim after
+    another until a plan is solved. Returns the plans, and the planning times (B,) [s].
     """
     (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
     aimed = []
@@ -386,7 +400,7 @@ def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
 
 
 def main() -> None:
-    """Measure the noise models, then images, the pipeline, and planning."""
+    """Run the requested parts of the module's docstring, and print their tables."""
     counts = {"num": 2000, "throws": 1000, "timed": 50, "rendered": 12, "seed": 7}
     parser = argument_parser("block_perception", __doc__, **counts)
     parser.add_argument(

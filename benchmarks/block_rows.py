@@ -1,22 +1,25 @@
-"""Measure the planner on every row of the block protocol, beside other methods on the same throws.
+"""Measure how many throws a block planner blocks, beside other methods on the same throws.
 
     python -m benchmarks.block_rows [--num 2000] [--seed 7] [--rows "R2,R2 late"] [--starts 192]
         [--lanes N] [--planner online] [--write] [--out DIR]
 
-Planning time is not subtracted. Each row has these columns, in percent of all throws:
-* end pose: there is a pose of the shield that meets the ball, is free of collision and, by the
-  joints' limits, can be reached in time by a straight motion. Its collisions are ignored.
-  This is nearly an upper bound, limited by the set of poses that is searched;
-* straight: this straight motion is free of collision too;
-* planner: the planner that is measured;
-* long: throws that neither of the two blocks, by least squares from --starts random starts of 40
-  steps each, none abandoned early;
-* union: blocked by any of the last three. The next column is the planner's share of the union.
+Each row of the table is a suite of throws with joint limits and a start time of the arm. The time
+for planning is ignored. Columns are in percent of all throws:
+* end pose: there is a pose of the shield that meets the ball and is free of collision. A straight
+  motion of the joints reaches this pose in time within the joints' limits, with or without a
+  collision on its path. This is nearly an upper bound. It is not exact, because only a finite set
+  of poses is searched;
+* straight: a straight motion blocks the ball, and is free of collision on its whole path;
+* planner: the measured planner blocks the ball;
+* long: a long search blocks the ball, but neither a straight motion nor the planner does. The long
+  search is least squares from --starts random starts, 40 steps each, without early stopping;
+* union: a straight motion, the planner or the long search blocks the ball;
+* planner of union: blocks of the planner, divided by the blocks of the union.
 
-All columns but the end poses are judged by the referee. --write stores the throws with these
-columns in `block_throws.csv` beside this file, one line a throw. Each method's column has one digit
-for every row of the throw's suite, in the order given at the head of the file; 1 means blocked.
-Read these columns as text, because they begin with zeros.
+Blocks in all columns but the end poses are judged by the referee. --write stores the throws and the
+results in `block_throws.csv` beside this file, one line a throw. The column of each method has one
+digit for every row of the throw's suite, in the order stated at the top of the file; 1 means
+blocked. Read these columns as text, because they may begin with zeros.
 """
 
 import csv
@@ -36,8 +39,9 @@ from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.end_poses import end_poses, flight_of
 
-# Suite and settings of each row; in late rows the arm may start after 0.133 s.
+# [s] In rows named "late" the arm may start only this long after the ball is first seen.
 LATE = 0.133
+# Row name -> suite of throws, and options of `pj.block.draw`.
 ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "R1": ("pole", {"regime": "R1"}),
     "R1 late": ("pole", {"regime": "R1", "delay": LATE}),
@@ -52,14 +56,18 @@ ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "open R2 late": ("open", {"delay": LATE}),
 }
 METHODS = ("end pose", "straight", "planner", "long", "union")
-STEPS = 40  # of least squares in the long search
+STEPS = 40  # Number of least-squares steps from each start of the long search.
 STRAIGHT = OnlineBlock(searches=(Search(tries=0),))
 
 
 @jax.jit
 @jax.vmap
 def has_end_pose(case: pj.block.BlockCase) -> Array:
-    """Return whether some collision-free end pose can be reached in time, () bool."""
+    """Return whether some pose of the shield meets the ball in time without a collision, () bool.
+
+    The pose must be reachable by a straight motion within the joints' limits. Collisions on the
+    path to the pose are ignored.
+    """
     poses = end_poses(case, flight_of(case), STRAIGHT.points, STRAIGHT.pieces)
     gaps = least_clearances(case.arm, case.scene, poses.angles)
     inside = (poses.angles >= case.arm.lower) & (poses.angles <= case.arm.upper)
@@ -68,7 +76,11 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 
 @jax.jit
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
-    """Return the best plan of each case (B,) from starts with bumps (N, 6) [rad] and ranks (N,)."""
+    """Run least squares for each case (B,) from N starts; return its plan with the least violation.
+
+    Start n is a straight motion to the end pose with rank `ranks[n]` in the planner's order. The
+    joints deviate from it along its path by up to `bumps[n]` (6,) [rad].
+    """
     online = OnlineBlock()
 
     def of_case(case: pj.block.BlockCase) -> pj.block.BlockPlan:
@@ -83,10 +95,12 @@ def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.blo
 
 
 def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
-    """Return which cases a long search blocks, by the referee, (N,) bool.
+    """Return which of N cases the long search from random starts blocks, (N,) bool.
+
+    Plans are judged by the referee.
 
     Args:
-        cases: batch of cases.
+        cases: a batch; the N cases to search are selected by `index`.
         index: (N,) int, indices of the cases to search.
         starts: number of random starts for each case.
         lanes: number of starts that are optimised in one call.
@@ -104,13 +118,16 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
 
 
 def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
-    """Return which cases (B,) a planner blocks, by the referee."""
+    """Return for each case (B,) whether the planner blocks the ball, as judged by the referee."""
     plans = pj.plan(planner, cases)
     return np.asarray(pj.block.judge(cases, plans).success & pj.are_solved(plans))
 
 
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
-    """Measure one row: which throws each method blocks, (N,) bool each."""
+    """Draw the throws of one row, and print the share of them that each method blocks.
+
+    Returns which throws are blocked, (N,) bool, by name of the method.
+    """
     suite, settings = ROWS[name]
     cases = pj.block.draw(options.num, suite, options.seed, **settings)
     found = {
@@ -132,7 +149,7 @@ def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
 
 
 def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
-    """Write the throws, and which method blocks each of them in which rows."""
+    """Write a CSV file with each throw's state, and which method blocks it in which rows."""
     suites = {ROWS[name][0]: [] for name in results}
     for name in results:
         suites[ROWS[name][0]].append(name)
@@ -155,7 +172,7 @@ def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options:
 
 
 def main() -> None:
-    """Print the requested rows."""
+    """Measure the requested rows, print the table, and write the throws if requested."""
     parser = argument_parser("block_rows", __doc__, num=2000, seed=7, starts=192)
     parser.add_argument(
         "--rows", default=",".join(ROWS), help=f"rows to print, of {', '.join(ROWS)}; default: all"

@@ -1,15 +1,21 @@
-"""Select the starting points of the block planner's least squares, beside straight motions.
+"""Learn the starting points of the block planner's search by least squares.
 
     python -m benchmarks.block_starts [--num 60] [--tries 24] [--lanes 512] [--write] [--out DIR]
 
-Throws are drawn from the suite `pole`, seed 1001, in regime R2, met straight on, with a delay of
-0.05 s. No reported result uses these throws. Throws that no straight motion blocks are tried from
-random starts. A start is an end pose, by its rank in the planner's order, and a bump that bends the
-straight motion of the joints to one side. Candidates are the bumps that led to plans, and the
-deviations of the plans from straight motions. Each candidate is tried at the first ranks on all
-throws that some start solved. The starts are then selected greedily: the next start is the one that
-blocks most of the remaining throws. --write replaces the shipped file. The shipped file was learned
-with --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
+The planner searches by least squares if no straight motion of the joints blocks a ball. The search
+starts from a straight motion with an added bump: each joint deviates smoothly to one side, by a
+given angle in the middle of the motion. A start is such a bump, and the rank of the motion's end
+pose in the planner's order of end poses.
+
+Throws are drawn from the suite `pole` with seed 1001 and the joint limits R2. They are met at a
+right angle, and the arm may start after 0.05 s. No reported result uses these throws. Throws that
+no straight motion blocks are planned from random starts. Two kinds of bumps become candidates: the
+random bumps that led to plans, and the typical deviations of these plans from straight motions.
+Each candidate is tried with the first end poses, on all throws that some random start solved. Then
+starts are selected greedily: the next start is the one that blocks most of the remaining throws.
+
+--write replaces the file that the library ships. The shipped file was learned with the options
+--num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
 """
 
 import dataclasses
@@ -34,28 +40,28 @@ from planner_jax.task.block.end_poses import all_profiles, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, bump_steps
 from planner_jax.task.block.plan import BlockPlan
 
-SEED, DELAY = 1001, 0.05
-STRAIGHT = 32  # number of straight motions that are tried
-SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad], standard deviation of random bumps
-RANKS, LATER_RANKS = 10, 24  # numbers of end poses: for candidates, for random starts
-KINDS = 48  # number of candidates of either kind
-MOST = 16  # maximum number of selected starts
-SHARES = tuple(np.arange(1, 33) / 32)
+SEED, DELAY = 1001, 0.05  # Seed of the throws, and time [s] after which the arm may start.
+STRAIGHT = 32  # Number of straight motions that are tried for each throw.
+SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad] Spread of random bumps of each joint.
+RANKS, LATER_RANKS = 10, 24  # Number of end poses tried with candidates, and with random starts.
+KINDS = 48  # Number of candidates: random bumps, and as many typical deviations of plans.
+MOST = 16  # Maximum number of selected starts.
+SHARES = tuple(np.arange(1, 33) / 32)  # Times at which motions are compared, over the duration.
 
 
 def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return random bumps (num, 6) [rad] of all sizes, and random ranks (num,) of end poses."""
+    """Draw `num` starts: bumps (num, 6) [rad] of the joints, and ranks (num,) of end poses."""
     bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
     return bumps, rng.integers(0, LATER_RANKS, num)
 
 
 @struct.dataclass
 class Followed:
-    """Result of least squares from one start."""
+    """Result of a least-squares search from one start."""
 
     plan: BlockPlan
-    point: Array  # (n,), the unknowns
-    profile: Array  # () int, of the bent straight motion, an index of `all_profiles`
+    point: Array  # (n,), the planner's unknowns at the end of the search
+    profile: Array  # () int, velocity profile of the initial motion, an index into `all_profiles`
 
 
 def follow(
@@ -65,13 +71,15 @@ def follow(
     rank: Array,
     steps: int | Array,
 ) -> Followed:
-    """Run least squares for one case from a bent straight motion, without abandoning it early.
+    """Run least squares for one case, starting from a straight motion with an added bump.
+
+    The planner's rule that stops a search without hope is switched off.
 
     Args:
         planner: defines the unknowns and residuals.
         case: one case.
-        bump: (6,) [rad], of the joints.
-        rank: () int < `LATER_RANKS`, of the end pose, in the planner's order.
+        bump: (6,) [rad], greatest deviation of each joint from the straight motion.
+        rank: () int < `LATER_RANKS`, index of the motion's end pose in the planner's order.
         steps: maximum number of least-squares steps; a number, or () int.
     """
     flight = flight_of(case)
@@ -93,8 +101,8 @@ def try_starts(
 
     Returns:
         is_good: (B,) bool, whether the plan is solved.
-        found: (B, 6) [rad], height of the bump that best fits the deviation of the resulting motion
-            from the straight motion to the same end.
+        found: (B, 6) [rad], bump that best fits the deviation of the planned motion from the
+            straight motion with the same end pose.
     """
 
     def one(case: pj.block.BlockCase, bump: Array, rank: Array) -> tuple[Array, Array]:
@@ -115,7 +123,10 @@ def try_starts(
 def try_in_parts(
     cases: Any, index: np.ndarray, bumps: np.ndarray, ranks: np.ndarray, steps: int, lanes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run `try_starts` for starts (N,) of the cases with indices (N,), `lanes` at a time."""
+    """Run `try_starts` in batches of `lanes` starts. Start n is for the case `index[n]`.
+
+    Returns whether each start led to a plan (N,), and the fitted bumps (N, 6) [rad].
+    """
 
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
         for first in range(0, len(index), lanes):
@@ -131,9 +142,10 @@ def try_in_parts(
 
 
 def select_starts(solves: np.ndarray) -> list[int]:
-    """Select columns of a table (throws, starts) bool greedily.
+    """Select starts greedily from a table (throws, starts) bool of which start solves which throw.
 
-    Each selected column solves most of the throws that the columns before it do not solve.
+    Each selected start solves most of the throws that no start before it solves. Returns the
+    selected columns, at most `MOST`.
     """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:
@@ -147,7 +159,14 @@ def select_starts(solves: np.ndarray) -> list[int]:
 
 
 def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]]:
-    """Return the selected starts, in the order in which the planner tries them."""
+    """Draw throws, and learn starts from them, in the order in which the planner tries them.
+
+    Args:
+        bench: prints the share of solved throws.
+        num: number of throws.
+        tries: number of random starts for each throw.
+        lanes: number of starts that are optimised in one call.
+    """
     rng = np.random.default_rng(0)
     cases = pj.block.draw(num, "pole", SEED, regime="R2", delay=DELAY)
     places, none = np.repeat(np.arange(num), STRAIGHT), np.zeros((num * STRAIGHT, 6))
@@ -168,10 +187,12 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # At most 8 starts of each throw, so that easy throws do not outvote the others.
+    # Each throw contributes at most 8 starts. Otherwise throws that almost every start solves would
+    # determine most candidates.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
-    # Drawn here, because SciPy deprecates `seed` in `kmeans2`, and its `rng` draws other numbers.
+    # The initial cluster centres are drawn here and passed to `kmeans2`: its own argument `seed` is
+    # deprecated, and its argument `rng` would draw other numbers than the shipped file used.
     first = np.random.RandomState(1).choice(len(picked), min(KINDS, len(picked)), replace=False)
     middles, _ = kmeans2(beside[picked], beside[picked[first]], minit="matrix")
     candidates = np.concatenate([middles, bumps[rng.permutation(picked)[:KINDS]]])

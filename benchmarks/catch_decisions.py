@@ -1,17 +1,21 @@
-"""Compare methods to choose catching order and times, as in Table III of [Yu2023catch].
+"""Compare methods that decide order and times of catches, as in Table III of [Yu2023catch].
 
     python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
         [--policy FILE] [--timed 200] [--out DIR]
 
-The planner is `exact`, and every plan is judged by the referee. Decisions: `best` plans the six
-most promising of all orders, `greedy` plans one order, and `random` a random one. `policy` is the
-shipped policy or the one in --policy: its mean action, or six proposals, from which the plan with
-the earliest last catch is used. In suites with optional targets, "caught" is the mean number of
-targets caught by successful plans. Last catches are means over accepted plans. The optimal time
-ratio (OTR) is computed for the decision's own times. "At 25" is the success rate if the planner
-stops after 25 iterations of one start. A decision is timed for one case at a time, compiled before,
-from one NumPy vector with the case's numbers to another with order and times. No policy was trained
-with this seed, and `draw` does not use it by default.
+The planner is `exact`, and every plan is judged by the referee. The decisions are:
+* `best`: plan the six most promising of all orders, and use the best plan;
+* `greedy`: plan the one order that catches the earliest target next;
+* `random`: plan a random order;
+* `policy`: plan the mean action of a neural network, the shipped policy or the one in --policy;
+* `policy, 6`: plan six proposals of this network, and use the plan with the earliest last catch.
+
+In suites with optional targets, "caught" is the mean number of targets that successful plans catch.
+"Last catch" is the mean time of the last catch over accepted plans. The optimal time ratio (OTR)
+compares the decided times with the optimised times. "At 25" is the success rate if the planner
+stops after 25 iterations from one initial guess. The time of a decision is for one case, without
+compilation, from one NumPy vector with the case's numbers to another vector with order and times.
+No policy was trained on the cases of this seed.
 """
 
 import argparse
@@ -55,14 +59,18 @@ def decision_time(decision: Any, cases: Any, num: int) -> float:
 
 
 def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) -> dict[str, Any]:
-    """Return the figures of one decision on one suite, and count its successes."""
+    """Plan the cases of one suite with one decision; return success rates, times and ratios.
+
+    The successes are added to the benchmark's summary.
+    """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
     verdict = pj.catch.judge(cases, plans)
     success = verdict.success
     short = pj.plan(DecidedPlanner(SHORT, decision), cases)
     bench.count(success)
-    # With optional targets, 25 iterations count only if they catch no fewer targets.
+    # With optional targets, a plan after 25 iterations counts as success only if it catches at
+    # least as many targets as the plan after all iterations.
     at_25 = pj.catch.judge(cases, short)
     at_25 = at_25.success & (at_25.num_caught >= verdict.num_caught)
     return {
@@ -78,7 +86,7 @@ def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) ->
 
 
 def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> None:
-    """Print all rows."""
+    """Print a table with one row for each suite and decision."""
     decisions = {
         "best": pj.catch.Best(),
         "greedy": pj.catch.Greedy(),
@@ -107,7 +115,7 @@ def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> Non
 
 
 def main() -> None:
-    """Parse the arguments and print the table."""
+    """Parse the arguments, and print the table of all suites and decisions."""
     parser = argument_parser("catch_decisions", __doc__, num=1000, seed=777, timed=200)
     parser.add_argument("--suites", default=",".join(TRAINED_ON), help="suites, comma-separated")
     parser.add_argument(

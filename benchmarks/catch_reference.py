@@ -2,16 +2,20 @@
 
     python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
-The published C++ program solves the same problem with the reference MINCO and L-BFGS headers, with
-one thread, in double precision. On the easy set it takes 2.96 ms a plan and makes 320 plans/s on a
-core (220 iterations). On the hard set it takes 4.40 ms and solves 98 %. With better settings of its
-search it makes 582 and 453 plans/s.
+The published C++ program solves the same problem with the reference headers of MINCO and L-BFGS, in
+one thread and in double precision. On the easy set it takes 2.96 ms and 220 iterations a plan, and
+makes 320 plans/s on a core. On the hard set it takes 4.40 ms a plan and solves 98 % of the throws.
+With better settings of its search it makes 582 plans/s on the easy set and 453 on the hard set.
 
-Printed are the cost of the initial guess against the published J0 (float64), the cost gap of
-`catch` to the published optimum (float64 and float32), `exact`'s refereed success and mean catching
-time (float32), and the speed of both, one by one and in a batch. The project's own C++ program
-(`benchmarks.catch_peer`), faster than the published one, stands beside them. The summary of the run
-folder is about `exact`. Run this benchmark on an idle machine; `taskset -c 0` binds it to one core.
+The benchmark measures two planners of this library: `catch`, which minimises the same objective,
+and `exact`, the default. It prints
+* for `catch`, the cost at the initial guess and at the optimum, relative to the published costs;
+* for `exact`, the success rate by the referee and the mean catching time;
+* the speed of both planners, one throw at a time and in a batch;
+* the speed of this project's own C++ program (`benchmarks.catch_peer`), which is faster than the
+  published program.
+The summary of the run folder is about `exact`. Run this benchmark on an idle machine. The command
+`taskset -c 0` binds it to one core.
 """
 
 import csv
@@ -34,11 +38,12 @@ from planner_jax.optimise.settings import Round, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
-_QUICK, _QUICK_COARSE = 45, 60  # iterations of the quick `catch`
+# Iterations of `quick_paper_catch`, with all samples and with a quarter of the samples.
+_QUICK, _QUICK_COARSE = 45, 60
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
-    """Return the cases of a file and its published columns."""
+    """Read a CSV file of throws; return its cases, and the published times and costs by name."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -61,13 +66,13 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
 
 
 def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
-    """Return the published cost function at a planner's initial guess."""
+    """Return the cost at a planner's initial guess, in the unit of the published costs."""
     context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
 
 
 def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
-    """Return percentiles of the planning time, one plan at a time."""
+    """Plan the cases one at a time, `repeats` times; return percentiles of the time as text."""
     host = jax.tree.map(np.asarray, cases)
     num = host.batch_shape[0]
     lanes = [pj.take(host, k) for k in range(num)]
@@ -83,7 +88,11 @@ def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
 
 
 def throughput(planner, cases: pj.catch.CatchCase) -> str:
-    """Return the best rates of five warm batches, by wall-clock time and by CPU time."""
+    """Plan a large batch five times without compilation; return its best speed as text.
+
+    The batch consists of `BATCH_COPIES` copies of the cases. The speed is in plans per second of
+    wall-clock time and of CPU time.
+    """
     many = jax.tree.map(lambda leaf: np.tile(leaf, (BATCH_COPIES,) + (1,) * (leaf.ndim - 1)),
                         jax.tree.map(np.asarray, cases))  # fmt: skip
     pj.plan(planner, many)
@@ -97,7 +106,10 @@ def throughput(planner, cases: pj.catch.CatchCase) -> str:
 
 
 def report_paper_planner(bench: Bench, data: Path) -> None:
-    """Report the cost of the guess and of the optimum in float64."""
+    """Report costs of `catch` in float64, at the initial guess and at the end of its search.
+
+    Both are compared with the published costs in the files of the folder `data`.
+    """
     with jax.enable_x64(True):
         for name in SETS:
             cases, known = read_set(data / f"catch_{name}.csv", jnp.float64)
@@ -133,7 +145,7 @@ def quick_paper_catch() -> PaperCatch:
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
-    """Report both planners on one set, in float32."""
+    """Report cost, success and speed of `catch` and `exact` on one set of throws, in float32."""
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
     quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
     bench.say(
@@ -154,7 +166,7 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
 
 
 def report_peer(bench: Bench, data: Path) -> None:
-    """Report the C++ program of `catch_peer` on both sets, with its fastest settings."""
+    """Report speed and cost of the C++ program `catch_peer` on both sets of throws."""
     with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
         program = peer.build(Path(folder))
         if program is None:
@@ -167,7 +179,7 @@ def report_peer(bench: Bench, data: Path) -> None:
 
 
 def main() -> None:
-    """Print all results."""
+    """Measure both planners and the C++ program on both sets of throws, and print the results."""
     parser = argument_parser("catch_reference", __doc__, repeats=5)
     parser.add_argument("--data", type=Path, default=Path("tests/data"), help="folder of the sets")
     options = parser.parse_args()

@@ -3,20 +3,23 @@
     python -m benchmarks.catch_replan [--num 1000] [--rate 100] [--noise 0.005] [--out DIR]
     taskset -c 1 python -m benchmarks.catch_replan --alone
 
-Balls are drawn from the suite `throws`. A camera observes each ball at the rate, with noise on its
-position, from a tenth of a second before planning starts until the catch. At each observation the
-Kalman filter predicts the ball one period ahead, and the catch is planned from there. A plan that
-is ready within one period takes effect at the period's end. A plan that takes longer counts as a
-missed deadline and is dropped. The filter knows the drag. A plan that violates a limit is dropped
-too. The last 0.05 s are not re-planned.
+Balls are drawn from the suite `throws`. A camera observes each ball --rate times per second, from a
+tenth of a second before planning starts until the catch. Observed positions have noise, and the
+ball's drag is known. After each observation a Kalman filter predicts the ball one period ahead, and
+the catch is planned again for a start at that time. If the plan is ready within one period and
+keeps all limits, the quadrotor switches to it at the end of the period. A plan that takes longer is
+a missed deadline. It is dropped, as is a plan that violates a limit. During the last 0.05 s before
+the catch nothing is re-planned.
 
 The flown trajectory, from the first plan to the catch, is judged against the ball's true path by
-the protocol of [Yu2023catch] (5 %, net test "ball"). The result of the first plan alone stands
-beside it. With --alone, re-plans are only timed, beside plans from scratch for the same throws. The
-summary of the run folder is about the flown trajectories, or about the timed re-plans with --alone;
-its cost gap is about the first re-plans. Everything is computed in the calling thread, as in the
-live loop, because passing a program of 0.1 ms to a JAX thread adds half of that time. Run it on an
-idle machine; the load average is printed.
+the protocol of [Yu2023catch]: limits with a tolerance of 5 %, and the ball within the net's radius
+of its centre. The first plan without re-planning is judged too. With --alone, the program only
+times re-plans, and plans from scratch for the same throws.
+
+The summary of the run folder is about the flown trajectories, or with --alone about the timed
+re-plans. Its cost gap is about the first re-plans. All programs run in the calling thread, as in
+the live loop, because starting a program of 0.1 ms in one of JAX's threads adds 0.05 ms. Run the
+benchmark on an idle machine; the load average is printed.
 """
 
 import dataclasses
@@ -41,13 +44,13 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-SEEN = 0.1  # [s], time of observation before planning starts
-WARM_UP = 5  # throws flown before the measurement
+SEEN = 0.1  # [s] Observations start this long before planning starts.
+WARM_UP = 5  # Number of throws that are flown before the measurement.
 SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
-    """Kalman filter of one ball, whose belief is stored as one vector between calls."""
+    """Kalman filter of one ball. Its mean and covariance are stored as one vector."""
 
     def __init__(self, period: float, noise: float, drag: Any, gravity: Any) -> None:
         model = EkfModel(
@@ -62,7 +65,10 @@ class Estimator:
         first, unravel = ravel_pytree(unknown)
 
         def advance(vector: jax.Array) -> jax.Array:
-            """Update the belief with an observation and predict one period ahead, as vectors."""
+            """Update the filter with an observation, and predict one period ahead.
+
+            `vector` holds the filter's state and then the observation (3,) [m].
+            """
             state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
             return ravel_pytree(ahead)[0]
@@ -71,12 +77,12 @@ class Estimator:
         self._first = self._belief = np.asarray(first)
 
     def begin(self, observation: np.ndarray) -> None:
-        """Reset the filter, with the first observation as the expected position."""
+        """Start a new ball: reset the filter, with the first observation (3,) [m] as the mean."""
         self._belief = self._first.copy()
         self._belief[:3] = observation
 
     def see(self, observation: np.ndarray) -> BallState:
-        """Return the predicted ball one period after this observation (3,), leaves (1, 3)."""
+        """Update the filter with an observation (3,) [m]; predict the ball one period later."""
         belief: Any = np.asarray(self._advance(np.concatenate([self._belief, observation])))
         self._belief = belief
         return BallState(pos=belief[None, :3], vel=belief[None, 3:6])
@@ -84,41 +90,44 @@ class Estimator:
 
 @dataclasses.dataclass
 class Times:
-    """Durations [s] of all calls, and counts of failures."""
+    """Durations [s] of estimation, first plans and re-plans, and counts of failures."""
 
     estimate: list[float] = dataclasses.field(default_factory=list)
     first: list[float] = dataclasses.field(default_factory=list)
     again: list[float] = dataclasses.field(default_factory=list)
     missed: int = 0  # number of missed deadlines
     broken: int = 0  # number of re-plans that violate a limit
-    # The first re-planning problems, with their plans.
+    # The first `COMPARED` re-planning problems, with their plans.
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
-        """Store a re-plan if it is one of the first."""
+        """Store a re-planning problem and its plan, unless `COMPARED` of them are stored."""
         if len(self.replans) < COMPARED:
             self.replans.append((left, found))
 
     def gaps(self) -> np.ndarray | None:
-        """Return the excess costs of the first re-plans over a long search from the same guess."""
+        """Return the relative costs of the stored re-plans above the costs of a long search.
+
+        The long search starts from the same guess. None if no re-plan is stored.
+        """
         if not self.replans:
             return None
         return cost_gaps(AGAIN, *stack(self.replans))
 
 
 def stack(trees: list) -> Any:
-    """Stack pytrees into a batch."""
+    """Stack pytrees of equal structure into one batch, with a new leading axis."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def balls_of(case: CatchCase) -> pj.BallPath:
-    """Return the targets of a case of `throws`."""
+    """Return the ball's path, which is the target of every case of the suite `throws`."""
     assert isinstance(case.targets, pj.BallPath)
     return case.targets
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
-    """Decide when to catch, and plan from scratch."""
+    """Decide when to catch, and plan from scratch; return the decided case and the plan."""
     case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
 
@@ -127,7 +136,11 @@ _propose = jax.jit(pj.catch.Greedy().propose)
 
 
 def warm_up(case: CatchCase) -> None:
-    """Compile every round: a quadrotor that must not move needs all of them."""
+    """Compile all searches of the planner and the re-planner.
+
+    A quadrotor with a speed limit near zero cannot catch the ball. The planner therefore tries, and
+    compiles, every round of its search.
+    """
     stuck = dataclasses.replace(
         case, limits=dataclasses.replace(case.limits, speed=np.float32(1e-3))
     )
@@ -138,14 +151,14 @@ def warm_up(case: CatchCase) -> None:
 def fly(
     case: CatchCase, observations: np.ndarray, estimator: Estimator, period: float, out: Times
 ) -> tuple[CatchPlan, CatchPlan]:
-    """Fly one throw from its first observation to the catch.
+    """Simulate one throw from its first observation to the catch, with re-planning.
 
     Args:
-        case: starts one period after the observation at which planning starts.
-        observations: (K, 3) [m], observations, one a period.
-        estimator: filter of the ball.
-        period: [s].
-        out: receives the times.
+        case: its time 0 is one period after the observation at which planning starts.
+        observations: (K, 3) [m], observed positions of the ball, one for each period.
+        estimator: Kalman filter of the ball.
+        period: [s], time between two observations.
+        out: stores the durations of all calls.
 
     Returns:
         The flown trajectory as a plan, and the first plan.
@@ -186,7 +199,7 @@ def fly(
 
 
 def cut_trajectory(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolynomial:
-    """Return the first `elapsed` seconds of a trajectory."""
+    """Return the first `elapsed` [s] of a trajectory."""
     ends = path.durations.cumsum()
     durations = path.durations - np.maximum(ends - elapsed, 0.0)
     flown = durations > 0.0
@@ -194,15 +207,18 @@ def cut_trajectory(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolyno
 
 
 def join_trajectories(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """Concatenate trajectories in time."""
+    """Concatenate trajectories, each starting where the one before it ends."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *paths)
 
 
 def judge(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
-    """Return the referee's verdicts by the protocol, in the order of the plans."""
+    """Judge plans by the protocol of [Yu2023catch]; return arrays of verdicts by field name.
+
+    The order of the plans is kept, although plans with equal numbers of pieces are judged together.
+    """
     lengths = np.array([flown.trajectory.durations.size for flown in plans])
     found: dict[str, np.ndarray] = {}
-    for length in np.unique(lengths):  # plans of equal size form a batch
+    for length in np.unique(lengths):
         lanes = np.flatnonzero(lengths == length)
         verdict = pj.catch.judge(
             pj.take(cases, lanes),
@@ -219,7 +235,7 @@ def judge(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
 
 
 def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
-    """Print one line of percentiles."""
+    """Print one line with percentiles of durations `seconds`, and store them as a row."""
     p50, p90, p99 = 1e3 * np.percentile(seconds, [50, 90, 99])
     bench.row(name=name, num=len(seconds), p50_ms=p50, p90_ms=p90, p99_ms=p99)
     bench.say(
@@ -229,7 +245,7 @@ def report_times(bench: Bench, name: str, seconds: list[float]) -> None:
 
 
 def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> None:
-    """Print one line of success."""
+    """Print the success rate, the ball's distances from the net's centre, and failed limits."""
     p50, p90, p99 = 100.0 * np.percentile(verdict["net_distance"], [50, 90, 99])
     limits = np.unique([limit for limit in verdict["failed_limit"] if limit], return_counts=True)
     failures = ", ".join(f"{limit} {count}" for limit, count in zip(*limits, strict=True))
@@ -241,9 +257,9 @@ def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> N
 
 
 def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray]:
-    """Return the true cases and noisy observations (num, K, 3) [m] of their balls.
+    """Draw throws; return the true cases and noisy observations (num, K, 3) [m] of their balls.
 
-    The cases start one period after planning starts.
+    Time 0 of the cases is one period after planning starts.
     """
     suite = pj.catch.draw(num)
     times = jnp.arange(-round(SEEN / period), int(suite.horizon.max() / period)) * period
@@ -263,7 +279,11 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
 
 
 def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
-    """Measure re-plans one after the other, once each, for balls that moved slightly."""
+    """Time one re-plan for each case, and a plan from scratch, and report percentiles.
+
+    A re-plan starts at a random time of the first plan, for a ball whose position and velocity
+    deviate from the expected ones by random errors of the size `noise`.
+    """
     random = np.random.default_rng(0)
     tasks = []
     for case in lanes:
@@ -300,7 +320,7 @@ def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: flo
 
 
 def main() -> None:
-    """Fly the throws, or time re-plans alone."""
+    """Simulate all throws with re-planning, or only time re-plans with --alone."""
     parser = argument_parser("catch_replan", __doc__, num=1000)
     parser.add_argument(
         "--rate", type=float, default=100.0, help="observations and plans per second [Hz]"
@@ -334,7 +354,7 @@ def main() -> None:
 def fly_all(
     bench: Bench, cases: CatchCase, observations: np.ndarray, period: float, noise: float
 ) -> None:
-    """Fly every throw, with everything compiled, and report."""
+    """Simulate every throw with compiled programs, and report times and success."""
     lanes = [pj.take(cases, k) for k in range(len(observations))]
     path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])
@@ -342,7 +362,7 @@ def fly_all(
         fly(lane, seen, estimator, period, Times())
     times = Times()
     gc.collect()
-    gc.disable()  # as in any loop with deadlines: a garbage collection takes milliseconds
+    gc.disable()  # A garbage collection takes milliseconds, and loops with deadlines avoid it.
     flights = [
         fly(lane, seen, estimator, period, times)
         for lane, seen in zip(lanes, observations, strict=True)

@@ -1,11 +1,12 @@
-"""Measure the catch planners' refereed success on every suite, beside the paper's rates.
+"""Measure how often catch planners succeed on every suite, beside the rates of [Yu2023catch].
 
     python -m benchmarks.catch_rows [--suites throws,hard] [--planners exact,catch,mpp]
         [--decide best] [--num 1000] [--seed 0] [--out DIR]
 
-Every plan is judged with a tolerance of 1e-3. The paper's `catch` has soft penalties. Every plan is
-therefore judged a second time by the protocol of the published C++ program: limits to 5 %, and the
-ball within the net's radius of its centre.
+The referee judges every plan with a relative tolerance of 1e-3. The paper's planner, here named
+`catch`, uses soft penalties, whose plans exceed limits slightly. Every plan is therefore judged a
+second time by the protocol of the published C++ program, which accepts limits exceeded by up to 5 %
+and requires the ball within the net's radius of its centre.
 """
 
 import argparse
@@ -23,7 +24,10 @@ from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Return the figures of one planner on one suite, and count its successes."""
+    """Plan the cases of one suite with one planner; return success, cost gap, ratios and times.
+
+    The successes are added to the benchmark's summary.
+    """
     num, seed = options.num, options.seed
     planner, cases = pj.catch.planner(name, decide=options.decide), pj.catch.draw(num, suite, seed)
     began = time.perf_counter()
@@ -57,7 +61,7 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
 
 
 def main() -> None:
-    """Print the requested rows."""
+    """Print a table with one row for each requested suite and planner."""
     parser = argument_parser("catch_rows", __doc__, num=1000, seed=0)
     parser.add_argument(
         "--suites", default=",".join(SUITES), help="suites, comma-separated; default: all"

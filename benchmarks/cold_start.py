@@ -1,9 +1,9 @@
-"""Measure the time from process start to the first plans, with empty and with warm caches.
+"""Measure the time from process start to the first plans, with and without cached programs.
 
     python -m benchmarks.cold_start [--num 1024] [--out DIR]
 
-Two fresh processes plan one batch of hits each. The second process uses the programs that the first
-process compiled.
+Two new processes, one after the other, plan one batch of hits each. The first process finds an
+empty compile cache on the disk. The second process loads the programs that the first one compiled.
 """
 
 import os
@@ -26,7 +26,10 @@ plans.save({path!r})
 
 
 def first_plans(num: int, path: str, caches: str) -> tuple[float, str]:
-    """Plan in a fresh process, save the plans to `path`, and return duration [s] and output."""
+    """Plan `num` hits in a new process, with the compile cache in the folder `caches`.
+
+    The plans are saved to `path`. Returns the process's duration [s] and its output.
+    """
     began = time.perf_counter()
     found = subprocess.run(
         [sys.executable, "-c", FIRST_PLANS.format(num=num, path=path)],
@@ -39,7 +42,7 @@ def first_plans(num: int, path: str, caches: str) -> tuple[float, str]:
 
 
 def main() -> None:
-    """Run both processes, and judge their plans."""
+    """Run both processes, print their durations, and judge their plans."""
     parser = argument_parser("cold_start", __doc__, num=1024)
     options = parser.parse_args()
     bench, rows = begin(parser, options), []
@@ -52,7 +55,8 @@ def main() -> None:
                 f"load average {os.getloadavg()[0]:.1f}"
             )
             rows.append((caches, seconds, pj.hit.HitPlan.load(path)))
-    # A device may have memory for one process only, so this process uses no device until here.
+    # This process uses the device only after both processes have ended, because the device's memory
+    # may suffice for one process only.
     with bench:
         planner, cases = pj.hit.planner("exact"), pj.hit.draw(options.num)
         for caches, seconds, plans in rows:

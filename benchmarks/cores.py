@@ -2,11 +2,15 @@
 
     python -m benchmarks.cores [--num 36000] [--turns 8] [--out DIR]
 
-Three groups of processes stay alive and take turns, so that a slow minute of the machine affects
-all of them: one process on one core; one process on all cores; and one process on each core, all at
-the same time. The last group shows the greatest speed-up that this machine allows, because cores
-may share caches, memory or a clock. Printed are warm plans per second, and their ratio to the one
-core in the same turn. Linux only, because processes are bound to cores.
+Three groups of processes are compared:
+* one process on one core;
+* one process on all cores;
+* one process on each core, all at the same time. This group shows the greatest speed-up that the
+  machine allows, which may be below the number of cores, because cores share caches and memory.
+
+The groups take turns, so that other load on the machine affects all of them. For each group the
+program prints plans per second without compilation, and their ratio to the plans per second on one
+core in the same turn. It runs on Linux only, because processes are bound to cores.
 """
 
 import functools
@@ -22,28 +26,29 @@ import numpy as np
 
 import planner_jax as pj
 
-# The processes import this module, so `main` imports what only the main process uses.
+# Every child process imports this module. Imports that only the main process needs are therefore
+# inside of `main`.
 
 
 def _start_process(cores: Sequence[int]) -> ProcessPoolExecutor:
-    """Create a process that is bound to some cores before JAX starts its threads."""
+    """Start a process, and bind it to the cores before JAX starts its threads."""
     spawn = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, spawn, initializer=os.sched_setaffinity, initargs=(0, cores))
 
 
 @functools.cache
 def _cases(num: int) -> tuple[Any, Any]:
-    """Return a planner and hits for it."""
+    """Return the planner `exact` and a batch of `num` drawn hits, stored between calls."""
     return pj.hit.planner("exact"), pj.hit.draw(num)
 
 
 def _plan_first(num: int) -> Any:
-    """Plan once, including compilation."""
+    """Plan `num` hits for the first time, which compiles the programs; return the plans."""
     return pj.plan(*_cases(num))
 
 
 def _time_plan(num: int) -> float:
-    """Return the duration [s] of a call that is already compiled."""
+    """Plan `num` hits with compiled programs; return the duration [s]."""
     planner, cases = _cases(num)
     began = time.perf_counter()
     pj.plan(planner, cases)
@@ -51,7 +56,7 @@ def _time_plan(num: int) -> float:
 
 
 def main() -> None:
-    """Take turns and print the rates."""
+    """Let the groups of processes plan in turns, and print their plans per second."""
     from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
     from planner_jax.benchmarks.run import argument_parser, begin
 
@@ -77,7 +82,7 @@ def main() -> None:
     for children in groups.values():
         for child in children:
             child.shutdown()
-    with bench:  # from here on JAX runs in the main process too
+    with bench:  # Only now does JAX start in the main process, so that it took no core before.
         bench.say(
             f"load average {load:.1f}; {options.turns} turns",
             "| process | plans/s, median | lowest | highest | times one core | success |",

@@ -1,4 +1,7 @@
-"""Compare the costs of plans with the optimum that a long search finds."""
+"""Compare the costs of plans with the optimum that a long search finds.
+
+Benchmarks use this module to report how far their plans are from the optimum.
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,9 +16,9 @@ from planner_jax.optimise.settings import LbfgsConfig, NewtonConfig, Round, Stag
 from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 
-COMPARED = 1024  # maximum number of plans of a batch that are compared
-# One long search from the first guess: L-BFGS, then Newton's method, which converges along
-# ill-conditioned directions too.
+COMPARED = 1024  # Maximum number of plans of a batch that are compared with a long search.
+# The long search starts from the planner's first guess. It runs L-BFGS, then Newton's method, which
+# converges also along directions in which the cost changes very little.
 TO_THE_OPTIMUM = Round(
     solver=NewtonConfig(max_steps=100, tolerance=1e-8, patience=10),
     stages=(Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)),),
@@ -30,23 +33,22 @@ def cost_gaps(
     *,
     card: Task | None = None,
 ) -> np.ndarray | None:
-    """Return the relative excess of plans' costs over the costs of a long search.
+    """Return by what fraction the costs of plans exceed the costs that a long search finds.
 
-    The long search is `TO_THE_OPTIMUM` for a planner that minimises by rounds. For any other
-    planner it is the planner that the task specification names as a yardstick, with that planner's
-    defaults.
+    For a planner that minimises in rounds, the long search is `TO_THE_OPTIMUM`. For any other
+    planner it is the planner that the task specification names as `yardstick`, with its defaults.
 
     Args:
         planner: the planner that made the plans. If it also decides (`DecidedPlanner`), the long
             search uses the same decisions.
         cases: a batch; only the first `COMPARED` cases are compared.
         plans: one plan for each case.
-        devices: as for `plan`.
-        card: specification of the planner's task, for its yardstick.
+        devices: devices of the long search; None for all devices.
+        card: specification of the planner's task, which names the yardstick.
 
     Returns:
-        (K,), relative (0.33 is 33 %), for the cases that both planners solve. None if the planner
-        has no rounds and the task has no yardstick for such cases.
+        (K,), cost / best cost - 1 for the K cases that both searches solve. None if the planner
+        has no rounds and the task names no yardstick for this class of cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
@@ -66,7 +68,7 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # Groups of a task and re-planning problems are cases of other classes.
+    # The yardstick cannot plan re-planning problems or groups of targets, which have other classes.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
@@ -76,7 +78,10 @@ def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:
-    """Return the median, 90 % and 99 % quantile of `cost_gaps`; None if there are no gaps."""
+    """Return the median, 90 % and 99 % quantile of the results of `cost_gaps`, by name.
+
+    The values are None if there are no gaps.
+    """
     together = np.concatenate([np.zeros(0), *(each for each in gaps if each is not None)])
     names = ("cost_gap_median", "cost_gap_p90", "cost_gap_p99")
     if not together.size:

@@ -1,11 +1,12 @@
-"""Measure the cost above the optimum, and the time, for each of a planner's efforts.
+"""Measure cost and time of plans for each effort: "feasible", "good" and "best".
 
     python -m benchmarks.efforts [--num 1000] [--seed 0] [--repeat 3] [--out DIR]
 
-The planner is `exact`, on hits of the suite `court`, and on catches of one and of two balls in
-greedy order. The optimum is found by a long search from the same guess, with Newton's method at the
-end. The time is the fastest call, compiled before. The share of plans that the referee accepts
-stands beside it.
+The effort states how long a planner continues to search after every limit holds. The planner is
+`exact`, for hits of the suite `court` and for catches of one and of two balls in greedy order. The
+table has the share of plans that the referee accepts, their cost above the optimum, and the time of
+the fastest call without compilation. The optimum is found by a long search from the same initial
+guess, which ends with Newton's method.
 """
 
 import argparse
@@ -24,7 +25,7 @@ SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Print a row for each effort and suite."""
+    """Plan every suite with every effort, and print a table with one row for each pair."""
     bench.say(
         f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
         "| task | suite | effort | refereed | cost above the optimum (median, p90, p99) | "
@@ -61,7 +62,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def _time_fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
-    """Return plans, and the duration [s] of the fastest of `repeat` warm calls."""
+    """Return plans, and the duration [s] of the fastest of `repeat` calls without compilation."""
     plans, seconds = pj.plan(planner, cases), []
     for _ in range(repeat):
         began = time.perf_counter()
@@ -71,7 +72,7 @@ def _time_fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
 
 
 def main() -> None:
-    """Print the rows."""
+    """Parse the arguments, and print the table of efforts."""
     parser = argument_parser("efforts", __doc__, num=1000, seed=0, repeat=3)
     options = parser.parse_args()
     with begin(parser, options) as bench:

@@ -1,13 +1,16 @@
-"""Measure how many steps per second the training environment takes.
+"""Measure the speed of the environment in which catching policies are trained, in steps per second.
 
     python -m benchmarks.environment_speed [--suite triangle3] [--iterations 25] [--lanes 16384]
         [--steps 20] [--out DIR]
 
-A step of `CatchEnv` takes one action for each batch element, plans with it, and returns the reward,
-the next cases and their observations. Actions are random with a standard deviation of a tenth of
-the range, as for a policy in training. The time is for --steps steps in one compiled loop, the best
-of three runs after a first one. The share of plans that succeed within the iterations stands beside
-it. The planner's own check decides on success, because a step stores no plans for the referee.
+The environment `CatchEnv` is a batch of --lanes catching problems. In each step, an action decides
+order and times for each problem, and the planner plans with this decision. The step returns
+rewards, the next problems and their observations. Actions are random, with a standard deviation of
+0.1 in a range from -1 to 1, similar to a policy in training.
+
+A run is one compiled loop of --steps steps, and the fastest of three runs after a first run counts.
+The program also prints the share of plans that keep all limits after --iterations iterations. The
+planner's own check decides about the limits, because a step stores no plans for the referee.
 """
 
 import argparse
@@ -23,7 +26,7 @@ from planner_jax.task.catch.spec import SUITES
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Print the row."""
+    """Time the environment's steps, and print steps per second and the share of solved plans."""
     env = CatchEnv((options.suite,), (options.iterations,))
     keys = jax.random.split(jax.random.key_data(jax.random.key(options.seed)), options.lanes)
 
@@ -58,7 +61,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Print the speed."""
+    """Parse the arguments, and print the environment's speed."""
     parser = argument_parser(
         "environment_speed", __doc__, iterations=25, lanes=16_384, steps=20, seed=0
     )

@@ -1,1 +1,4 @@
-"""The problem of `PaperCatch` with one ball in C++, with solvers of its own."""
+"""A C++ program that plans catches of one ball: the problem of the baseline `PaperCatch`.
+
+`benchmarks.catch_reference` compares the planners with it. It has its own L-BFGS and BFGS.
+"""

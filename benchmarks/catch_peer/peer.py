@@ -1,19 +1,25 @@
 """Build the C++ program of this folder, run it on a table of throws, and compare with the table.
 
-The program minimises the objective of `planner_jax.baselines.catch.paper.PaperCatch`, on one core
-and in double precision, one throw after another, without a heap allocation. It shares no code with
-the library.
+The program plans catches of one ball. It minimises the objective of
+`planner_jax.baselines.catch.paper.PaperCatch`, on one core and in double precision, one throw after
+another, without a heap allocation. It shares no code with the library. `benchmarks.catch_reference`
+runs it to compare its speed with the planners' speed.
 
-The settings of each search were tuned by some 500 to 1,500 random steps on the 240 throws of both
-sets, for the least time with 97 % of the costs within 1e-3 of the published cost. The following
-were varied: memories of 8 to 64 and BFGS with a dense matrix, `past` from 2 to 20, `delta` from
-1e-7 to 1e-5, both constants of the weak Wolfe conditions, bisection and cubic interpolation, a unit
-for each kind of variable, and variables relative to the smoothest trajectory and to the ball.
+The settings of each search were tuned by a random search of 500 to 1,500 steps on the 240 throws of
+both published sets. The aim was the least time with at least 97 % of the costs within 1e-3 of the
+published cost. These settings were varied:
+* the memory of L-BFGS from 8 to 64 pairs, or BFGS with a dense matrix;
+* the stopping rule: the cost must change by less than `delta` (1e-7 to 1e-5) over `past` (2 to 20)
+  iterations;
+* the line search: both constants of the weak Wolfe conditions, bisection or cubic interpolation;
+* the variables: a scale for each kind of variable, and either the published variables or variables
+  relative to the smoothest trajectory and to the ball.
 
-The table lists plans per CPU second on a core of an AMD EPYC (Zen 3 or later), which other programs
-used too, so that differences of 10 % are not significant. In brackets are the percentage of costs
-within 1e-3 and the mean iterations. On 960 throws shifted from these by some 0.1 m and 0.15 m/s,
-`SEARCHES` ends within 1e-3 of a long search on 98 to 100 %.
+The table lists plans per CPU second on one core of an AMD EPYC (Zen 3 or later). Other programs ran
+on the same machine, so differences below 10 % are not significant. In brackets are the percentage
+of costs within 1e-3 of the published cost, and the mean number of iterations. As a check, 960 other
+throws were made by shifting these throws by some 0.1 m and 0.15 m/s. The settings in `SEARCHES` end
+within 1e-3 of the cost of a long search on 98 to 100 % of them.
 
 | variables | search | `past`, `delta` | easy set | hard set |
 |---|---|---|---|---|
@@ -39,26 +45,29 @@ import numpy as np
 
 SOURCE = Path(__file__).with_name("catch.cpp")
 COMPILERS = ("g++", "c++")
-# Without -ffinite-math-only: a step that is too long may overflow, which must be detected.
+# The flag -ffinite-math-only is left out, because the program must detect infinite costs: a trial
+# step that is too long may overflow.
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 FLAGS += ("-fno-signed-zeros", "-fassociative-math", "-freciprocal-math", "-Wno-psabi")
 NO_COMPILER = f"C++: not measured, there is no compiler ({' or '.join(COMPILERS)})"
-AS_GOOD = 1e-3  # relative cost above the published cost that counts as equal
+AS_GOOD = 1e-3  # A relative cost above the published cost up to this value counts as equal.
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Settings of the search; the fields are the program's command-line arguments."""
 
-    # Whitened offsets and the net relative to the ball, instead of q and p(T)
+    # Whether the variables are whitened waypoint offsets from the smoothest trajectory and the
+    # net's position relative to the ball. If not, they are waypoints q and the end position p(T).
     relative: bool = False
     memory: int = 48  # pairs of L-BFGS, at most 64; 0 for BFGS with a dense matrix
     past: int = 10  # iterations over which the cost is compared
     delta: float = 1e-7  # relative change of the cost over `past` iterations that ends the search
-    decrease: float = 1e-4  # of the weak Wolfe conditions
-    curvature: float = 0.9
-    interpolate: bool = True  # cubic interpolation within a bracket, not bisection
-    scale_q: float = 1.0  # units of the variables: waypoints or offsets, log T, p, v, a
+    decrease: float = 1e-4  # constant of sufficient decrease in the weak Wolfe conditions
+    curvature: float = 0.9  # constant of the slope in the weak Wolfe conditions
+    interpolate: bool = True  # line search by cubic interpolation, else by bisection
+    # Scales of the variables: waypoints or offsets, log T, end position, velocity, acceleration.
+    scale_q: float = 1.0
     scale_t: float = 1.0
     scale_p: float = 1.0
     scale_v: float = 1.0
@@ -70,8 +79,9 @@ class Settings:
         return [f"{name}={float(value):g}" for name, value in given.items()]
 
 
-# The fastest settings that satisfy `AS_GOOD` on at least 98 % of both published sets, with some
-# margin for another processor's rounding.
+# The fastest settings of three kinds of search. On at least 98 % of both published sets their cost
+# is within `AS_GOOD` of the published cost. This leaves a margin above the required 97 %, because
+# another processor may round differently.
 SEARCHES = {
     "C++, own L-BFGS, one core, double": Settings(
         memory=48, past=5, delta=8e-7, decrease=0.01, curvature=0.5,
@@ -90,9 +100,9 @@ SEARCHES = {
 
 @dataclasses.dataclass(frozen=True)
 class Figures:
-    """Results of the program on a table."""
+    """Speed, cost and success of the C++ program on a table of throws."""
 
-    plans_per_second: float  # per CPU second, without reading and printing
+    plans_per_second: float  # plans per CPU second, without reading input and printing
     share_within: float  # share of cases whose cost is at most `AS_GOOD` above the published one
     median_gap: float  # relative cost above the published one
     mean_iterations: float
@@ -100,7 +110,7 @@ class Figures:
     guess_error: float  # largest relative error of the cost at the initial guess
 
     def __str__(self) -> str:
-        """Format the results in one line."""
+        """Format speed, cost gap, iterations and success in one line of text."""
         return (
             f"{self.plans_per_second:.0f} plans/s, gap <= {AS_GOOD:.0e} on "
             f"{100 * self.share_within:.1f} %, median {self.median_gap:.1e}, "
@@ -110,7 +120,7 @@ class Figures:
 
 
 def build(folder: Path) -> Path | None:
-    """Compile the program into a folder; return None if there is no compiler (`NO_COMPILER`)."""
+    """Compile the C++ program into a folder; return its path, or None if there is no compiler."""
     compiler = next(filter(None, map(shutil.which, COMPILERS)), None)
     if compiler is None:
         return None
@@ -120,13 +130,13 @@ def build(folder: Path) -> Path | None:
 
 
 def measure(program: Path, table: Path, settings: Settings, repeats: int = 5) -> Figures:
-    """Run the program on a table, and compare.
+    """Run the C++ program on a table of throws, and compare its costs with the published costs.
 
     Args:
-        program: from `build`.
-        table: with the columns of tests/data/catch_paper.csv.
-        settings: of the search.
-        repeats: number of rounds over all cases; the fastest counts.
+        program: path of the compiled program, from `build`.
+        table: CSV file with the columns of tests/data/catch_paper.csv.
+        settings: settings of the search.
+        repeats: number of times that all cases are planned; the fastest time counts.
     """
     with table.open(newline="", encoding="utf-8") as file:
         published = list(csv.DictReader(file))
