@@ -231,7 +231,7 @@ def _of_segment(
     motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
     each = along.excess(motion, parameters)
     hinges = factors * smooth_hinge(jnp.stack(each) + margins, along.hinge_width)
-    penalty = duration * jnp.sum(hinges * weights)
+    penalty = duration * jnp.sum(hinges * weights[None])
     if along.rate is not None:
         penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
     # First over the limits at each sample: on a CPU faster than a maximum of the stack.

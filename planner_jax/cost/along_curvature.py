@@ -68,7 +68,7 @@ def curvature_along(
         powers.append(powers[-1] * rate)
     rates = jnp.stack(powers)[:, None, None]
     order = np.arange(orders)[:, None, None]
-    motion, drift, drift_of_drift = unit * rates  # (orders, K, 3) each
+    motion, drift, drift_of_drift = unit * rates[None]  # (orders, K, 3) each
     # First and second derivatives of the samples by theta.
     first = drift - samples(order) * motion
     second = drift_of_drift - samples(2.0 * order) * drift + samples(order**2) * motion
@@ -80,8 +80,8 @@ def curvature_along(
         return jnp.sum(weight * jnp.sum(values, axis=(0, 2)))
 
     back = samples(constants.moving_samples)  # (orders, K, C)
-    weighed = weight[:, None] * rates
-    slopes = jnp.stack([slope, (1.0 - samples(order)) * slope + image]) * weighed
+    weighed = weight[None, :, None] * rates
+    slopes = jnp.stack([slope, (1.0 - samples(order)) * slope + image]) * weighed[None]
     by, mixed = jnp.einsum("dkc,odka->oca", back, slopes, precision=lax.Precision.HIGHEST)
     return AlongCurvature(
         penalty=jnp.sum(weight * value),

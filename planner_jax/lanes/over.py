@@ -240,7 +240,8 @@ def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Arra
         first = jnp.clip(start.array, 0, shape[axis] - size)
         sizes = [1] * len(shape)
         sizes[axis] = size
-        indices = jnp.arange(size, dtype=first.dtype).reshape(*sizes, 1) + first
+        steps = jnp.arange(size, dtype=first.dtype).reshape(*sizes, 1)
+        indices = steps + jnp.expand_dims(first, tuple(range(len(sizes))))
         window = jnp.take_along_axis(window, indices, axis)
     return [window]
 

@@ -160,7 +160,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
         natural = jnp.pad(natural, ((0, 0), (0, 0), (self.num_offsets, 0)))
-        points = (natural / jnp.asarray(self.scale, natural.dtype)).reshape(num, -1)
+        points = (natural / jnp.asarray(self.scale, natural.dtype)[None, None]).reshape(num, -1)
         network = self.start_network(context.case)
         if network is None:
             return points
@@ -171,14 +171,14 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
         """Return the whitened offsets (N, O, 3), and the end variables (N, K) in SI units."""
         scale = jnp.asarray(self.scale, point.dtype)
-        natural = point.reshape(-1, scale.size) * scale
+        natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return offsets, natural[:, self.num_offsets :]
 
     def join(self, offsets: Float[Array, "N O 3"], natural: Float[Array, "N K"]) -> Array:
         """Return the point (n,) of offsets and end variables: the inverse of `split`."""
         together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
-        return (together / jnp.asarray(self.scale, together.dtype)).ravel()
+        return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
         """Return the penalties along the trajectory."""

@@ -96,7 +96,10 @@ def chain_curvature(
     own_units, offset_units = scale[3 * offsets.shape[1] :], scale[: 3 * offsets.shape[1]]
 
     def join(offsets: Array, natural: Array) -> Array:
-        parts = [offsets.reshape(num, -1) * offset_units, natural.reshape(num, -1) * own_units]
+        parts = [
+            offsets.reshape(num, -1) * offset_units[None],
+            natural.reshape(num, -1) * own_units[None],
+        ]
         return jnp.concatenate(parts, axis=1).ravel()
 
     def products() -> Callable[[Array], Array]:
@@ -104,7 +107,7 @@ def chain_curvature(
         hessian = jax.vmap(whole)(of.at_samples)
 
         def product(direction: Array) -> Array:
-            parts = direction.reshape(num, -1) * scale
+            parts = direction.reshape(num, -1) * scale[None]
             step = parts[:, : offset_units.size].reshape(offsets.shape)
             move = parts[:, offset_units.size :]
             longer = move[:, 0, None, None]
@@ -128,7 +131,7 @@ def chain_curvature(
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)
     is_time = jnp.asarray(np.eye(natural.size)[:: natural.shape[1]], scale.dtype)  # (N, N k)
     beside = einsum("pnca,nca->pn", turned, of.columns_theta[:, :num_rows])
-    beside = dot(beside + 0.5 * theta_theta * is_time.T, is_time, 1)
+    beside = dot(beside + 0.5 * theta_theta[None] * is_time.T, is_time, 1)
     block = dot(half, turned, ((1, 2, 3), (1, 2, 3))) + within + beside + beside.T
     units = jnp.tile(own_units, num)
     own_bend = alone + bend
@@ -142,7 +145,7 @@ def chain_curvature(
         products=products,
         preconditioner=block_preconditioner(
             places.reshape(1, -1),
-            (block * units * units[:, None])[None],
-            join(own_bend * offset_units.reshape(offsets.shape[1:]), jnp.zeros_like(natural)),
+            (block * units[None] * units[:, None])[None],
+            join(own_bend * offset_units.reshape(1, *offsets.shape[1:]), jnp.zeros_like(natural)),
         ),
     )

@@ -34,7 +34,8 @@ def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Pr
         def solve(right: Array) -> Array:
             entries, found = tuple(right), list(right / of_others)
             for block, inverse in zip(blocks, inverses, strict=True):
-                solved = jnp.sum(inverse * jnp.stack([entries[j] for j in block]), axis=1)
+                part = jnp.stack([entries[j] for j in block])
+                solved = jnp.sum(inverse * part[None], axis=1)
                 for place, value in zip(block, tuple(solved), strict=True):
                     found[place] = value
             return jnp.stack(found)
@@ -62,7 +63,7 @@ def _gauss_jordan(matrix: Array) -> Array:
         )
         scaled = jnp.where(here, 1.0, row) / pivot
         rest = jnp.where(here, 0.0, m)
-        return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled)
+        return jnp.where(here[:, None], scaled, rest - column[:, None] * scaled[None])
 
     return jax.lax.fori_loop(0, size, eliminate, matrix)
 

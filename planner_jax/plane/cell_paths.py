@@ -85,7 +85,9 @@ def draw_path(
     along *= (lattice.levels - 1) / lattice.pace
 
     def draw(ends: Array, steps: Array) -> CellPath:
-        score = ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)  # prefer the goal's own cell
+        score = (
+            ends + jnp.where(jnp.arange(9) == 0, 1.0, 0.0)[None, None]
+        )  # prefer the goal's own cell
         best = jnp.argmax(jnp.where(is_reached, score, -jnp.inf))
         level, heading, around = jnp.unravel_index(best, is_reached.shape)
 
@@ -102,7 +104,7 @@ def draw_path(
             rate = (before - grid.start).astype(dtype) / (n.astype(dtype) + 0.5)
             mean = jnp.dot(along, rate, precision=lax.Precision.HIGHEST)
             velocity = _velocity(from_level, heading - turn, grid)
-            rough += directness * jnp.sum((velocity - mean) ** 2, axis=-1)
+            rough += directness * jnp.sum((velocity - mean[None]) ** 2, axis=-1)
             chosen = jnp.argmax(jnp.where(is_step, steps[n].astype(dtype) - rough, -jnp.inf))
             after = (from_level[chosen], heading - turn[chosen], before, turn[chosen])
             new = jax.tree.map(lambda a, b: jnp.where(n < num, a, b), after, state)

@@ -183,7 +183,7 @@ def separation(
         body: ends of the rectangle behind and ahead of the point, and half its width [m].
     """
     behind, ahead, half = body
-    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    cos, sin = jnp.cos(heading)[None], jnp.sin(heading)[None]
     ends = [(a, b) for a in (behind, ahead) for b in (-half, half)]
     points = [(x + a * cos - b * sin, y + a * sin + b * cos) for a, b in ends]
     before = jnp.roll(corners, 1, axis=1)

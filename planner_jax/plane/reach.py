@@ -111,7 +111,8 @@ def grid_of(
 def _pack(cells: Array) -> Array:
     """Pack cells (..., W * 32) bool into words (W, ...)."""
     bits = cells.reshape(*cells.shape[:-1], -1, 32).astype(jnp.uint32)
-    words = jnp.sum(bits << jnp.arange(32, dtype=jnp.uint32), axis=-1, dtype=jnp.uint32)
+    shifts = jnp.expand_dims(jnp.arange(32, dtype=jnp.uint32), tuple(range(cells.ndim)))
+    words = jnp.sum(bits << shifts, axis=-1, dtype=jnp.uint32)
     return jnp.moveaxis(words, -1, 0)
 
 
@@ -170,7 +171,7 @@ def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
 def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) -> Array:
     """Return the cells (words, cells) uint32 that moving obstacles occupy at one time."""
     cells = grid.lattice.cells
-    middle = (movers.centre + movers.velocity * time - grid.corner) / grid.cell
+    middle = (movers.centre + movers.velocity * time - grid.corner[None]) / grid.cell
     at = jnp.round(jnp.clip(middle, -cells, 2.0 * cells)).astype(jnp.int32) - _STENCIL // 2
 
     def draw_one(stencil: Array, at: Array) -> Array:
@@ -221,23 +222,25 @@ def reach_set(
     # Differences of rounded positions, so that the moves of n layers add up to the rounded
     # position: if each move were rounded, a heading of 11 degrees would become 0.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
-    cells = jnp.round(0.5 * half_steps * pace[:, None, None] * direction).astype(jnp.int32)
+    cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None]).astype(
+        jnp.int32
+    )
     halves = jnp.diff(cells, axis=0)  # (2 layers + 1, levels, headings, 2)
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
     # The same for turns: their whole bins add up to the angle that the turn rates allow.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
-    whole = jnp.diff(jnp.floor(before * most + 0.1), axis=0)  # (layers, levels)
+    whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     span = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))
-    turns = span <= whole[..., None]
+    turns = span[None, None] <= whole[..., None]
     walls = _pack(field < vehicle.radius)
     stencils = _stencils(grid, movers, vehicle.radius)
-    discs = jnp.round(-vehicle.ahead[:, None, None] * direction / grid.cell).astype(jnp.int32)
+    discs = jnp.round(-vehicle.ahead[:, None, None] * direction[None] / grid.cell).astype(jnp.int32)
     middle = jnp.mean(vehicle.ahead) * direction  # of the body from the rear axle
-    position = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)
-    on_map = (position + middle[:, :, None] > grid.lower[:, None]) & (
-        position + middle[:, :, None] < grid.upper[:, None]
+    position = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)[None]
+    on_map = (position[None] + middle[:, :, None] > grid.lower[None, :, None]) & (
+        position[None] + middle[:, :, None] < grid.upper[None, :, None]
     )
     columns = _pack(on_map[:, 0])[..., None]
     allowed = jnp.where(on_map[:, 1], columns, jnp.uint32(0))
@@ -303,8 +306,8 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
     indices = jnp.arange(lattice.cells, dtype=cell.dtype)
-    at = (indices[:, None] == cell[1]) & (indices == cell[0])
-    bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[:, None]
+    at = (indices[:, None] == cell[1]) & (indices[None] == cell[0])
+    bits = near[:, None, None] & (jnp.arange(lattice.headings) == 0)[None, :, None]
     return jnp.where(bits, _pack(at)[:, None, None], jnp.uint32(0))
 
 
@@ -353,11 +356,11 @@ def goal_cells(
     width = 2.0 * np.pi / lattice.headings
     bins = jnp.arange(lattice.headings)
     angle = grid.heading + width * bins.astype(grid.cell.dtype)
-    axle = goal - ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
-    nearest = jnp.round((axle - grid.corner) / grid.cell).astype(jnp.int32)
+    axle = goal[None] - ahead * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    nearest = jnp.round((axle - grid.corner[None]) / grid.cell).astype(jnp.int32)
     around = jnp.asarray(np.stack(np.meshgrid([0, -1, 1], [0, -1, 1]), axis=-1).reshape(-1, 2))
-    cells = nearest[:, None].astype(around.dtype) + around
+    cells = nearest[:, None].astype(around.dtype) + around[None]
     of_level = jax.vmap(jax.vmap(bit_at, (None, None, None, 0)), (None, None, 0, 0))
     of_all = jax.vmap(of_level, (None, 0, None, None))
     is_reached = of_all(layer, jnp.arange(lattice.levels), bins, cells)
-    return cells, is_reached & headings[:, None]
+    return cells, is_reached & headings[None, :, None]

@@ -144,7 +144,7 @@ def shield_jacobian(arm: Arm, angles: Array) -> Array:
     rotations, positions = link_frames(arm, angles)
     axes = joint_axes(arm, rotations)
     middle = positions[5] + product(rotations[5], jnp.asarray(arm.shield_centre))
-    return jnp.concatenate([jnp.cross(axes, middle - positions), axes], axis=1).T
+    return jnp.concatenate([jnp.cross(axes, middle[None] - positions), axes], axis=1).T
 
 
 def capsules(arm: Arm, angles: Array) -> Array:

@@ -102,9 +102,13 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
     whole = turn(length)
     heading = start[2] + jnp.cumsum(whole) - whole
-    tau = length[:, None] * jnp.asarray(_NODE, speed.dtype)
+    tau = length[:, None] * jnp.asarray(_NODE, speed.dtype)[None]
     angle = heading[:, None] + jax.vmap(turn, in_axes=1, out_axes=1)(tau)
-    moved = (v[:, None] + rise[:, None] * tau) * length[:, None] * jnp.asarray(_WEIGHT, speed.dtype)
+    moved = (
+        (v[:, None] + rise[:, None] * tau)
+        * length[:, None]
+        * jnp.asarray(_WEIGHT, speed.dtype)[None]
+    )
     x, y = jnp.sum(moved * jnp.cos(angle)), jnp.sum(moved * jnp.sin(angle))
     return start + jnp.stack([x, y, jnp.sum(whole)])
 

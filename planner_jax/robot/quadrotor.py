@@ -72,7 +72,7 @@ class QuadrotorLimits:
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
     """Return the thrust per unit mass  a + g e_3  [m/s^2], (..., 3)."""
-    return acc + gravity * jnp.array([0.0, 0.0, 1.0], acc.dtype)
+    return acc + jnp.broadcast_to(gravity * jnp.array([0.0, 0.0, 1.0], acc.dtype), acc.shape)
 
 
 def body_z(acc: Array, gravity: Array) -> Array:

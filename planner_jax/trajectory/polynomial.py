@@ -89,8 +89,8 @@ def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
     """Return the integral () of the squared `order`-th derivative, in closed form."""
     coeffs, durations = trajectory.coeffs, trajectory.durations
     form, exponents = energy_form(coeffs.shape[1] - 1, order)
-    powers = durations[:, None, None] ** jnp.asarray(exponents, durations.dtype)
-    gram = jnp.asarray(form, coeffs.dtype) * powers
+    powers = durations[:, None, None] ** jnp.asarray(exponents, durations.dtype)[None]
+    gram = jnp.asarray(form, coeffs.dtype)[None] * powers
     return jnp.einsum("mki,mkl,mli->", coeffs, gram, coeffs, precision=lax.Precision.HIGHEST)
 
 
@@ -98,7 +98,7 @@ def sample_pieces(trajectory: PiecewisePolynomial, nodes: int) -> Motion:
     """Sample the motion at `nodes` + 1 times of every piece, ends included, piece after piece."""
     coeffs, degree = trajectory.coeffs, trajectory.coeffs.shape[1] - 1
     fractions = jnp.asarray(np.arange(nodes + 1) / nodes, coeffs.dtype)
-    times = trajectory.durations[:, None] * fractions
+    times = trajectory.durations[:, None] * fractions[None]
 
     def sample(order: int) -> Array:
         factors = derivative_factors(degree, order)

@@ -289,7 +289,7 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
     A sum is used, because the call of a small matrix product costs more than its arithmetic.
     """
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
-    return jnp.sum(gram[..., None] * rows, axis=1)
+    return jnp.sum(gram[..., None] * rows[None], axis=1)
 
 
 def proportional_trajectory(

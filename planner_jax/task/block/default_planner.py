@@ -317,7 +317,7 @@ class OnlineBlock(Planner):
         duration = jnp.maximum(time - case.delay, 1e-3)
         turned = poses.angles[index] - coast(case, duration, self.pieces)
         shapes = jnp.asarray(all_profiles(self.pieces)[0], turned.dtype)
-        steps = shapes[poses.profile[index]][:, None] * turned
+        steps = shapes[poses.profile[index]][:, None] * turned[None]
         return jnp.append(steps.reshape(-1), time)
 
     def decode(self, case: BlockCase, point: Array) -> tuple[Array, Array, Array]:
@@ -360,7 +360,8 @@ class OnlineBlock(Planner):
         pushes = jnp.concatenate([pushes, push[None]])
         of_first, of_steps = (jnp.asarray(each, dtype) for each in step_weights(pieces, shares))
         chosen = jnp.append(worst, self.samples - 1)
-        lift, drift = of_steps[chosen], of_first[chosen][:, None] * case.rates  # (W + 1, K), (., 6)
+        lift = of_steps[chosen]  # (W + 1, K)
+        drift = of_first[chosen][:, None] * case.rates[None]  # (W + 1, 6)
         gradient, curvature = _lift_to_unknowns(lift, drift, grams, pushes, joints)
         size = 6 * pieces
         ends_free = jnp.where(case.ends_at_rest, 0.0, 1.0)
@@ -369,7 +370,7 @@ class OnlineBlock(Planner):
         return Model(
             cost=joints.cost + jnp.sum(rows**2) + jnp.sum(short**2),
             gradient=gradient * free,
-            curvature=curvature * free[:, None] * free,
+            curvature=curvature * free[:, None] * free[None],
             violation=_combine_excess(joints.excess, contact_excess, too_near),
         )
 
@@ -386,7 +387,7 @@ class OnlineBlock(Planner):
         # Between knots, where a joint may exceed its position limit and turn back.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
-        joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle) / half) - 1.0)
+        joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0)
         contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
         excess = _combine_excess(joints, contact, self.margin - jnp.min(gaps))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)

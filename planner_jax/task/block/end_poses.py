@@ -86,9 +86,9 @@ def end_poses(
     duration = jnp.maximum(time - case.delay, 1e-3)
     turned = jnp.abs(angles - coast(case, duration, pieces))
     rates, rises, rests = profile_peaks(pieces)
-    of_rate = jnp.max(turned / case.limits.velocity, axis=1) / duration
-    of_rise = jnp.max(turned / case.limits.acceleration, axis=1) / duration**2
-    of_rates, of_rises = of_rate[:, None] * rates, of_rise[:, None] * rises
+    of_rate = jnp.max(turned / case.limits.velocity[None], axis=1) / duration
+    of_rise = jnp.max(turned / case.limits.acceleration[None], axis=1) / duration**2
+    of_rates, of_rises = of_rate[:, None] * rates[None], of_rise[:, None] * rises[None]
     efforts = jnp.maximum(of_rates, of_rises)
     is_allowed = rests | ~case.ends_at_rest
     paces = efforts
@@ -108,7 +108,8 @@ def end_poses(
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
     """Return the angles (..., 6) [rad] at which joints stop if they brake evenly in piece 1."""
     of_first = step_weights(pieces, (1.0,))[0][0]
-    return case.angles + of_first * duration[..., None] * case.rates
+    angles, rates = (jnp.broadcast_to(x, (*duration.shape, 6)) for x in (case.angles, case.rates))
+    return angles + of_first * duration[..., None] * rates
 
 
 def face_ball(velocity: Array) -> Array:
@@ -152,7 +153,7 @@ def contact_terms(
     # Offset from its middle, within the plane.
     beside = away - off * normal
     beside_slope = jnp.concatenate([-moves, velocity[None]])
-    beside_slope -= jnp.sum(beside_slope * normal, axis=1)[:, None] * normal
+    beside_slope -= jnp.sum(beside_slope * normal[None], axis=1)[:, None] * normal[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
     spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
     beside_share = jnp.maximum(1.0 - spare / distance, 0.0)

@@ -54,7 +54,7 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
     """
     of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
-    return start + jnp.asarray(of_first, steps.dtype)[:, None] * first + turned
+    return start[None] + jnp.asarray(of_first, steps.dtype)[:, None] * first[None] + turned
 
 
 class JointTerms(NamedTuple):
@@ -100,20 +100,20 @@ def joint_terms(
         sign = weights.limits * jnp.sign(share) * (over > 0.0).astype(over.dtype)
         return row(over, by_steps, by_time, sign)
 
-    of_rate = jnp.eye(pieces, dtype=dtype) / (duration * case.limits.velocity[:, None, None])
-    rate_shares = rates / case.limits.velocity
-    of_rise = rise * (pieces / duration**2 / case.limits.acceleration[:, None, None])
-    rise_shares = accelerations / case.limits.acceleration
+    of_rate = jnp.eye(pieces, dtype=dtype)[None] / (duration * case.limits.velocity[:, None, None])
+    rate_shares = rates / case.limits.velocity[None]
+    of_rise = rise[None] * (pieces / duration**2 / case.limits.acceleration[:, None, None])
+    rise_shares = accelerations / case.limits.acceleration[None]
     # The first rise contains `first`, which grows in proportion to the duration.
     of_start = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
-    by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration) / duration
-    angle_shares = (angles - middle) / half
-    of_angle = of_steps / half[:, None, None]
+    by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration[None]) / duration
+    angle_shares = (angles - middle[None]) / half[None]
+    of_angle = of_steps[None] / half[:, None, None]
     effort = weights.effort
     parts = [
         hinge(rate_shares, of_rate, -rate_shares / duration),
         hinge(rise_shares, of_rise, by_time),
-        hinge(angle_shares, of_angle, of_first[:, None] * case.rates / half),
+        hinge(angle_shares, of_angle, of_first[:, None] * case.rates[None] / half[None]),
         row(effort * rise_shares, of_rise, by_time, effort),
     ]
     values = jnp.concatenate([value for value, _ in parts], axis=1)
@@ -130,7 +130,7 @@ def joint_terms(
 def bump_steps(height: Array, pieces: int) -> Array:
     """Return steps (K, 6) of a squared sine that turns joints by `height` (6,) [rad] and back."""
     knots = np.arange(1, pieces + 1) / pieces
-    return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height
+    return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 
 
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
@@ -140,7 +140,7 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)
     rise = (rates[1:] - rates[:-1]) / jnp.maximum(step, 1e-9)
     turned = step * 0.5 * (rates[1:] + rates[:-1])
-    angles = start + jnp.cumsum(turned, axis=0) - turned
+    angles = start[None] + jnp.cumsum(turned, axis=0) - turned
     return PiecewisePolynomial(
         coeffs=jnp.stack([angles, rates[:-1], 0.5 * rise], axis=1),
         durations=jnp.broadcast_to(step, (pieces,)),

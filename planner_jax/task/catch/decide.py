@@ -41,7 +41,7 @@ def closest_approach(cases: CatchCase) -> Array:
 def _closest_approach(case: CatchCase) -> Array:
     net, limits = case.net, case.limits
     times, states, speed = estimate.sample_targets(case)
-    distance = estimate.length(states.pos - case.head_state[0][:, None])
+    distance = estimate.length(states.pos - case.head_state[0][None, :, None])
     # Target and quadrotor move between two of the times.
     step = case.horizon[:, None] / estimate.GRID
     slack = net.height + net.radius + (speed + limits.speed) * step

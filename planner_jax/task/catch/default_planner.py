@@ -213,7 +213,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         vel = share * (ball.pos - before) / durations[:, None]
         up = jnp.array([0.0, 0.0, 1.0], times.dtype)
         lean = _LEAN * case.net.max_angle
-        acc = thrust * nearest_upright(ball.vel, lean) - case.gravity * up
+        acc = thrust * nearest_upright(ball.vel, lean) - case.gravity * up[None]
         still = jnp.zeros((times.size, 3))
         return jnp.concatenate(
             [jnp.log(durations)[:, None], jnp.zeros((times.size, 2)), vel, acc, still], axis=1

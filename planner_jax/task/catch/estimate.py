@@ -42,7 +42,7 @@ def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
     Times are the last axis because CPUs vectorise along it.
     """
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
-    times = case.horizon[:, None] * shares
+    times = case.horizon[:, None] * shares[None]
     along = lambda target, at: over_lanes(functools.partial(state_at, target))(at)  # noqa: E731
     states = jax.vmap(along)(case.targets, times)
     return times, states, length(states.vel)
@@ -59,7 +59,7 @@ def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, 
     """Return positions (N, 3, K) of the quadrotor at catches of N targets, and penalties (N, K)."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
-    places = states.pos - net.height * jnp.asarray([[0.0], [0.0], [1.0]], states.pos.dtype)
+    places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)
     low = jnp.maximum(limits.min_height + 0.1 - places[:, 2], 0.0)
     return places, 10.0 * from_below + 10.0 * low
 

@@ -57,7 +57,7 @@ def _next(
     """Return the earliest estimated meeting with a target after another meeting."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
-    away = positions - last.position
+    away = positions - last.position[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(away**2, axis=1), 1e-12))
     heading = jnp.arctan2(away[:, 1], away[:, 0])
     turn = jnp.abs((heading - last.heading + np.pi) % (2.0 * np.pi) - np.pi)

@@ -88,7 +88,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     v0, v1, c0, c1 = (
         each[:, None] for each in (speed[:-1], speed[1:], curvature[:-1], curvature[1:])
     )
-    ll, lr, rr = turned
+    ll, lr, rr = turned[:, None]
     angle = step * (v0 * (ll * c0 + lr * c1) + v1 * (lr * c0 + rr * c1))  # (K, nodes)
     whole = angle[:, -1]
     heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + angle
@@ -98,29 +98,37 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     cos, sin = sums[:, :, 0]
     by_hat = sums[:, :, 1:3]  # (2, K, 2, S), integrals of the direction
     aside = jnp.stack([-sums[1, :, 3:], sums[0, :, 3:]]).reshape(2, num, 2, 3, samples)
-    p0, p1, p2 = (v0 * aside[:, :, 0, k] + v1 * aside[:, :, 1, k] for k in range(3))  # (2, K, S)
+    p0, p1, p2 = (
+        v0[None] * aside[:, :, 0, k] + v1[None] * aside[:, :, 1, k] for k in range(3)
+    )  # (2, K, S)
     hat0, hat1 = by_hat[:, :, 0], by_hat[:, :, 1]
-    local = step * (v0 * hat0 + v1 * hat1)
-    stretch = (v0 * c0) * p0 + (v0 * c1 + v1 * c0) * p1 + (v1 * c1) * p2
+    local = step * (v0[None] * hat0 + v1[None] * hat1)
+    stretch = (v0 * c0)[None] * p0 + (v0 * c1 + v1 * c0)[None] * p1 + (v1 * c1)[None] * p2
     ends = local[:, :, -1]
     pos = start[:2, None, None] + (jnp.cumsum(ends, axis=1) - ends)[:, :, None] + local
     x, y = pos  # (K, S)
-    at_ll, at_lr, at_rr = turned[:, 2::2]
+    at_ll, at_lr, at_rr = turned[:, None, 2::2]
     square = step * step
     own = jnp.stack(  # x, y and heading of the samples by the five variables, (5, 3, K, S)
         [
             jnp.stack([*moved, turning])
             for moved, turning in (
-                (step * hat0 + square * (c0 * p0 + c1 * p1), step * (at_ll * c0 + at_lr * c1)),
-                (step * hat1 + square * (c0 * p1 + c1 * p2), step * (at_lr * c0 + at_rr * c1)),
-                (square * (v0 * p0 + v1 * p1), step * (at_ll * v0 + at_lr * v1)),
-                (square * (v0 * p1 + v1 * p2), step * (at_lr * v0 + at_rr * v1)),
+                (
+                    step * hat0 + square * (c0[None] * p0 + c1[None] * p1),
+                    step * (at_ll * c0 + at_lr * c1),
+                ),
+                (
+                    step * hat1 + square * (c0[None] * p1 + c1[None] * p2),
+                    step * (at_lr * c0 + at_rr * c1),
+                ),
+                (square * (v0[None] * p0 + v1[None] * p1), step * (at_ll * v0 + at_lr * v1)),
+                (square * (v0[None] * p1 + v1[None] * p2), step * (at_lr * v0 + at_rr * v1)),
                 ((local + square * stretch) / time, angle[:, 2::2] / time),
             )
         ]
     )
     last = own[..., -1]  # (5, 3, K)
-    end_x, end_y = x[:, -1], y[:, -1]
+    end_x, end_y = x[None, :, -1], y[None, :, -1]
     after = jnp.stack(  # as twists, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
@@ -137,7 +145,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
         ]
     )
     a, b, turn = (before[..., k, None] for k in range(3))  # (5, K, 1)
-    moved = own + jnp.stack([a - turn * y, b + turn * x, turn + 0.0 * x], axis=1)
+    moved = own + jnp.stack([a - turn * y[None], b + turn * x[None], turn + 0.0 * x[None]], axis=1)
     share = jnp.asarray((np.arange(num)[:, None] + np.arange(1, samples + 1) / samples) / num)
     share = share.astype(dtype)
     zeros, ones = jnp.zeros_like(x), jnp.ones_like(x)

@@ -148,7 +148,7 @@ class MotionProblem:
         curvature = rate / jnp.maximum(speed, 0.3 * case.limits.speed)
         limit = case.limits.curvature
         point = self.pack(speed, jnp.clip(curvature, -limit, limit), time)
-        cells = grid.corner + grid.cell * path.cell.astype(grid.cell.dtype)
+        cells = grid.corner[None] + grid.cell * path.cell.astype(grid.cell.dtype)
         return Guess(point=point, positions=interpolate(cells, case.start[:2], at - 0.5))
 
     def build_model(

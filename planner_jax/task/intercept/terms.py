@@ -162,7 +162,9 @@ def meeting_terms(
     rows = jnp.concatenate(columns, axis=1)
     none = jnp.zeros_like(sign)
     turn = jnp.stack([none, none, sign, none, over])
-    squares = weights.miss * jnp.matmul(rows.T, rows, precision=_HIGHEST) + turn[:, None] * turn
+    squares = (
+        weights.miss * jnp.matmul(rows.T, rows, precision=_HIGHEST) + turn[:, None] * turn[None]
+    )
     missed = jnp.sqrt(jnp.sum(miss**2) + 1e-12) / case.tolerance - 1.0
     return squares, jnp.maximum(missed, turned)
 
@@ -204,9 +206,9 @@ def obstacle_terms(
         """Return distances of one disc from walls and movers, and their gradients, (1 + N, M)."""
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
-        moved = movers.centre[..., None] + velocity * times  # (N, 2, M)
+        moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
         far, (away_x, away_y) = distances(
-            movers.corners, movers.present, at_x - moved[:, 0], at_y - moved[:, 1]
+            movers.corners, movers.present, at_x[None] - moved[:, 0], at_y[None] - moved[:, 1]
         )
         return (
             jnp.concatenate([still, far]),
@@ -219,9 +221,9 @@ def obstacle_terms(
     inside = jnp.maximum(radius + weights.margin - far, 0.0)
     is_inside = inside > 0.0
     speed_x, speed_y = (
-        jnp.concatenate([jnp.zeros((1, 1), x.dtype), velocity[:, k]]) for k in range(2)
+        jnp.concatenate([jnp.zeros((1, 1), x.dtype), velocity[:, k]])[None] for k in range(2)
     )
-    turn = ahead[:, None, None] * (away_y * cos - away_x * sin)
+    turn = ahead[:, None, None] * (away_y * cos[None, None] - away_x * sin[None, None])
     passing = -(away_x * speed_x + away_y * speed_y)
     slopes = [jnp.where(is_inside, -each, 0.0) for each in (away_x, away_y, turn, passing)]
     rows = [*slopes, inside]
@@ -266,10 +268,10 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
     pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
     times = drive.time.reshape(-1)
     middle = pos + case.body.middle * drive.direction.reshape(-1, 2)
-    free = jnp.min(jnp.minimum(middle - case.lower, case.upper - middle), axis=1)
+    free = jnp.min(jnp.minimum(middle - case.lower[None], case.upper[None] - middle), axis=1)
     both = join_obstacles(case.walls, case.movers)
-    moved = both.centre[:, None] + both.velocity[:, None] * times[:, None]
-    x, y = (pos[:, axis] - moved[..., axis] for axis in range(2))
+    moved = both.centre[:, None] + both.velocity[:, None] * times[None, :, None]
+    x, y = (pos[None, :, axis] - moved[..., axis] for axis in range(2))
     apart = separation(both.corners, both.present, x, y, heading, ends_of(case.body))
     return jnp.minimum(free, jnp.min(apart, axis=0))
 
@@ -278,10 +280,10 @@ def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
     """Return whether the start is blocked, and whether the meeting is, () bool each."""
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
-    x, y = (-(both.centre - case.start[:2])[:, axis, None] for axis in range(2))
+    x, y = (-(both.centre - case.start[None, :2])[:, axis, None] for axis in range(2))
     heading, body = case.start[2:], ends_of(case.body)
     at_start = separation(both.corners, both.present, x, y, heading, body)
-    apart = goal - (both.centre + both.velocity * case.time)
+    apart = goal[None] - (both.centre + both.velocity * case.time)
     at_goal, _ = distances(both.corners, both.present, apart[:, :1], apart[:, 1:])
     on_map = jnp.all((goal > case.lower) & (goal < case.upper))
     return jnp.min(at_start) < 0.0, (jnp.min(at_goal) < 0.5 * case.body.width) | ~on_map
