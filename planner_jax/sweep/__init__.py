@@ -1,1 +1,1 @@
-"""Sweeps: seeded cases, planned and refereed in chunks, into one run folder."""
+"""Sweeps: draw many seeded cases of a task, plan and judge them, and store all in one folder."""

@@ -1,4 +1,4 @@
-"""The chunks of a sweep: drawn or read, planned, refereed and written as parts of the rows."""
+"""Draw, plan and judge the cases of a sweep in chunks; each chunk becomes one file of rows."""
 
 import contextlib
 import functools
@@ -29,7 +29,7 @@ from planner_jax.runs.summary import percent
 from planner_jax.runs.timing import CompileClock, Stopwatch, measure, measure_warm
 from planner_jax.sweep.sweep import Sweep
 
-_PENDING = 2  # chunks that are judged or written while the next one is planned
+_PENDING = 2  # Greatest number of chunks that are judged or written while the next one is planned.
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
@@ -44,37 +44,38 @@ _MEASURED = {
 
 
 class Record(TypedDict):
-    """Provenance of the rows of a part, stored in the part's metadata."""
+    """Description of one file of rows (a part), stored in the metadata of the Parquet file."""
 
-    run: str  # digest of the `Maker`
-    number: int
+    run: str  # digest `Maker.run` of everything that affects the rows
+    number: int  # number of the chunk whose cases are in the file
     num: int  # number of rows
-    successes: int
-    warm: bool  # whether nothing was compiled
-    plan_seconds: float
-    compile_seconds: float
-    referee_seconds: float
+    successes: int  # number of plans that the referee accepted
+    warm: bool  # True if JAX compiled nothing while the chunk was planned
+    plan_seconds: float  # time of planning, including compilation
+    compile_seconds: float  # time in which JAX traced or compiled
+    referee_seconds: float  # time of judging
 
 
-Made = tuple[bytes, Record]  # content and record of a part
-# Starts to make parts of some numbers, and yields in order functions that wait for each part.
+Made = tuple[bytes, Record]  # the bytes of a Parquet file of rows, and its record
+# A function that starts to plan the chunks with some numbers on workers. For each chunk, in order,
+# it yields a function that waits for the chunk's file of rows and returns it.
 Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None, None]]
 
 
 @dataclass(frozen=True)
 class Maker:
-    """Source, planner and referee that make the rows of chunks."""
+    """Everything that turns a chunk of cases into rows: source, planner and referee."""
 
     sweep: Sweep
-    source: Source
+    source: Source  # draws or reads the cases
     planner: Planner
     makers: Entries  # versions, code and devices that affect the rows
-    description: Entries  # description of the source
-    run: str  # SHA-256 of all that affects the rows, with settings and the files they name
+    description: Entries  # manifest entries that identify the cases of the source
+    run: str  # SHA-256 of everything that affects the rows, such as settings and files they name
 
     @classmethod
     def of(cls, sweep: Sweep, settings: SweepSettings, batch: int) -> "Maker":
-        """Open the source and the planner of a sweep."""
+        """Open the source of cases and load the planner that the settings of a sweep name."""
         source = sweep.open_source(settings, batch)
         makers, description = makers_of(environment()), source.description()
         parameters = source.settings.parameters()
@@ -83,7 +84,7 @@ class Maker:
         return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
-        """Plan a chunk; the growth of `clock` since its last lap is the compilation."""
+        """Plan a chunk; return plans and record, whose compile time `clock` has measured."""
         plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,
@@ -97,13 +98,13 @@ class Maker:
         }
 
     def make(self, number: int) -> Made:
-        """Draw and plan a chunk, judge its plans, and encode its rows."""
+        """Draw chunk `number`, plan and judge it, and encode its rows as a Parquet file."""
         chunk = self.source.chunk(number)
         with CompileClock() as clock:
             return self.judge(chunk, *self.plan(chunk, clock))
 
     def judge(self, chunk: Chunk, plans: PyTree, record: Record) -> Made:
-        """Judge plans, and encode the rows of their chunk."""
+        """Judge the plans of a chunk; return the bytes of its Parquet file and its record."""
         watch = Stopwatch()
         verdict = self.sweep.judge(chunk.cases, plans, self.source.settings)
         record = {
@@ -116,7 +117,7 @@ class Maker:
 
 
 def _files_of(parameters: Entries) -> dict[str, int]:
-    """Return CRC-32 checksums of files that settings name, as in "library:FILE"."""
+    """Return CRC-32 checksums of the files in settings of the form "NAME:FILE", by setting."""
     found = {}
     for name, value in parameters.items():
         path = value.partition(":")[2] if isinstance(value, str) else ""
@@ -130,15 +131,15 @@ def _files_of(parameters: Entries) -> dict[str, int]:
 def make_parts(
     maker: Maker, rows: Dataset, there: dict[int, Record], workers: Workers | None, progress: bool
 ) -> dict[int, Record]:
-    """Make every chunk without a part, and return the records of all parts by number.
+    """Plan every chunk whose file of rows is missing; return the records of all files by number.
 
     While one chunk is planned, the next one is drawn and the previous ones are judged and written.
 
     Args:
-        maker: makes the rows.
-        rows: dataset for the parts.
-        there: records of parts that exist.
-        workers: start to make parts elsewhere; None makes them in this process.
+        maker: turns a chunk of cases into rows.
+        rows: dataset to which the files of rows are written.
+        there: records of the files that exist, by number.
+        workers: function that plans chunks on other processes; None plans them in this process.
         progress: whether a progress bar is shown.
     """
     source, records = maker.source, dict(there)
@@ -177,7 +178,7 @@ def make_parts(
 def _make_here(
     maker: Maker, numbers: Iterable[int], pool: ThreadPoolExecutor
 ) -> Generator[Callable[[], Made], None, None]:
-    """Plan chunks in this process, and yield functions that judge them."""
+    """Plan chunks in this process; yield for each a function that judges and encodes its plans."""
     with CompileClock() as clock:
         draws = (pool.submit(as_here(maker.source.chunk), number) for number in numbers)
         following = next(draws, None)
@@ -187,7 +188,7 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return the times of the manifest except `wall_seconds` from the records of all parts."""
+    """Return the manifest's times except `wall_seconds`; plan chunk 0 again if too few are warm."""
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -1,7 +1,8 @@
-"""The chunks of a sweep as tasks of a Ray cluster.
+"""Workers of a Ray cluster that plan the chunks of a sweep, for the option `--workers ray`.
 
-Every chunk is one task, which returns the content of its part. A worker rejects a chunk if its rows
-could differ from the rows of the run. If a worker dies, Ray repeats its task on another worker.
+A chunk is a block of consecutive cases. One Ray task plans and judges a chunk, and returns the
+bytes of the Parquet file with its rows. A worker whose code or devices differ from the run's raises
+`WorkersFailed`. If a worker dies, Ray repeats its task on another worker.
 """
 
 import contextlib
@@ -30,18 +31,23 @@ from planner_jax.runs.settings import WorkersFailed
 from planner_jax.sweep.chunks import Made, Maker, Workers
 from planner_jax.sweep.sweep import sweep_of
 
-_ADDRESS, _GPUS = "RAY_ADDRESS", "CUDA_VISIBLE_DEVICES"  # environment variables
-_RETRIES = 3  # attempts to repeat a chunk whose worker died
-_AHEAD = 2  # chunks for each worker that are being made or wait to be written
-WORKERS_OF_GPU = 8  # greatest number; with one worker the GPU is idle while the worker judges
-_MEMORY = 0.6  # share of a GPU for all its workers; each needs more memory to start
+_ADDRESS, _GPUS = "RAY_ADDRESS", "CUDA_VISIBLE_DEVICES"  # names of environment variables
+_RETRIES = 3  # Number of times that Ray repeats a chunk whose worker died.
+_AHEAD = 2  # Number of chunks per worker that are being made or wait to be written.
+# Greatest number of workers that share one GPU. Several workers keep the GPU busy, because a worker
+# judges its plans on the CPU while another worker plans on the GPU.
+WORKERS_OF_GPU = 8
+# Fraction of a GPU's memory that all its workers may allocate for arrays. The remainder is left for
+# what every process needs to start.
+_MEMORY = 0.6
 
 
 @contextlib.contextmanager
 def workers_of(kind: str | None) -> Iterator[Workers | None]:
-    """Provide the workers of a cluster within the block; None if `kind` is None.
+    """Provide the workers of a Ray cluster within a `with` block; None if `kind` is None.
 
-    Joins the cluster of RAY_ADDRESS, or starts one on this machine.
+    The process joins the cluster at the address in the environment variable RAY_ADDRESS. If the
+    variable is not set, a cluster is started on this machine, and stopped at the end of the block.
     """
     if kind is None:
         yield None
@@ -55,7 +61,7 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     with tempfile.TemporaryDirectory("", "ray-", "/tmp", ignore_cleanup_errors=True) as folder:
         _start(ray, folder)
         try:
-            # JAX starts in this process with one GPU, as in each worker.
+            # Let JAX use one GPU in this process, because each worker uses one GPU too.
             os.environ[_GPUS] = os.environ.get(_GPUS, "0").partition(",")[0]
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
@@ -67,12 +73,13 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
 
 
 def _start(ray: ModuleType, folder: str) -> None:
-    """Join a cluster, or start one on localhost whose logs and sockets are in a folder."""
+    """Join the cluster at RAY_ADDRESS, or start one on localhost with its files in `folder`."""
     address, handler = os.environ.get(_ADDRESS), signal.getsignal(signal.SIGTERM)
     try:
         if address:
             host, _, port = address.removeprefix("ray://").rpartition(":")
-            if host and port.isdecimal():  # Ray itself would retry for minutes
+            # Test the address first, because Ray itself retries a wrong address for minutes.
+            if host and port.isdecimal():
                 socket.create_connection((host.strip("[]"), int(port)), timeout=10.0).close()
             how = {"address": address}
         else:
@@ -86,14 +93,15 @@ def _start(ray: ModuleType, folder: str) -> None:
         rule = "the address of a Ray cluster that answers, or left out where Ray starts"
         raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
     finally:
-        with contextlib.suppress(ValueError):  # Ray replaces it in the main thread
+        # Ray replaces the handler of SIGTERM in the main thread, so that it is set again.
+        with contextlib.suppress(ValueError):
             signal.signal(signal.SIGTERM, handler)
 
 
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Start to make parts of these numbers, and yield in order functions that fetch them."""
+    """Submit chunks to Ray, a few per worker at a time; yield functions that wait for each part."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}
@@ -103,7 +111,8 @@ def _make_parts(
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
         memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
         environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
-        how = {"num_gpus": 1.0 / shared, "max_calls": 0}  # keeps a worker on its first GPU
+        # With `max_calls` 0 a worker process is used for many chunks, always on the same GPU.
+        how = {"num_gpus": 1.0 / shared, "max_calls": 0}
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
     run = (maker.sweep.task, maker.source.settings, maker.makers, maker.run)
@@ -122,7 +131,7 @@ def _make_parts(
 
 
 def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
-    """Return the part that a worker has made, or raise its exception."""
+    """Return the finished part of a chunk from its worker, or raise the worker's exception."""
     try:
         return ray.get(promise)
     except ray.exceptions.RayTaskError as error:
@@ -134,15 +143,16 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
 
 
 def _make(job: bytes, number: int) -> Made:
-    """Make a part in a worker."""
+    """Plan and judge chunk `number` in a worker process, and return its part."""
     return _maker_of(job).make(number)
 
 
 @functools.lru_cache(maxsize=1)
 def _maker_of(job: bytes) -> Maker:
-    """Return the maker of a run; a worker keeps it with its compiled programs."""
+    """Return the `Maker` of a pickled run; raise `WorkersFailed` if this worker's code differs."""
     environ, config, (task, settings, makers, run) = pickle.loads(job)
-    os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)  # JAX rejects both names together
+    # JAX raises an error if this variable and XLA_CLIENT_MEM_FRACTION are both set.
+    os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)
     os.environ.update(environ)
     for name, value in config.items():
         jax.config.update(name, value)

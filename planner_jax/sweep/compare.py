@@ -1,4 +1,4 @@
-"""Comparison of several runs: rates, costs, speeds, and the cases that only some runs solve."""
+"""Comparison of finished sweeps: success rates, costs, speeds, and cases that only some solve."""
 
 import csv
 import dataclasses
@@ -19,17 +19,17 @@ from planner_jax.runs.table import align
 from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 
-# Columns that are read; all sweeps have them.
+# Columns of the row files that a comparison reads. The rows of every task have these columns.
 _READ = ("index", "success", "failed_limit", "cost", "iterations")
 
 
 @dataclasses.dataclass(frozen=True)
 class ComparedRun:
-    """A finished sweep with the compared columns of its B cases."""
+    """A finished sweep, with the columns of its B cases that are compared with other sweeps."""
 
-    name: str  # path, as the user wrote it
+    name: str  # path of the run's folder, as the user wrote it
     manifest: Entries
-    deciding: tuple[str, ...]  # names of the settings that determine the cases
+    deciding: tuple[str, ...]  # names of the settings that determine which cases are planned
     index: np.ndarray  # (B,) int
     success: np.ndarray  # (B,) bool
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
@@ -38,35 +38,35 @@ class ComparedRun:
 
     @property
     def settings(self) -> Entries:
-        """Settings of the run."""
+        """Settings of the run by name, as its manifest stores them."""
         return self.manifest["parameters"]
 
     @property
     def rate(self) -> float:
-        """Share of successes."""
+        """Success rate: number of successful cases divided by the number of cases."""
         return float(self.success.mean())
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Wilson's 95 % interval of the rate."""
+        """Lower and upper end of Wilson's 95 % confidence interval of the success rate."""
         return wilson_interval(int(self.success.sum()), len(self.success))
 
 
 class Difference(NamedTuple):
-    """Difference between a run's success and the success of the first run."""
+    """Difference between the success of one run and the success of the first listed run."""
 
-    difference: float  # difference of the rates, -1 to 1
-    difference_low: float  # ends of its 95 % interval
-    difference_high: float
-    # Numbers of cases that one run alone solves, and McNemar's exact p-value. None if the two runs
-    # have different cases.
+    difference: float  # success rate of this run minus the rate of the first run, -1 to 1
+    difference_low: float  # lower end of the 95 % confidence interval of the difference
+    difference_high: float  # upper end of this interval
+    # Number of cases that only the first run solves, number of cases that only this run solves, and
+    # the p-value of McNemar's exact test. All three are None if the two runs have different cases.
     first_only: int | None = None
     this_only: int | None = None
     mcnemar_p: float | None = None
 
 
 def read_run(path: str | os.PathLike) -> ComparedRun:
-    """Read a run; raise `ArgumentError` unless it is a complete, finished sweep."""
+    """Read a run from its folder; raise `ArgumentError` unless it is a complete, finished sweep."""
     folder = RunFolder(path, name="RUN")
     manifest, sweep = read_finished(folder)
     with folder.reading_rows():
@@ -92,7 +92,7 @@ def require_comparable(runs: Sequence[ComparedRun]) -> None:
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
-    """Return the settings by which the cases of two runs differ, as "name VALUE and VALUE"."""
+    """Return "SETTING VALUE and VALUE" for each setting that makes the cases of two runs differ."""
     return _unlike(first, other, first.deciding)
 
 
@@ -108,12 +108,13 @@ def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> lis
 
 
 def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
-    """Return the difference between the success rates of a run and of the first run.
+    """Return the success rate of a run minus the rate of the first run, with a 95 % interval.
 
-    For runs of the same cases, only the cases that exactly one run solves are used. If neither run
-    is better, each such case is equally likely to be solved by either run (McNemar's exact test).
-    The interval is the Clopper-Pearson interval of the share of this run. For runs of different
-    cases, the interval is Newcombe's, from the Wilson intervals of both rates.
+    If both runs planned the same cases, the test is McNemar's exact test. It uses the n cases that
+    exactly one of the two runs solves; under the null hypothesis either run is equally likely to
+    solve such a case. The interval follows from the Clopper-Pearson interval of k / n, where the
+    other run solves k of the n cases. For runs of different cases the interval is Newcombe's, from
+    the Wilson intervals of both rates.
     """
     change = other.rate - first.rate
     if other_cases(first, other):
@@ -124,7 +125,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    if not apart:  # upper bound after no event in `num` trials
+    # Both runs solve the same cases: the interval is the upper bound for 0 events in `num` trials.
+    if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
     test = binomtest(theirs, apart)
@@ -134,7 +136,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
 
 
 def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
-    """Return a row of numbers for every run; the first run has no differences."""
+    """Return the rates, costs and times of each run by name; the first run has no `Difference`."""
     rows = []
     for index, run in enumerate(runs):
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]
@@ -162,13 +164,13 @@ def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
 
 
 def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float | None:
-    """Return a measure of the finite values, or None without any."""
+    """Return a measure, such as the mean, of the finite values; None if no value is finite."""
     finite = values[np.isfinite(values)]
     return float(measure(finite)) if finite.size else None
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """Return index and failed limits of the cases that some runs solve and others do not."""
+    """Return index, and each run's first failed limit, of the cases that only some runs solve."""
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index
@@ -176,7 +178,7 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
 
 
 def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
-    """Return the comparison as lines of text, with at most `most` differing cases."""
+    """Return the comparison as lines of text, with at most `most` cases that only some solve."""
     first, *others = runs
     own, rows = first.settings, table_of(runs)
     lines = [f"{first.manifest['kind']}, suite {own['suite']}, seed {own['seed']}", ""]
@@ -201,7 +203,7 @@ def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
 
 
 def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> Iterator[str]:
-    """Yield the differences between a run and the first one."""
+    """Yield sentences on how run number `k` differs from the first run in success and settings."""
     low, high = 100.0 * row["difference_low"], 100.0 * row["difference_high"]
     change = f"[{k}] less [1]: {100.0 * row['difference']:+.2f} points of success"
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
@@ -213,14 +215,14 @@ def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> It
         f"{change}, {interval}; of the same cases [1] alone solves {row['first_only']:,} and [{k}] "
         f"alone {row['this_only']:,}, p = {row['mcnemar_p']:.3g} (McNemar, exact)."
     )
-    # The batch affects only the last digits of plans.
+    # The batch size is not reported as a difference, as it changes only the last digits of plans.
     names = [name for name in first.settings if name not in ("batch", *first.deciding)]
     if settings := _unlike(first, run, names):
         yield f"    settings that differ: {'; '.join(settings)}"
 
 
 def _cells(rows: Sequence[Entries]) -> list[list[str]]:
-    """Return the table of all runs as text: a line for each measure, a column for each run."""
+    """Return the table of all runs as text cells: a line for each figure, a column for each run."""
     spread = [
         f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
     ]
@@ -247,9 +249,10 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
 
 
 def as_csv(runs: Sequence[ComparedRun]) -> str:
-    """Return the comparison as CSV text: a column for each run, a row for each measure or case.
+    """Return the comparison as CSV text with one column for each run.
 
-    The rows of cases hold the limit that fails in each run, for all differing cases.
+    The first rows hold the figures of `table_of`. Then one row follows for each case that only some
+    runs solve, with the first limit that fails in each run, or "success".
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

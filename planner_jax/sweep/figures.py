@@ -1,4 +1,4 @@
-"""Figures of several tasks; every figure is drawn from the folder of a run alone."""
+"""Figures that the reports of several tasks share, drawn from the files in a run's folder."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from planner_jax.sweep.quadrotor import (
 
 DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder": 1}
 FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
-_SAMPLES = 800  # number of samples of a plan
+_SAMPLES = 800  # number of times at which a plan is sampled for its curves
 CAPTION = (
     "One plan along its time against the limits, beside the other planners' plans for the same "
     "case. Thin: the recovery trajectory behind the last contact, if there is one."
@@ -31,21 +31,22 @@ _OF_REST: Look = {"linewidth": 0.9}
 
 
 class Drawn(NamedTuple):
-    """A plan of the figure."""
+    """One planner's plan in a figure that compares planners: its curves and their style."""
 
     row: Row
-    motion: SampledMotion  # up to the last contact
-    rest: SampledMotion | None  # recovery trajectory
-    look: Look  # style of its lines
+    motion: SampledMotion  # trajectory up to the last contact
+    rest: SampledMotion | None  # recovery trajectory after the last contact, if there is one
+    look: Look  # keyword arguments of Matplotlib for the lines of this plan
 
     def draw(self, axes: Axes, values: Callable[[SampledMotion], np.ndarray]) -> None:
-        """Draw values (N,) of the plan over time."""
+        """Draw a quantity of the plan over time; `values` computes it (N,) from a trajectory."""
         axes.plot(self.motion.time, values(self.motion), **self.look)
         if self.rest is not None:
             axes.plot(self.rest.time, values(self.rest), **{**self.look, **_OF_REST})
 
 
-# Panels: label of the axis, title, and a function of motion and gravity with values (N,).
+# Panels by name. Each has the label of its y axis, its title, and a function that computes the
+# plotted values (N,) from a sampled trajectory and the gravity [m/s^2].
 PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]] = {
     "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
     "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),
@@ -66,14 +67,14 @@ def quadrotor_figure(
     first: Callable[[Axes, Entries, list[Drawn]], None],
     word: Callable[[Row], str],
 ) -> None:
-    """Draw plans of several planners for one case over time, with the limits.
+    """Draw several planners' plans for the same case over time, together with the limits.
 
     Args:
         figure: empty figure.
-        run: run with the plans.
-        panels: names in `PANELS` of the panels behind the first.
-        first: draws the first panel.
-        word: returns a text on a plan that succeeds.
+        run: run whose example case is drawn.
+        panels: four names in `PANELS`, for the second to the fifth panel.
+        first: function that draws the first panel, which differs between tasks.
+        word: function that describes the plan of a successful row in a few words.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
@@ -124,7 +125,7 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
-    """Draw hover thrust and limits; a bound that follows from another limit is grey."""
+    """Draw hover thrust and thrust limits; without limits, a grey bound from the acceleration."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:
@@ -133,7 +134,8 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
     most = setting.get("acceleration")
-    if most is None:  # the rotors are the only limit
+    # Without this limit only the thrust of single rotors is limited, which has no panel.
+    if most is None:
         return
     bound = gravity + most
     axes.set_ylim(0.0, min(max(axes.get_ylim()[1], 1.1 * bound), 3.0 * most))
@@ -148,7 +150,7 @@ def write_verdicts(
     plans: Sequence[tuple[str, Row]],
     word: Callable[[Row], str],
 ) -> None:
-    """Write the legend: each planner with its verdict."""
+    """Write the name of each planner in its colour, with the referee's verdict on its plan."""
     axes.axis("off")
     look: Look = {"va": "top", "transform": axes.transAxes}
     row, suite = plans[0][1], run.manifest["parameters"].get("suite")
@@ -170,7 +172,7 @@ def write_verdicts(
 
 
 def outcomes_figure(figure: Figure, run: RunRows) -> None:
-    """Draw a histogram of iterations; success and failures are text of the page."""
+    """Draw a histogram of the optimiser's iterations over all plans of a run."""
     axes, rows = figure.subplots(), run.folder.plans.read(["iterations"])
     iterations = np.asarray(rows["iterations"])
     style.label(axes, "iterations of the attempt that gave the plan", "plans", "Effort")

@@ -1,4 +1,4 @@
-"""Parts that the runs of all quadrotor tasks share: columns, and trajectories of rows."""
+"""Columns and sampled trajectories that the sweeps of hits and catches by quadrotors share."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ _RESTS = {
 
 
 def recovery_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the recovery trajectory, if the run has one."""
+    """Return a sentence on the trajectory to standstill after the last contact; [] without one."""
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
@@ -61,7 +61,7 @@ def recovery_remark(parameters: Row) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class SampledMotion:
-    """A trajectory sampled at N times."""
+    """Position and its first three derivatives along a quadrotor's trajectory, at N times."""
 
     time: np.ndarray  # (N,) [s]
     pos: np.ndarray  # (N, 3) [m]
@@ -73,12 +73,13 @@ class SampledMotion:
 def sample_motion(
     coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
 ) -> SampledMotion:
-    """Sample a trajectory at evenly spaced times in float64.
+    """Sample a piecewise polynomial of M pieces at evenly spaced times, in float64.
 
     Args:
-        coeffs: flat: M pieces x ascending powers of the piece's own time x 3 axes.
-        durations: (M,) [s].
-        num: number of samples.
+        coeffs: flattened coefficients (M, powers, 3): for each piece the ascending powers of the
+            time since the start of the piece, each for the axes x, y and z.
+        durations: (M,) [s], durations of the pieces.
+        num: number of samples from the start of the first piece to the end of the last.
     """
     lengths = np.asarray(durations, float)
     pieces = np.asarray(coeffs, float).reshape(len(lengths), -1, 3)
@@ -89,7 +90,7 @@ def sample_motion(
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
-    """Sample the recovery trajectory of a row, at times of the plan; None without one."""
+    """Sample a row's recovery trajectory, flown after its last contact; None if it has none."""
     if row["recovery_durations"] is None:
         return None
     rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)
@@ -97,16 +98,17 @@ def sample_rest(row: Row, num: int) -> SampledMotion | None:
 
 
 def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the thrust per unit mass  a + g e_3, (N, 3) [m/s^2]."""
+    """Return the thrust per unit mass  a + g e_3  in the world frame, (N, 3) [m/s^2]."""
     return motion.acc + gravity * np.array([0.0, 0.0, 1.0])
 
 
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the magnitude (N,) [rad/s] of the body rate at zero heading.
+    """Return the magnitude (N,) [rad/s] of the body's angular velocity at zero heading.
 
-    With  c = thrust x jerk,  the rate about axes across the body z axis is  |c| / |thrust|^2,  and
-    the rate about the body z axis is  -c_z / (|thrust| (|thrust| + thrust_z))  by the Hopf
-    fibration. NaN without thrust and upside down.
+    With the thrust vector f and  c = f x jerk,  the angular velocity normal to the body z axis has
+    the magnitude  |c| / |f|^2.  The component about the body z axis is  -c_z / (|f| (|f| + f_z)),
+    because zero heading is defined by the Hopf fibration. The result is NaN where f is zero or
+    points straight down.
     """
     thrust = net_thrust(motion, gravity)
     size = np.linalg.norm(thrust, axis=1)

@@ -1,7 +1,7 @@
-"""Settings of the sweeps of quadrotors; the manifest holds all parameters of their robot.
+"""Settings that the sweeps of hits and catches share, because both robots are quadrotors.
 
-Nothing here imports JAX. Robots are imported when one is named, so that the help of a command needs
-no NumPy.
+Nothing here imports JAX. The modules of robots are imported only when a setting names a robot, so
+that the help of a command is printed without importing NumPy.
 """
 
 import dataclasses
@@ -18,16 +18,16 @@ if TYPE_CHECKING:
 
 
 def robot_option(usual: str) -> Any:
-    """Return the field `robot` of settings, a `QuadrotorModel` or None."""
+    """Return the dataclass field of the setting `robot`; `usual` names the default in its help."""
     words = f"as `planner-jax robots` lists them, or a file .yaml, .yml, .xml (default: {usual})"
     return option(None, "NAME", words)
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the `QuadrotorModel` that a setting names; None without one.
+    """Return the `QuadrotorModel` for a setting: a name, a file, a mapping, a model, or None.
 
     Raises:
-        ArgumentError: there is no such robot, its file is not sound, or it has another tool.
+        ArgumentError: no robot has this name, its file has errors, or its tool is not `tool`.
     """
     if given is None:
         return None
@@ -49,7 +49,7 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
 
 
 def robot_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the robot of a run, if one was named."""
+    """Return a sentence on the robot that a run's settings name; [] if they name none."""
     robot = parameters.get("robot")
     if robot is None:
         return []
@@ -59,7 +59,7 @@ def robot_remark(parameters: Row) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorSettings(SweepSettings):
-    """Settings that the sweeps of all quadrotor tasks have."""
+    """Settings that the sweeps of all tasks with a quadrotor have."""
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
@@ -67,7 +67,7 @@ class QuadrotorSettings(SweepSettings):
     recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
-    WITHOUT_EFFORT: ClassVar[str]  # the planner that minimises nothing
+    WITHOUT_EFFORT: ClassVar[str]  # planner without a minimisation, which rejects `effort`
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,6 +80,6 @@ class QuadrotorSettings(SweepSettings):
         require_one_of(CHOICES, "recovery", self.recovery)
 
     def planner_options(self) -> Entries:
-        """Return the options of the planner that these settings decide."""
+        """Return the keyword arguments for the task's `planner` that follow from the settings."""
         more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
         return super().planner_options() | more | recovery_options(self.recovery)

@@ -1,4 +1,4 @@
-"""Table, figures and page of a run, made from its folder alone."""
+"""Report of a finished sweep: table, figures and HTML page, made from the files of its folder."""
 
 import html
 import math
@@ -19,7 +19,7 @@ from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of_run
 
 
 def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
-    """Return the counts over all rows of a run."""
+    """Count successes, statuses and failed limits over all rows of a run, one file at a time."""
     tally = sweep.tally(settings)
     for part in rows.parts(tally.READS or None):
         tally.add(part)
@@ -27,7 +27,7 @@ def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
 
 
 def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
-    """Return manifest and sweep of a folder; raise `ArgumentError` if parts are missing."""
+    """Return a run's manifest and sweep; raise `ArgumentError` if it is unfinished or damaged."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     if "summary" not in manifest:
@@ -41,7 +41,7 @@ def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `ArgumentError` unless the rows of a sweep are complete and fit its summary."""
+    """Raise `ArgumentError` unless all rows exist and their counts equal the manifest's summary."""
     manifest, sweep = read_finished(folder)
     parameters = manifest["parameters"]
     settings = settings_of_manifest(settings_of(sweep.task), parameters, folder.name)
@@ -62,7 +62,7 @@ def require_counted(folder: RunFolder, summary: Mapping[str, object], counted: E
 
 
 def _agree(one: object, other: object) -> bool:
-    """Return whether two plain values are equal up to rounding."""
+    """Return whether two JSON values are equal, floats within a relative difference of 1e-4."""
     if isinstance(one, dict) and isinstance(other, dict):
         return one.keys() == other.keys() and all(_agree(one[key], other[key]) for key in one)
     if isinstance(one, list | tuple) and isinstance(other, list | tuple):
@@ -73,7 +73,7 @@ def _agree(one: object, other: object) -> bool:
 
 
 def write_report(folder: RunFolder) -> None:
-    """Write `table.md`, `figures/` and `index.html` of a finished run."""
+    """Write `table.md`, `figures/` and `index.html` into the folder of a finished run."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     folder.figures.mkdir(exist_ok=True)
@@ -88,7 +88,7 @@ def write_report(folder: RunFolder) -> None:
 
 
 def _pick_failures(plans: Dataset) -> list[Row]:
-    """Return the first few failures."""
+    """Return the first `FAILURES_SHOWN` rows whose plans the referee rejected."""
     failed, first = [], 0
     for rows in plans.parts(["success"]):
         failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()
@@ -116,7 +116,7 @@ tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; 
 
 
 def _page(sweep: Sweep, manifest: Entries, lines: Sequence[str], failures: Sequence[Row]) -> str:
-    """Return `index.html`: all contents of a run's folder on one plain page."""
+    """Return the HTML of `index.html`: headline, figures, table, remarks and list of failures."""
     title, rates = html.escape(sweep.title(manifest)), sweep.table(manifest)
     lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
     notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in sweep.remarks(manifest))

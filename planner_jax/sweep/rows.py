@@ -1,4 +1,4 @@
-"""Cases and plans of finished sweeps, read from their rows bit for bit."""
+"""Cases and plans of finished sweeps, restored from the rows of a run for the command line."""
 
 from typing import NamedTuple
 
@@ -21,18 +21,18 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 class PlannedRow(NamedTuple):
-    """The plan of a row, bit for bit, and the referee's objection."""
+    """The plan that a row of a run stores, and the referee's reason for rejecting it."""
 
-    plan: Plan  # of the robot's class, such as `QuadrotorPlan`
-    sentence: str  # "" if the referee accepts the plan
+    plan: Plan  # an object of the robot's plan class, such as `QuadrotorPlan`
+    sentence: str  # the referee's reason as a sentence; "" if the referee accepts the plan
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a row of a run, read or drawn again.
+    """Return the case of a row: drawn again from the run's seed, or read again from its files.
 
     Raises:
-        ArgumentError: the folder does not hold a complete, finished sweep, or the case differs from
-            the case that was planned.
+        ArgumentError: the folder does not hold a complete, finished sweep, or physics or limits of
+            the case differ from those in the manifest.
     """
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
@@ -44,7 +44,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
 
 
 def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Return the plan of a row of a run, and the referee's objection.
+    """Return the plan that a row of a run stores, and the referee's reason for rejecting it.
 
     Raises:
         ArgumentError: the folder does not hold a complete, finished sweep, or has no such row.
@@ -63,7 +63,7 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
 
 
 def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
-    """Return the plan of a row of a quadrotor, with the gravity of the run's setting."""
+    """Restore a quadrotor's plan from a row of a run; gravity comes from the run's `setting`."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
@@ -74,20 +74,20 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
 
 
 def arm_plan(row: Row, _: Entries) -> ArmPlan:
-    """Return the plan of a row of blocks; it starts at the row's `delay`."""
+    """Restore an arm's plan from a row of a block sweep; its motion starts at the row's `delay`."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )
 
 
 def car_plan(row: Row, _: Entries) -> CarPlan:
-    """Return the plan of a row of interceptions."""
+    """Restore a car's plan from a row of an interception sweep: speed and curvature at knots."""
     knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
     return CarPlan(**_outcome(row), time=_numbers(row["meeting_time"]), **knots)
 
 
 def _outcome(row: Row) -> Entries:
-    """Return the fields that every plan has."""
+    """Restore the fields that all plan classes have: cost, violation, iterations and status."""
     counts = {"iterations": row["iterations"], "status": Status[row["status"]]}
     return {
         **{name: _numbers(row[name]) for name in ("cost", "violation")},

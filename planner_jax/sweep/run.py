@@ -1,4 +1,4 @@
-"""A sweep: cases are planned and refereed into one run folder, with a report."""
+"""Start or resume a sweep: plan and judge many cases, write their rows, and write the report."""
 
 import contextlib
 import dataclasses
@@ -30,7 +30,7 @@ from planner_jax.sweep.sweep import Sweep, settings_of, sweep_of
 
 
 class SweepInterrupted(KeyboardInterrupt):
-    """A sweep was interrupted by Ctrl-C; the message is its folder, which can be resumed."""
+    """A sweep was interrupted by Ctrl-C; the message is the path of its folder, to resume it."""
 
 
 def start_sweep(
@@ -41,24 +41,25 @@ def start_sweep(
     progress: bool = True,
     workers: str | None = None,
 ) -> Entries:
-    """Plan and referee a sweep into a new folder.
+    """Plan and judge the cases of a sweep, and write rows and report into a new folder.
 
     Args:
         task: task of the sweep.
-        settings: settings of the sweep, of the task's class.
-        out: folder, new or empty.
-        progress: show a bar on the standard error stream.
-        workers: "ray" has the chunks made by a Ray cluster, on all its GPUs if JAX computes on a
-            GPU in this process. The rows do not depend on the number of devices.
+        settings: settings of the sweep, of the settings class that the task names.
+        out: folder of the run, which must be missing or empty.
+        progress: whether to show a progress bar on the standard error stream.
+        workers: "ray" lets the workers of a Ray cluster plan the chunks of cases, on all its GPUs
+            if JAX in this process computes on a GPU. The rows do not depend on the number of
+            devices. None plans in this process.
 
     Returns:
         The manifest of the finished run.
 
     Raises:
-        ArgumentError: an argument or a case breaks a rule; nothing is left behind.
+        ArgumentError: an argument or a case breaks a rule; all files of the run are removed.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
-        WorkersFailed: workers could not make a chunk; the folder can be resumed.
-        OSError: the disk fails; the folder can be resumed.
+        WorkersFailed: the workers could not plan a chunk of cases; the folder can be resumed.
+        OSError: a file cannot be written; the folder can be resumed.
     """
     folder = RunFolder(out)
     folder.require_new()
@@ -96,23 +97,24 @@ def resume_sweep(
 ) -> Entries:
     """Finish a sweep that was interrupted or killed; a complete run is left unchanged.
 
-    Parts that are missing, damaged or of another run are planned again.
+    Rows are stored in one file per chunk of cases. The cases of a file that is missing, damaged or
+    of another run are planned again.
 
     Args:
         task: task of the sweep.
         out: folder of the run.
-        progress: show a bar on the standard error stream.
-        workers: as for `start_sweep`; the first session may have used others.
-        **given: settings passed again; they must equal the settings of the run.
+        progress: whether to show a progress bar on the standard error stream.
+        workers: "ray" or None as for `start_sweep`, independent of the workers used so far.
+        **given: settings by name that the caller repeats; they must equal the run's settings.
 
     Returns:
         The manifest of the finished run. Its rows equal the rows of an uninterrupted run.
 
     Raises:
-        ArgumentError: the folder is not the folder of such a sweep, a passed setting differs from
-            the run's, or the rows would differ.
+        ArgumentError: the folder does not hold a sweep of this task, a repeated setting differs, or
+            rows planned here would differ because of other versions, code, devices or files.
         SweepInterrupted: on Ctrl-C; the folder can be resumed.
-        WorkersFailed: workers could not make a chunk; the folder can be resumed.
+        WorkersFailed: the workers could not plan a chunk of cases; the folder can be resumed.
     """
     folder, sweep = RunFolder(out), sweep_of(task)
     _settings_of_run(folder, sweep, given)
@@ -142,7 +144,7 @@ def resume_sweep(
 
 
 def _session(workers: str | None) -> Entries:
-    """Return start and environment of a session, and its workers if it has any."""
+    """Return a manifest entry on this process: its start time, versions, device and workers."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     made = {} if workers is None else {"workers": workers}
     return {"started": now, **environment(), **made}
@@ -151,7 +153,7 @@ def _session(workers: str | None) -> Entries:
 def _settings_of_run(
     folder: RunFolder, sweep: Sweep, given: Mapping[str, object]
 ) -> tuple[Entries, SweepSettings]:
-    """Return manifest and settings of a run that is resumed, settings passed again checked."""
+    """Return the manifest and the settings of a run that is resumed; `given` must equal them."""
     manifest = folder.read_manifest()
     if manifest["kind"] != sweep.kind:
         raise ArgumentError(
@@ -167,7 +169,7 @@ def _maker_of(sweep: Sweep, settings: SweepSettings) -> Maker:
 
 
 def _sound_parts(folder: RunFolder, manifest: Entries) -> dict[int, Record]:
-    """Return the records of the parts of a run by number; remove all other files."""
+    """Return the records of all undamaged row files by number, and delete every other file."""
     files, found = folder.plans.files(), {}
     for path in files:
         if not path.is_file():
@@ -195,7 +197,7 @@ def _finish(
     workers: Workers | None,
     progress: bool,
 ) -> Entries:
-    """Make all missing parts and the report."""
+    """Plan all chunks that have no record in `there`, then write summary, report and manifest."""
     source, watch = maker.source, Stopwatch()
     *earlier, session = manifest["sessions"]
     try:
@@ -221,12 +223,13 @@ def _finish(
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
     except ArgumentError:
-        # A case of a later chunk breaks a rule, so that this run cannot be finished.
+        # A case of a later chunk breaks a rule. The run can never be finished and is deleted.
         folder.discard()
         raise
     except (KeyboardInterrupt, WorkersFailed, OSError) as error:
         session.setdefault("seconds", watch.lap())
-        with contextlib.suppress(OSError):  # the disk may be full
+        # The disk may be full, in which case the manifest cannot be written either.
+        with contextlib.suppress(OSError):
             folder.write_manifest({**manifest, "state": "interrupted"})
         if isinstance(error, KeyboardInterrupt):
             raise SweepInterrupted(str(folder.path)) from None
@@ -236,7 +239,7 @@ def _finish(
 def plan_baselines(
     sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
 ) -> pa.Table:
-    """Return rows of other planners' plans for one case, with a column `planner`."""
+    """Plan case `index` with each of some planners; return one row a planner, with its name."""
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
         stopping.check()
@@ -248,11 +251,12 @@ def plan_baselines(
     return pa.concat_tables(tables)
 
 
-_OF_NETWORKS = ("parent", "name")  # fields of every Flax module
+# Fields that every Flax module has. They do not describe a network and are left out of manifests.
+_OF_NETWORKS = ("parent", "name")
 
 
 def _fields_of(planner: object) -> Entries:
-    """Return static fields of a planner for the manifest, with shapes for arrays."""
+    """Return a planner's fields for the manifest; an array is described by its shape alone."""
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
         if field.name in _OF_NETWORKS:

@@ -1,4 +1,4 @@
-"""The sweep of a task: everything that a run needs from its task."""
+"""The class `Sweep`: what a sweep needs from its task, such as columns, table and figures."""
 
 import contextlib
 import dataclasses
@@ -28,31 +28,34 @@ from planner_jax.sweep.figures import outcomes_figure
 
 @dataclasses.dataclass(frozen=True)
 class RunFigure:
-    """One figure of a task's runs."""
+    """One figure in the reports of a task's sweeps."""
 
-    name: str  # file name
+    name: str  # file name in the folder `figures`
     caption: str
     size: tuple[float, float]  # width and height [inch]
-    draw: Callable[[Figure, RunRows], None]  # draws into an empty figure
+    draw: Callable[[Figure, RunRows], None]  # function that draws a run into an empty figure
 
 
 class Sweep(Generic[AnySettings]):
-    """The sweep of a task: sources, planning, judging, columns, table and figures.
+    """What a sweep does for one task: open cases, plan, judge, and report.
 
-    This class serves any task. The class of a task, named by `SweepSettings.RUN`, overrides parts.
+    This class serves any task. A task may name a subclass in `SweepSettings.RUN` that overrides
+    methods, for example to add its own columns and figures.
     """
 
-    frame: ClassVar[str] = ""  # axes and time of the columns, as text
-    own_columns: ClassVar[Sequence[Column]] = ()
-    single_columns: ClassVar[Sequence[Column]] = ()  # used by the command `plan`
+    frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns
+    own_columns: ClassVar[Sequence[Column]] = ()  # columns of the rows; () stores every leaf
+    single_columns: ClassVar[Sequence[Column]] = ()  # columns for `planner-jax plan` of one case
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure("outcomes.png", "Number of plans by iterations.", (9.0, 4.4), outcomes_figure),
     )
-    counts: ClassVar[type[Tally]] = Tally  # class of the counts
-    single_figures: ClassVar[Sequence[RunFigure]] = ()  # used by the command `plan`
-    # Returns the plan of a row, bit for bit, from the row and the setting of its run.
+    counts: ClassVar[type[Tally]] = Tally  # class that counts the rows for the summary
+    single_figures: ClassVar[Sequence[RunFigure]] = ()  # figures of `planner-jax plan` of one case
+    # A function that restores the plan which a row stores. Its arguments are the row and the
+    # manifest's entry `setting`, which holds the physics of all cases.
     plan_of_row: Callable[[Row, Entries], Plan] | None = None
-    failure_words: ClassVar[Mapping[str, str]] = {  # heading -> column of the list of failures
+    # Columns in the report's list of failures, as heading -> name of the column.
+    failure_words: ClassVar[Mapping[str, str]] = {
         "case": "index",
         "solver's status": "status",
         "referee": "sentence",
@@ -63,19 +66,19 @@ class Sweep(Generic[AnySettings]):
 
     @property
     def kind(self) -> str:
-        """Kind of the run in its manifest."""
+        """Entry `kind` of the manifest, such as "sweep hit"."""
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of the run: `own_columns`, or every leaf of case, plan and verdict."""
+        """Return the rows' columns: `own_columns`, or else all leaves of case, plan and verdict."""
         return self.own_columns or leaf_columns(batch)
 
     def planner(self, settings: AnySettings) -> Planner:
-        """Return the planner of a run."""
+        """Return the planner that the settings of a run name, with the options that they set."""
         return self.task.planner(settings.planner, **settings.planner_options())
 
     def other_planners(self, settings: AnySettings) -> Entries:
-        """Return the task's other planners for such cases by name, if they are installed."""
+        """Return the task's other installed planners that take the same class of cases, by name."""
         own, _ = self.task.split_planner(settings.planner)
         made = {}
         for name in self.task.all_planners():
@@ -86,7 +89,7 @@ class Sweep(Generic[AnySettings]):
         return {name: one for name, one in made.items() if one.case_type is kind}
 
     def require_fit(self, settings: AnySettings, planner: Planner, cases: PyTree) -> None:
-        """Raise `ArgumentError` unless the planner takes such cases."""
+        """Raise `ArgumentError` if the planner takes another class of cases."""
         require(
             isinstance(cases, planner.case_type),
             "planner",
@@ -95,44 +98,44 @@ class Sweep(Generic[AnySettings]):
         )
 
     def open_source(self, settings: AnySettings, batch: int) -> Source:
-        """Return the source of a sweep's cases; `batch` is the default of the settings."""
+        """Return the source of a sweep's cases; `batch` is used if the settings have no batch."""
         return DrawnSource(**fill_in(settings, settings.DEFAULT_NUM, batch), task=self.task)
 
     def plan(self, planner: Planner, cases: PyTree) -> PyTree:
-        """Return the plans of a batch."""
+        """Return the planner's plans for a batch of cases."""
         return plan(planner, cases)
 
     def judge(self, cases: PyTree, plans: PyTree, settings: AnySettings) -> PyTree:
-        """Return the referee's verdicts on plans."""
+        """Return the referee's verdicts on a batch of plans."""
         return self.task.judge(cases, plans, **settings.judge_options())
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return physics and limits that all cases share, for the manifest."""
+        """Return physics and limits that all cases share, for the entry `setting` of manifests."""
         return {}
 
     def tally(self, settings: AnySettings) -> Tally:
-        """Return a tally without counts."""
+        """Return an object that counts rows for the summary, all counts at zero."""
         return self.counts()
 
     def title(self, manifest: Entries) -> str:
-        """Return the title of table and page."""
+        """Return the title of the report's table and HTML page."""
         settings = manifest["parameters"]
         name = self.task.name.capitalize()
         return f"{name} sweep, suite {settings['suite']}, planner {settings['planner']}"
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return the table of success rates."""
+        """Return the report's table of success rates, here with one row for the suite."""
         summary, settings = manifest["summary"], manifest["parameters"]
         header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
         cells = rate_cells(summary["successes"], summary["num"])
         return RateTable("Success", header, [[settings["suite"], *cells]])
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return sentences on findings of the task, for the headline."""
+        """Return sentences on results that only this task has, for the head of the report."""
         return []
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return sentences on the origin of the numbers."""
+        """Return sentences for the end of the report: which cases, and what counts as success."""
         settings = manifest["parameters"]
         return [
             f"Cases: {settings['num']:,} of suite {settings['suite']}, seed {settings['seed']}.",
@@ -146,16 +149,16 @@ def settings_of(task: Task) -> type[SweepSettings]:
 
 
 def sweep_of(task: Task) -> Sweep:
-    """Return the sweep of a task."""
+    """Return the sweep object of a task, of the class that its settings name in `RUN`."""
     name = settings_of(task).RUN
     return pkgutil.resolve_name(name)(task) if name else Sweep(task)
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep of a run; `name` is the argument that holds its path.
+    """Return the sweep object for a run's task; messages call the run's path by the name `name`.
 
     Raises:
-        ArgumentError: the run is of another kind, or of a task that is not installed.
+        ArgumentError: the run is not a sweep, or its task is not installed.
     """
     first, _, task = str(manifest["kind"]).partition(" ")
     if first != "sweep":
@@ -167,12 +170,12 @@ def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
 
 
 def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> Entries:
-    """Return leaves of the first case as plain numbers, rounded to six digits.
+    """Return fields of the first case of a batch as plain numbers, rounded to six decimals.
 
     Args:
-        tree: batch of cases, or a part of it.
-        names: fields; by default all. None and nested fields are left out.
-        prefix: of the names in the result.
+        tree: batch of cases, or a field of it that is a dataclass, such as its limits.
+        names: names of fields; by default all. Fields that are None or dataclasses are left out.
+        prefix: text before each name in the result.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
     known = {name: vars(tree)[name] for name in names}

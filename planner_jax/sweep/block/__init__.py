@@ -1,1 +1,1 @@
-"""The block sweep: settings, columns and figures of an arm that blocks balls."""
+"""The sweep of blocks: a robot arm blocks thrown balls with a shield."""

@@ -1,4 +1,4 @@
-"""Columns of a block run: ball, plan and verdict."""
+"""Columns of the rows that a sweep of blocks stores: ball, arm, plan and referee's verdict."""
 
 from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, leaves_of

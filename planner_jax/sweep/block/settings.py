@@ -1,4 +1,4 @@
-"""Settings of a block sweep."""
+"""Settings of a sweep of blocks, from which the options of `planner-jax sweep block` are made."""
 
 import dataclasses
 from typing import ClassVar
@@ -8,12 +8,14 @@ from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option
 from planner_jax.studies.block.settings import StudySettings, require_moderate
 
-REGIMES = ("R1", "R2", "R3")  # keys in `planner_jax.robot.arm`, which imports JAX
+# Names of the sets of joint limits. They equal the keys of `planner_jax.robot.arm.REGIMES`, which
+# is not used here because that module imports JAX.
+REGIMES = ("R1", "R2", "R3")
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockSettings(StudySettings):
-    """Settings of a block sweep."""
+    """Settings of a sweep of blocks."""
 
     regime: str = option(
         "R2",
@@ -30,7 +32,7 @@ class BlockSettings(StudySettings):
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
     CASE_BYTES: ClassVar[int] = 60_000
-    CPU_BATCH: ClassVar[int] = 256  # a case takes some milliseconds
+    CPU_BATCH: ClassVar[int] = 256  # small, because planning a case takes some milliseconds
     GPU_BATCH: ClassVar[int] = 4096
 
     def __post_init__(self) -> None:
@@ -42,5 +44,5 @@ class BlockSettings(StudySettings):
             require(self.delay == 0.0, "delay", rule, self.delay)
 
     def draw_options(self) -> Entries:
-        """Return the options of the task's `draw`; the delay is the time of the first motion."""
+        """Return keyword arguments for the task's `draw`; motions start at the option `delay`."""
         return {**super().draw_options(), "delay": self.delay + self.first_motion}

@@ -1,4 +1,4 @@
-"""The sweep of blocks: rows, execution times, and results of perception."""
+"""The sweep of blocks: robot arms block thrown balls, known exactly or observed by a camera."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ from planner_jax.sweep.sweep import Sweep
 
 
 class BlockTally(Tally):
-    """Counts with means of execution time, errors of fits, and planning times."""
+    """Counts of successes, and means of execution times, flight-fit errors and planning times."""
 
     MEANS = ("execution_time",)
     READS = (*COUNTED, *MEANS, *StudyCounts.READS)
@@ -36,12 +36,12 @@ class BlockTally(Tally):
         self._study = StudyCounts()
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Add some rows of the run to the counts and sums."""
         super().add(rows)
         self._study.add(rows)
 
     def summary(self) -> Entries:
-        """Return the summary; with a camera or a clock also errors [m] and times [s]."""
+        """Return rates and means; with a camera errors [m] of flight fits, or planning times [s]."""
         return super().summary() | self._study.summary()
 
 
@@ -52,19 +52,19 @@ class BlockSweep(Sweep[BlockSettings]):
     plan_of_row = staticmethod(arm_plan)
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of blocks, with columns of perception or planning time."""
+        """Return the columns of blocks, with columns on camera or planning time if simulated."""
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Return the planner of a run; raise `ArgumentError` if its file is not a library."""
+        """Return the run's planner, wrapped to simulate a camera or its planning time if set."""
         return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:
-        """Return the task's other planners; none with perception or a clock."""
+        """Return the task's other planners; none if a camera or planning time is simulated."""
         return {} if settings.is_study else super().other_planners(settings)
 
     def require_fit(self, settings: BlockSettings, planner: Planner, cases: PyTree) -> None:
-        """Raise `ArgumentError` unless the planner takes such cases, and its library fits them."""
+        """Raise `ArgumentError` if the planner or its library of motions does not fit the cases."""
         if isinstance(planner, SeeingArms | CountedPlanner):
             planner = planner.planner
         super().require_fit(settings, planner, cases)
@@ -72,7 +72,7 @@ class BlockSweep(Sweep[BlockSettings]):
             planner.check(cases)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return sentences on execution time, fits of the flight, and planning time."""
+        """Return sentences on execution time, errors of the flight fits, and planning time."""
         summary, found = manifest["summary"], []
         if (mean := summary["mean_execution_time"]) is not None:
             found.append(f"The arm moves for {mean:.3f} s, in the mean of the successes.")

@@ -1,1 +1,1 @@
-"""The catch sweep: settings, columns, table and figures of catches with a net."""
+"""The sweep of catches: a quadrotor catches flying targets with a net."""

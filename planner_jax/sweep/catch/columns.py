@@ -1,7 +1,7 @@
-"""Columns of a catch run: targets, decision, catches and verdict.
+"""Columns of the rows that a sweep of catches stores: targets, decision, catches and verdict.
 
-For N targets, a list of a row has N entries, or N points in sequence. Lists of the decision, the
-plan and the verdict are in the order of catching.
+For N targets, a list column of a row has N numbers, or the 3 N coordinates of N points. Lists of
+the case follow the order of its targets. Lists of plan and verdict follow the order of the catches.
 """
 
 import numpy as np

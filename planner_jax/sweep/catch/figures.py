@@ -1,4 +1,4 @@
-"""Figures of a catch run: one plan in space and along its time."""
+"""Figures in the report of a sweep of catches: one plan in space, and plans over time."""
 
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
 
 
 def target_paths(row: Row) -> BallPath | HarmonicPath:
-    """Return the targets of a row; leaves have a leading axis N."""
+    """Restore the paths of the N targets of a row; every leaf has a leading axis N."""
 
     def leaf(name: str, *trailing: int) -> jax.Array:
         return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
@@ -33,7 +33,7 @@ def target_paths(row: Row) -> BallPath | HarmonicPath:
 
 
 def target_positions(row: Row, times: np.ndarray) -> np.ndarray:
-    """Return the positions (N, K, 3) [m] of all targets at times (K,) [s]."""
+    """Return the predicted positions (N, K, 3) [m] of a row's N targets at times (K,) [s]."""
     return np.asarray(_positions(target_paths(row), jnp.asarray(times, jnp.float32)))
 
 
@@ -43,7 +43,7 @@ def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
 
 
 class SampledCatch(NamedTuple):
-    """A row with its quadrotor, net and N targets at K times."""
+    """The plan of a row, and quadrotor, net and N targets sampled at K times of the plan."""
 
     row: Row
     motion: SampledMotion
@@ -55,7 +55,7 @@ class SampledCatch(NamedTuple):
 
 
 def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
-    """Return a row with sampled plan; `setting` holds the physics of the manifest."""
+    """Sample net and targets at the times of `motion`; `setting` is an entry of the manifest."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -68,7 +68,7 @@ def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCa
 def due_distance(plan: SampledCatch) -> np.ndarray:
     """Return the distance (K,) [m] from the net's centre to the next target to be caught.
 
-    NaN at the first time after a catch, so that the line has a gap there.
+    The first value after each catch is NaN. The drawn line then has a gap where the target changes.
     """
     times, num = plan.motion.time, len(plan.catches)
     place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
@@ -77,14 +77,14 @@ def due_distance(plan: SampledCatch) -> np.ndarray:
     return np.where(np.diff(place, prepend=0) > 0, np.nan, distance)
 
 
-_SAMPLES = 1601
-_ROTORS = 0.165  # [m], half the diagonal between the paper's propellers
-_CLOSE, _AROUND = 0.5, 0.4  # [m], half side of a close-up; [s], half of the time shown in it
+_SAMPLES = 1601  # number of times at which a plan is sampled
+_ROTORS = 0.165  # [m] half the diagonal distance between propellers, of the paper's quadrotor
+_CLOSE, _AROUND = 0.5, 0.4  # [m] half the side of a close-up; [s] half the time that it shows
 _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
 
 
 def flight_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the example from the side and from above, with a close-up of every catch."""
+    """Draw the plan of the run's example case: from the side, from above, and each catch close."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
     plan = sample_catch(row, motion, setting)
@@ -119,20 +119,20 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
 
 
 def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return least and greatest coordinates (3,) [m] of the plan and of targets until caught."""
+    """Return bounds (3,) [m] that contain the plan and each target's path up to its catch."""
     caught = zip(plan.row["order"], plan.catches, strict=False)
     paths = [plan.targets[target][: at + 1] for target, at in caught]
     points = np.concatenate([plan.motion.pos, plan.centre, *paths])
-    points = np.nan_to_num(points)  # the plan may not be finite
+    points = np.nan_to_num(points)  # a failed plan may contain NaN
     low, high = points.min(axis=0), points.max(axis=0)
-    # Keep panels high enough to be read.
+    # Make all sides at least a quarter of the longest, so that no panel is too low to be read.
     middle, half = 0.5 * (low + high), 0.5 * (high - low) + 2.0 * _ROTORS
     half = np.maximum(half, 0.25 * half.max())
     return middle - half, middle + half
 
 
 def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = None) -> None:
-    """Draw paths and catches in the plane of x and a second axis; `only` selects one catch."""
+    """Draw a plan over x and axis `second` (1: y, 2: z), around catch `only` or completely."""
     where, catches, time = [0, second], plan.catches, plan.motion.time
     for index, at in enumerate(catches):
         if only not in (None, index):
@@ -150,7 +150,7 @@ def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = N
 
 
 def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha: float) -> None:
-    """Draw hoop, stick and rotors at one time."""
+    """Draw rotors, net hoop and the stick between them at the sample with index `at`."""
     axis, centre, pos = plan.axis[at], plan.centre[at], plan.motion.pos[at]
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= max(np.linalg.norm(across), 1e-9)
@@ -163,16 +163,16 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
 
 
 _PANELS = ("speed", "body_rate", "thrust", "jerk")
-_LEAST_DISTANCE = 1e-3  # [m], start of the logarithmic axis
+_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis; smaller distances are drawn here
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw net distance, speed, body rate, thrust and jerk of plans for one case."""
+    """Draw several planners' plans for one case over time: net distance, speed, thrust and jerk."""
     quadrotor_figure(figure, run, _PANELS, _draw_distances, _word)
 
 
 def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw the distance from the net to the next target to be caught."""
+    """Draw each plan's distance from the net's centre to the next target to be caught."""
     for plan in plans:
         away = due_distance(sample_catch(plan.row, plan.motion, setting))
         axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)

@@ -1,4 +1,4 @@
-"""Settings of a catch sweep."""
+"""Settings of a sweep of catches, from which the options of `planner-jax sweep catch` are made."""
 
 import dataclasses
 import math
@@ -10,12 +10,12 @@ from planner_jax.runs.settings import option
 from planner_jax.sweep.quadrotor_settings import QuadrotorSettings
 from planner_jax.task.catch.spec import DECISIONS, SUITES, TRAINED
 
-NET_TESTS = ("plane", "ball")  # tests in `referee_catches`
+NET_TESTS = ("plane", "ball")  # how the referee tests the net's radius: see the option `net_test`
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchSettings(QuadrotorSettings):
-    """Settings of a catch sweep."""
+    """Settings of a sweep of catches."""
 
     decide: str = option(
         "best", "NAME", f"order and first times: {', '.join(DECISIONS)}, policy:FILE"
@@ -36,7 +36,8 @@ class CatchSettings(QuadrotorSettings):
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
-    GPU_BATCH: ClassVar[int] = 8192  # all orders of six targets take 1 MB for each case
+    # With six targets, evaluating all 720 orders takes 1 MB of memory for each case of a batch.
+    GPU_BATCH: ClassVar[int] = 8192
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -47,7 +48,7 @@ class CatchSettings(QuadrotorSettings):
 
     @property
     def case_bytes(self) -> int:
-        """Memory [bytes] of one case; more if all orders of several targets are evaluated."""
+        """Estimated memory [bytes] of one case, which grows with the number of evaluated orders."""
         suite = SUITES.get(self.suite or next(iter(SUITES)))
         all_orders = self.decide == "best" and suite is not None and not suite.optional
         orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1

@@ -1,4 +1,4 @@
-"""The sweep of catches: targets, times, decisions, and the rates of [Yu2023catch]."""
+"""The sweep of catches by quadrotors with a net, reported beside the rates of [Yu2023catch]."""
 
 import numpy as np
 import pyarrow as pa
@@ -32,18 +32,18 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts with targets caught, times of the catches, and the optimal time ratio."""
+    """Counts of successes, and means of targets caught, catch times and optimal time ratios."""
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
     def __init__(self, decides: bool = True) -> None:
         super().__init__()
-        self._decides = decides  # whether plans start from the times of a decision
+        self._decides = decides  # False for planners that choose catch times without a decision
         self._shares = self._ratios = self._times = 0.0
         self._num_ratios = self._num_caught = 0
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Add some rows of the run to the counts and sums."""
         super().add(rows)
         caught, present, times = (
             np.stack(rows[name].to_pylist()) for name in ("caught", "present", "catch_times")
@@ -57,7 +57,7 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return rates from 0 to 1 and times [s]; None if unknown."""
+        """Return rates from 0 to 1 and mean times [s]; a mean over no values is None."""
         return {
             **super().summary(),
             "caught": self._shares / self.num,
@@ -85,20 +85,20 @@ class CatchSweep(Sweep[CatchSettings]):
     single_figures = figures[:2]
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return physics and limits that all cases have in common, for the manifest."""
+        """Return physics and limits that all cases share, for the manifest's entry `setting`."""
         net = first_values(cases.net, ["height", "radius", "max_angle"], "net_")
         return {**first_values(cases, ["gravity"]), **net, **first_values(cases.limits)}
 
     def tally(self, settings: CatchSettings) -> CatchTally:
-        """Return an empty count of rows."""
+        """Return an object that counts rows for the summary, all counts at zero."""
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success and optimal time ratio beside Tables I and III of [Yu2023catch]."""
+        """Return the run's success and time ratio, beside [Yu2023catch, Tables I and III]."""
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return a sentence on targets caught, their times and the optimal time ratio."""
+        """Return a sentence on the share of targets caught, mean time and optimal time ratio."""
         summary = manifest["summary"]
         text = f"{100.0 * summary['caught']:.2f} % of the targets caught"
         if summary["mean_catch_time"] is not None:
@@ -108,7 +108,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return [f"{text}."]
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return where the numbers come from, a sentence each."""
+        """Return sentences for the report: robot, cases, decision, limits and rules of success."""
         settings, limits = manifest["parameters"], manifest["setting"]
         gravity = limits["gravity"]
         return [

@@ -1,1 +1,1 @@
-"""The hit sweep: serves, columns, table and figures of quadrotor volleys."""
+"""The sweep of hits: a quadrotor returns served balls with its racket."""

@@ -1,4 +1,4 @@
-"""Columns of a hit run: serve, plan and verdict."""
+"""Columns of the rows that a sweep of hits stores: serve, plan and the referee's verdict."""
 
 import numpy as np
 import pyarrow as pa
@@ -53,7 +53,7 @@ COLUMNS = [
 ]
 
 _ORIGIN = ("scenario", "file", "line", "serve_pos", "serve_vel", "target")
-# Columns of a single case, which is not a serve of the court.
+# Columns of one case that the user specified. It has no scenario, serve or published outcome.
 SINGLE_COLUMNS = [
     *(c for c in COLUMNS if c.name not in _ORIGIN and c not in OUTCOMES),
     *leaves_of("cases", ("target", "m", "desired landing point", VECTOR)),

@@ -1,4 +1,4 @@
-"""Figures of a hit run: the court, one case in space, and one plan along its time."""
+"""Figures in the report of a sweep of hits: the court, one case in space, plans over time."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -15,14 +15,14 @@ from planner_jax.sweep.quadrotor import sample_motion
 from planner_jax.task.hit import court
 from planner_jax.task.hit.court import fly, landing
 
-_SAMPLES = 48
-_SHORTEST = 0.12  # least ratio of half a panel's height to its width
+_SAMPLES = 48  # number of points of each drawn trajectory
+_SHORTEST = 0.12  # least ratio of half the height of a panel to its width
 _FLOOR = "#F6F8FA"
 _TARGET: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
 
 
 def court_figure(figure: Figure, run: RunRows) -> None:
-    """Draw a sample of a run's cases from above and from the side."""
+    """Draw about 60 cases of a run on the court, from above and from the side, with failures."""
     rows, setting = run.sample(), run.manifest["setting"]
     drag_after = run.manifest["parameters"]["drag_after_impact"]
     aside, top = court.HALF_WIDTH + 0.3, 6.4
@@ -58,14 +58,14 @@ def court_figure(figure: Figure, run: RunRows) -> None:
 def ball_path(
     pos: np.ndarray, vel: np.ndarray, end: float, drag: float, gravity: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] up to `end`, and positions (N, 3) [m] of a ball in flight."""
+    """Return times (N,) [s] up to `end`, and positions (N, 3) [m] of a ball in free flight."""
     time = np.linspace(0.0, end, _SAMPLES)
     again = (_SAMPLES, 1)
     return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]
 
 
 def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: bool) -> None:
-    """Draw serve, trajectory and returned ball of a case in the plane of x and a second axis."""
+    """Draw the paths of ball and quadrotor in the plane of x and axis `second` (1: y, 2: z)."""
     good, gravity, drag = row["success"], setting["gravity"], setting["drag"]
 
     def line(path: np.ndarray, colour: str, width: float, alpha: float, dash: str = "-") -> None:
@@ -93,7 +93,7 @@ def draw_case(axes: Axes, row: Row, second: int, setting: Entries, drag_after: b
 
 
 def _draw_floor(axes: Axes) -> None:
-    """Draw lines, dead zone and letters of the regions from above."""
+    """Draw the court from above: its lines, its dead zone, and the letters of its regions."""
     length, width, dead = court.HALF_LENGTH, court.HALF_WIDTH, court.DEAD_ZONE
     line: Look = {"color": style.GREY, "linewidth": 1.0, "zorder": 1}
     whole: Look = {"facecolor": _FLOOR, "edgecolor": style.GREY}
@@ -113,7 +113,7 @@ def _draw_floor(axes: Axes) -> None:
 
 
 def path_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the example from above and from the side."""
+    """Draw ball and quadrotor of the run's example case, from above and from the side."""
     (_, row), setting = run.same_case()[0], run.manifest["setting"]
     drag_after = run.manifest["parameters"].get("drag_after_impact", False)
     above, side = figure.subplots(2, 1, sharex=True)
@@ -123,7 +123,7 @@ def path_figure(figure: Figure, run: RunRows) -> None:
         axes.plot(row["target"][0], row["target"][second], zorder=6, markersize=11, **_TARGET)
         low, high = axes.get_ylim()
         wide = np.ptp(axes.get_xlim())
-        # Keep panels high enough to be read.
+        # With equal scales, a flat path would give a panel too low to be read.
         middle, half = 0.5 * (low + high), max(0.5 * (high - low), _SHORTEST * wide)
         axes.set(ylim=(middle - half, middle + half), aspect="equal")
     side.axhline(0.0, color=style.GREY, linewidth=1.5)
@@ -137,7 +137,7 @@ _PANELS = ("speed", "acceleration", "body_rate", "thrust")
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw height, speed, acceleration, body rate and thrust of plans for one serve."""
+    """Draw several planners' plans for one serve over time: height, speed, thrust and others."""
     quadrotor_figure(figure, run, _PANELS, _draw_heights, _word)
 
 
@@ -146,7 +146,7 @@ def _word(row: Row) -> str:
 
 
 def _draw_heights(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw the height of the quadrotor, and of the ball until it would land."""
+    """Draw the heights of the quadrotor's plans, and of the served ball up to its landing."""
     row, physics = plans[-1].row, (setting["drag"], setting["gravity"])
     pos, vel = np.array(row["ball_pos"]), np.array(row["ball_vel"])
     time, path = ball_path(pos, vel, float(landing(pos, vel, *physics)[0]), *physics)

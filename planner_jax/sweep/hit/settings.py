@@ -1,4 +1,4 @@
-"""Settings of a hit sweep."""
+"""Settings of a sweep of hits, from which the options of `planner-jax sweep hit` are made."""
 
 import dataclasses
 import math
@@ -13,15 +13,15 @@ from planner_jax.runs.settings import option
 from planner_jax.sweep.quadrotor_settings import QuadrotorSettings
 from planner_jax.task.hit.spec import START
 
-_FARTHEST = 1e6  # [m], greatest coordinate of the start
+_FARTHEST = 1e6  # [m] greatest absolute coordinate of the start that is accepted
 
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(QuadrotorSettings):
-    """Settings of a hit sweep.
+    """Settings of a sweep of hits.
 
-    The default of `num` is the whole folder of serves, or `DEFAULT_NUM` drawn serves. `seed` is the
-    seed of drawn serves and of uniform starts.
+    `num` is the number of serves: by default all serves of the folder `serves`, or `DEFAULT_NUM` if
+    serves are drawn. `seed` determines the drawn serves, and the starts if `start` is "uniform".
     """
 
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")
@@ -41,7 +41,7 @@ class HitSettings(QuadrotorSettings):
     DEFAULT_NUM: ClassVar[int] = 9000
     CASE_BYTES: ClassVar[int] = 12_000
     ROW_BYTES: ClassVar[int] = 1_500
-    CPU_BATCH: ClassVar[int] = 4608  # one block of the serve generator
+    CPU_BATCH: ClassVar[int] = 4608  # number of serves that the generator draws at once
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -53,7 +53,7 @@ class HitSettings(QuadrotorSettings):
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 
     def planner_options(self) -> Entries:
-        """Return the options of the planner that these settings decide."""
+        """Return the keyword arguments for the task's `planner` that follow from the settings."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
         return super().planner_options() | truer
 

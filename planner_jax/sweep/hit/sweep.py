@@ -1,4 +1,4 @@
-"""The sweep of hits: serves, the 36 scenarios of the court, and published success rates."""
+"""The sweep of hits: quadrotors return serves in 36 court scenarios, beside published rates."""
 
 import dataclasses
 
@@ -34,15 +34,16 @@ from planner_jax.task.hit.suites import Serves, generate_serves, read_serves, to
 
 @dataclasses.dataclass(frozen=True)
 class ServeSource(Source):
-    """Source of serves; a chunk holds them as the origin of its cases."""
+    """Source of the cases of a sweep of hits, which are made from drawn or published serves."""
 
     settings: HitSettings
-    folder: Serves | None  # serves of published files, if the settings name a folder
+    folder: Serves | None  # all serves of published files, if the settings name a folder of files
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return cases as `Source.cases` does.
+        """Return the chunk of cases `first` to `last - 1`, with their serves as its `origin`.
 
-        A ball that lands before planning starts breaks a rule as well.
+        Raises:
+            ArgumentError: a case breaks a rule, or its ball lands before planning starts.
         """
         settings = self.settings
         if self.folder is not None:
@@ -58,14 +59,14 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Check all serves of a folder; of drawn serves, the first chunk."""
+        """Check the cases of the first chunk, or of all chunks if serves are read from files."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
         return cases
 
     def description(self) -> Entries:
-        """Return source, number of distinct serves and digest of their numbers."""
+        """Return the manifest entry on the serves: their source, number and SHA-256 digest."""
         if self.folder is None:
             return {"serves": {"source": "generated", "distinct": self.num, "sha256": None}}
         return {
@@ -74,9 +75,9 @@ class ServeSource(Source):
 
 
 class HitTally(Tally):
-    """Counts by scenario; the example flies from the left to the far target.
+    """Counts of successes by scenario.
 
-    [Yu2023bat, Fig. 7] shows such a case.
+    The report's example is a success from the left to the far target, as in [Yu2023bat, Fig. 7].
     """
 
     READS = (*COUNTED, *ScenarioCounts.READS)
@@ -86,18 +87,18 @@ class HitTally(Tally):
         self._scenarios = ScenarioCounts()
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Add some rows of the run to the counts."""
         super().add(rows)
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of possible examples, the preferred ones first."""
+        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
 
     def summary(self) -> Entries:
-        """Return success rates from 0 to 1, with published rates of the same serves."""
+        """Return success rates from 0 to 1, by scenario beside published rates on its serves."""
         return {**super().summary(), "per_scenario": self._scenarios.summary()}
 
 
@@ -125,8 +126,8 @@ class HitSweep(Sweep[HitSettings]):
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
-        """Return the source of a sweep's serves; a folder is read and checked completely."""
-        # Suites of other packages have no serves.
+        """Return the source of a sweep's cases; a folder of published serves is read completely."""
+        # Suites that other packages add cannot be used, as only this task's suites define serves.
         require_one_of(TASK.suites, "suite", str(settings.suite))
         folder = None if settings.serves is None else read_serves(settings.serves)
         if folder is not None and (settings.num or 0) > len(folder):
@@ -136,7 +137,7 @@ class HitSweep(Sweep[HitSettings]):
         return ServeSource(**fill_in(settings, num, batch), folder=folder)
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return physics and limits that all cases have in common, for the manifest."""
+        """Return physics and limits that all cases share, for the manifest's entry `setting`."""
         names = ("drag", "gravity", "restitution", "racket_height", "racket_radius")
         setting = first_values(cases, names)
         return setting | first_values(cases.limits) | first_values(cases.hit_limits)
@@ -146,7 +147,7 @@ class HitSweep(Sweep[HitSettings]):
         return make_table(manifest)
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return where the numbers come from, a sentence each."""
+        """Return sentences for the report: robot, serves, limits and rules of the referee."""
         summary, settings = manifest["summary"], manifest["parameters"]
         law = f"drawn from the published law, suite {settings['suite']}, seed {settings['seed']}"
         origin = "cases of published trial files" if settings["serves"] else law

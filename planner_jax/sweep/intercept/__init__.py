@@ -1,1 +1,1 @@
-"""The sweeps of interceptions and of groups: settings, columns, table and figures."""
+"""The sweeps of cars that meet one moving target, or a group of targets one after another."""

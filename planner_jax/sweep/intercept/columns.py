@@ -1,7 +1,7 @@
-"""Columns of an intercept run: car, target, obstacles, plan and verdict.
+"""Columns of the rows that a sweep of interceptions stores: case, plan and verdict.
 
-For N obstacles of V corners, a list of a row has N entries, or all corners in sequence. A polygon
-with fewer corners repeats one.
+For N obstacles of V corners each, a list column has N entries, or the coordinates of all N V
+corners. A polygon with fewer than V corners repeats one of its corners.
 """
 
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from planner_jax.runs import columns as known
 from planner_jax.runs.columns import LIST, VECTOR, Column, RefereedBatch, leaves_of, list_of
 
 FRAME = "world, in the plane, headings counter-clockwise from x; times from the car's start"
-WAY_POINTS = 65  # number of points of a target's path
+WAY_POINTS = 65  # number of points at which the column `target_way` stores a target's path
 _FLAGS, _POINT = list_of(pa.bool_()), list_of(pa.float32(), 2)
 
 
@@ -27,12 +27,12 @@ def _target_way(batch: RefereedBatch) -> np.ndarray:
 
 @jax.jit
 def _positions(targets: PyTree, times: jax.Array) -> jax.Array:
-    """Return positions (B, K, 2) [m] of targets (B,) at times (B, K) [s]."""
+    """Return positions (B, K, 2) [m] of B targets, each at its own K times (B, K) [s]."""
     return jax.vmap(jax.vmap(lambda path, time: path.at(time).pos, (None, 0)))(targets, times)
 
 
 def _corners(name: str) -> Callable[[RefereedBatch], np.ndarray]:
-    """Return a function of the corners (B, N, V, 2) [m] of walls or movers at time 0."""
+    """Return a function that computes corners (B, N, V, 2) [m] of "walls" or "movers" at time 0."""
 
     def values(batch: RefereedBatch) -> np.ndarray:
         group = vars(batch.cases)[name]

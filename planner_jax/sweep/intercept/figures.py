@@ -1,4 +1,4 @@
-"""Figures of an intercept run: cases from above, and one plan along its time."""
+"""Figures in the report of a sweep of interceptions: cases from above, and plans over time."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -27,7 +27,7 @@ from planner_jax.sweep.figures import draw_upper_limit, look_of, write_verdicts
 
 @dataclasses.dataclass(frozen=True)
 class SampledDrive:
-    """A row, its obstacles as polygons, and car and target at K times."""
+    """The plan of a row: its obstacles as polygons, and car and target sampled at K times."""
 
     row: Row
     setting: Entries  # entry `setting` of the manifest
@@ -43,17 +43,17 @@ class SampledDrive:
     target: np.ndarray  # (K, 2) [m]
 
     def target_at(self, times: np.ndarray | float) -> np.ndarray:
-        """Return predicted positions (T, 2) [m] of the target at times (T,) [s]."""
+        """Interpolate the predicted positions (T, 2) [m] of the target at times (T,) [s]."""
         places = np.reshape(self.row["target_way"], (-1, 2))
         known = np.linspace(0.0, self.row["due_time"], len(places))
         return np.stack([np.interp(times, known, places[:, k]) for k in range(2)], axis=-1)
 
     def pose_at(self, time: float) -> np.ndarray:
-        """Return the pose (3,) of the rear axle at one time [s]."""
+        """Interpolate the rear axle's pose (3,), x, y [m] and heading [rad], at one time [s]."""
         return np.array([np.interp(time, self.time, self.pose[:, k]) for k in range(3)])
 
     def footprint(self, pose: np.ndarray) -> np.ndarray:
-        """Return the corners (4, 2) [m] of the body for a pose (3,) of the rear axle."""
+        """Return the corners (4, 2) [m] of the car's body for a pose (3,) of its rear axle."""
         behind, half = -self.setting["body_rear_overhang"], 0.5 * self.setting["body_width"]
         ahead = behind + self.setting["body_length"]
         corners = np.array([(behind, -half), (ahead, -half), (ahead, half), (behind, half)])
@@ -62,7 +62,7 @@ class SampledDrive:
 
 
 def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
-    """Return a row sampled at `num` evenly spaced times, with the manifest's `setting`."""
+    """Sample a row's plan at `num` evenly spaced times; `setting` is an entry of the manifest."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
@@ -87,7 +87,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
-    """Return the existing walls or movers of a row, (V, 2) [m] each."""
+    """Return the corners (V, 2) [m] of each wall or mover (`kind`) that exists in a row."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -97,7 +97,7 @@ def _polygons(row: Row, kind: str) -> list[np.ndarray]:
 def _sample(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
-    """Return fields of `SampledDrive` at fractions (K,) of the time of a plan."""
+    """Return time, pose, speed, curvature and acceleration at fractions (K,) of a plan's time."""
     time = end * shares
 
     def at(time: Array) -> tuple[Array, ...]:
@@ -107,15 +107,16 @@ def _sample(
     return {"time": time, "pose": pose, "speed": v, "curvature": c, "acceleration": acceleration}
 
 
-_SAMPLES = 241
-_PANELS, _COLUMNS, _FAILURES = 6, 3, 2
-_MOST_BODIES, _MOST_MOVERS = 6, 16  # greatest numbers of times and of polygons of movers
-# Viridis without its light end, which is invisible on paper.
+_SAMPLES = 241  # number of times at which a plan is sampled
+_PANELS, _COLUMNS, _FAILURES = 6, 3, 2  # numbers of panels, panels in a row, and failures shown
+# Greatest numbers of times at which a panel shows the car, and of polygons of moving obstacles.
+_MOST_BODIES, _MOST_MOVERS = 6, 16
+# The colour map Viridis without its light end, which is hard to see on white paper.
 _COLOURS_OF_TIME = ListedColormap(colormaps["viridis"](np.linspace(0.0, 5.0 / 6.0, 256)))
 
 
 def plane_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the run's example and other cases."""
+    """Draw the run's example and some other cases from above, one panel for each case."""
     setting = run.manifest["setting"]
     drives = [sample_drive(row, setting, _SAMPLES) for row in choose_rows(run)]
     latest = max(drive.row["due_time"] for drive in drives)
@@ -138,7 +139,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
 
 
 def choose_rows(run: RunRows) -> list[Row]:
-    """Return the example, evenly spaced other rows, and a few failures."""
+    """Return the example's row, evenly spaced rows of other successes, and at most two failures."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]
     failures = [row for row in others if not row["success"]][:_FAILURES]
@@ -148,7 +149,7 @@ def choose_rows(run: RunRows) -> list[Row]:
 
 
 def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None:
-    """Draw one case, with several times in one panel."""
+    """Draw one case from above, with car, target and moving obstacles at several times."""
     row = drive.row
     draw_map(axes, drive.setting, drive.walls)
     end = float(np.nan_to_num(row["meeting_time"]))
@@ -184,7 +185,7 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
 
 
 def entries(colours: ScalarMappable) -> list[Artist]:
-    """Return the entries of the legend."""
+    """Return the entries of the legend of `plane_figure`."""
     early = colours.get_cmap()(0.3)
     look: Look = {"linestyle": "", "marker": "o"}
     return [
@@ -198,14 +199,14 @@ def entries(colours: ScalarMappable) -> list[Artist]:
 
 
 def instants(end: float, most: int) -> np.ndarray:
-    """Return at most `most` round times [s] from 0 to `end`."""
+    """Return at most `most` times [s] from 0 to `end`, multiples of 1, 2, 2.5 or 5 times 10^n."""
     steps = [mantissa * 10.0**power for power in range(-3, 9) for mantissa in (1.0, 2.0, 2.5, 5.0)]
     num, step = next((n, step) for step in steps if (n := int(end / step + 1e-6)) < most)
     return step * np.arange(num + 1)
 
 
 def draw_map(axes: Axes, setting: Entries, walls: list[np.ndarray]) -> None:
-    """Draw the map's bounds and walls."""
+    """Draw the walls (V, 2) [m], and set the axes to the bounds of the map."""
     look: Look = {"facecolor": style.PALE, "edgecolor": style.GREY, "linewidth": 0.8}
     axes.add_collection(PolyCollection(walls, zorder=1, **look))
     (left, low), (right, high) = setting["lower"], setting["upper"]
@@ -222,14 +223,15 @@ def draw_polygons(
     alpha: float = 0.25,
     zorder: float = 2,
 ) -> None:
-    """Draw polygons (V, 2) [m] in an RGB or RGBA colour, with a pale filling."""
+    """Draw polygons, each of V corners (V, 2) [m]; `alpha` is the opacity of their filling."""
     look: Look = {"facecolor": (*colour[:3], alpha), "edgecolor": colour, "zorder": zorder}
     axes.add_collection(PolyCollection(polygons, linewidth=1.0, **look))
 
 
-_CURVE_SAMPLES = 801
-_LEAST_DISTANCE = 1e-3  # [m], start of the logarithmic axis
-# Limit, label of the axis, title, and values (K,) of a drive that the limit bounds.
+_CURVE_SAMPLES = 801  # number of times at which a plan is sampled for curves over time
+_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis; smaller distances are drawn here
+# Panels of curves over time. Each has the name of a limit, the label of its y axis, its title, and
+# a function that computes the limited quantity (K,) from a sampled plan.
 _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] = (
     ("speed", "v [m/s]", "Speed", lambda d: d.speed),
     ("acceleration", "|a| [m/s²]", "Acceleration along the path", lambda d: np.abs(d.acceleration)),
@@ -244,7 +246,7 @@ _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] 
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:
-    """Draw distance, speed, accelerations and curvature of plans for one case over time."""
+    """Draw several planners' plans for one case over time: distance, speed and curvature."""
     plans, setting = run.same_case(), run.manifest["setting"]
     panels = figure.subplots(2, 3, sharex=True)
     drives = [

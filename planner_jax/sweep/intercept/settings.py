@@ -1,4 +1,4 @@
-"""Settings of the sweeps of interceptions and of groups."""
+"""Settings of the sweeps of cars that meet one moving target, or a group of targets."""
 
 import dataclasses
 from typing import ClassVar
@@ -10,21 +10,22 @@ from planner_jax.task.group.spec import DECISIONS
 
 @dataclasses.dataclass(frozen=True)
 class InterceptSettings(SweepSettings):
-    """Settings of an intercept sweep."""
+    """Settings of a sweep of cars that each meet one moving target."""
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
-    CPU_BATCH: ClassVar[int] = 256  # a case takes some milliseconds
+    CPU_BATCH: ClassVar[int] = 256  # small, because planning a case takes some milliseconds
     GPU_BATCH: ClassVar[int] = 4096
 
 
 @dataclasses.dataclass(frozen=True)
 class GroupSettings(SweepSettings):
-    """Settings of a sweep of groups of targets."""
+    """Settings of a sweep of cars that each meet a group of targets one after another."""
 
     decide: str = option("best", "NAME", f"decision about the order: {', '.join(DECISIONS)}")
 
-    CASE_BYTES: ClassVar[int] = 1_000_000  # all finalists of a group are planned together
+    # The most promising orders of a group's targets are planned together, which needs memory.
+    CASE_BYTES: ClassVar[int] = 1_000_000
     CPU_BATCH: ClassVar[int] = 64
     GPU_BATCH: ClassVar[int] = 512
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)

@@ -1,4 +1,4 @@
-"""The sweep of interceptions: rows, times, accelerations, and figures."""
+"""The sweep of interceptions: cars that meet moving targets among walls and moving obstacles."""
 
 import numpy as np
 import pyarrow as pa
@@ -13,21 +13,21 @@ from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 
-COMPARED = ("lattice", "spacetime")  # other planners of the run's example
+COMPARED = ("lattice", "spacetime")  # planners that also plan the run's example case, for figures
 
 
 class InterceptTally(Tally):
-    """Counts with means of meeting time, miss and acceleration.
+    """Counts of successes, and means of meeting time, miss distance and acceleration.
 
-    The example is a success that comes close to a mover.
+    The report's example is a success in which the car passes a moving obstacle closely.
     """
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
     READS = (*COUNTED, *MEANS, "mover_clearance")
-    NEAR = 0.1  # [m], clearance of an example
+    NEAR = 0.1  # [m] the example's clearance to moving obstacles is below this distance
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of possible examples, the preferred ones first."""
+        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
@@ -50,17 +50,17 @@ class InterceptSweep(Sweep[InterceptSettings]):
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:
-        """Return the planners in `COMPARED`; each takes a minute to compile."""
+        """Return the planners in `COMPARED` alone, because each planner compiles for a minute."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 
     def setting(self, cases: PyTree) -> Entries:
-        """Return map, body and limits that all cases share, for the manifest."""
+        """Return map, car body and limits that all cases share, for the manifest's `setting`."""
         bounds = first_values(cases, ["lower", "upper"])
         return bounds | first_values(cases.body, prefix="body_") | first_values(cases.limits)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return a sentence on time, accuracy and acceleration."""
+        """Return a sentence on mean meeting time, miss distance and acceleration of successes."""
         summary = manifest["summary"]
         if summary["mean_miss"] is None:
             return []
@@ -71,7 +71,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
         ]
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return sentences on the origin of the numbers."""
+        """Return sentences for the report: cases, limits, and when a plan is a success."""
         limits = manifest["setting"]
         return [
             *super().remarks(manifest)[:-1],
