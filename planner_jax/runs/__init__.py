@@ -1,1 +1,1 @@
-"""Run folders: manifest, rows, tables and figures of a command."""
+"""Folders of runs, in which sweeps and flights store their manifest, rows, table and figures."""

@@ -1,4 +1,4 @@
-"""Columns of the rows of a run: one row for each case, in SI units."""
+"""Columns of the rows of a run, in SI units; a row describes one case, its plan and its verdict."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from planner_jax.runs.source import Chunk
 
 @dataclasses.dataclass(frozen=True)
 class RefereedBatch:
-    """B cases with their plans and verdicts; leaves are NumPy or JAX arrays."""
+    """B cases, their plans and the referee's verdicts; leaves are NumPy or JAX arrays (B, ...)."""
 
     chunk: Chunk
     plans: PyTree
@@ -22,7 +22,7 @@ class RefereedBatch:
 
     @property
     def cases(self) -> PyTree:
-        """The cases, leaves with leading axis B."""
+        """The cases of the chunk, with leaves (B, ...)."""
         return self.chunk.cases
 
 
@@ -30,21 +30,22 @@ Values: TypeAlias = ArrayLike | pa.Array | None
 
 
 class Column(NamedTuple):
-    """One column of a task's rows."""
+    """One column of a task's rows: its description, and a function that computes its values."""
 
     name: str
-    unit: str  # "" for names and counts, "1" for ratios
-    meaning: str
+    unit: str  # SI unit; "" for names and counts, "1" for ratios
+    meaning: str  # text for the metadata of the Parquet file
     type: pa.DataType
-    values: Callable[[RefereedBatch], Values]  # (B,) or (B, ...); None for a column of nulls
+    # Function that returns the values, (B,) or (B, ...), or None if all values are missing.
+    values: Callable[[RefereedBatch], Values]
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
-_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # kind of a NumPy type -> type of a column
+_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # code of a NumPy dtype's kind -> type of a column
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
-    """Return the type of a list column; Parquet returns the entries under the name "element"."""
+    """Return the Arrow type of a list column, whose entries Parquet names "element"."""
     return pa.list_(pa.field("element", kind), length)
 
 
@@ -54,13 +55,13 @@ INDEX = Column("index", "", "index of the case in the run", pa.int64(), lambda b
 
 
 def leaves_of(part: str, *rows: tuple, optional: bool = False) -> list[Column]:
-    """Return columns that are leaves of one part of a batch.
+    """Return columns whose values are leaves of a subtree of a `RefereedBatch`.
 
     Args:
-        part: dotted path of the part in a `RefereedBatch`.
-        *rows: name, unit and meaning of a column; optionally its type, by default NUMBER, and the
-            dotted path of the leaf in the part, by default the name.
-        optional: whether a missing leaf makes the column null.
+        part: dotted path of the subtree, such as "plans" or "cases.targets".
+        *rows: one tuple a column: name, unit and meaning, then optionally the type, by default
+            NUMBER, and the dotted path of the leaf within the subtree, by default the name.
+        optional: whether the values are null if a batch has no such leaf; if not, that is an error.
     """
 
     def column(
@@ -76,7 +77,7 @@ _STATUS_NAMES = np.array([Status(code).name for code in range(len(Status))])
 
 
 def status_column(meaning: str) -> Column:
-    """Return the column of the plans' statuses by name."""
+    """Return the column `status`: the name of each plan's status, such as "CONVERGED"."""
     return Column("status", "", meaning, TEXT, lambda b: _STATUS_NAMES[np.asarray(b.plans.status)])
 
 
@@ -105,9 +106,9 @@ OUTCOME = [
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """Return a column for every leaf of the cases, the plans and the verdict.
 
-    A name consists of "case", "plan" or "verdict" and the names of the fields, joined by dots. The
-    columns of `SOLVER` and `OUTCOME` have the same names in all runs. The metadata of a field may
-    hold its `unit` and `meaning`.
+    A column's name is the path of its leaf, such as "case.ball.pos" or "plan.cost". The columns of
+    `SOLVER` and `OUTCOME` instead have the same names in all runs. Unit and meaning are taken from
+    the metadata `unit` and `meaning` of the dataclass field.
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]
@@ -141,7 +142,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """Return the rows of a batch; their metadata hold the frame as text."""
+    """Return the table of a batch, one row a case; `frame` is a text for the table's metadata."""
     num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
@@ -151,7 +152,7 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
 
 
 def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
-    """Return an Arrow array of `num` entries from values (num,) or (num, ...)."""
+    """Convert values (num,) or (num, ...) to an Arrow array of `num` numbers or lists."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):

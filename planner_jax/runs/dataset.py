@@ -1,8 +1,8 @@
 """The rows of a run: a Parquet dataset, which `pyarrow.dataset`, pandas and DuckDB read.
 
-A dataset is a folder with one file for each part, such as `part-000007-1a2b3c4d.parquet`, named by
-the number of the part and the CRC-32 of the file. A part is written completely or not at all. Its
-metadata hold a record of how its rows were made.
+A part of a dataset is one file of rows, such as `part-000007-1a2b3c4d.parquet`. Its name holds the
+number of the part and the CRC-32 checksum of the file. A part is written completely or not at all.
+Its metadata hold a record, a JSON object on how its rows were made.
 """
 
 import io
@@ -19,20 +19,20 @@ from pyarrow import dataset
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.runs.manifest import Entries, Row
 
-ROW_GROUP = 2048  # rows of about 3 MB, the least that is read for one row
-_RECORD = b"part"
+ROW_GROUP = 2048  # Rows in a row group of about 3 MB. Reading one row reads a whole group.
+_RECORD = b"part"  # key of a part's record in the metadata of its file
 _NAME = re.compile(r"part-([0-9]{6,12})-([0-9a-f]{8})\.parquet")
 
 
 class DamagedPart(ValueError):
-    """A file is not the part that was written; the text says why."""
+    """A file of rows is damaged or is not part of a run; the message states the reason."""
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
-    """Return the content of a part.
+    """Return the bytes of a Parquet file with some rows, and with a record in its metadata.
 
-    Only text has a dictionary, because numbers hardly repeat. Lists are not compressed, which would
-    save little.
+    Only text columns are encoded with a dictionary, because numbers hardly repeat. List columns are
+    not compressed, because compression would save little.
     """
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]
@@ -50,14 +50,14 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
 
 
 def number_of(path: Path) -> int:
-    """Return the number in the name of a part; raise `DamagedPart` for another name."""
+    """Return the part number in a file's name; raise `DamagedPart` if no part has such a name."""
     if (name := _NAME.fullmatch(path.name)) is None:
         raise DamagedPart("is not a part of a run")
     return int(name[1])
 
 
 def check_part(path: Path) -> Entries:
-    """Return the record of a part; raise `DamagedPart` if the file is not what was written."""
+    """Return a part's record; raise `DamagedPart` if the file's checksum or format is wrong."""
     number_of(path)
     with open_plain(path) as file:
         content = file.read()
@@ -72,22 +72,22 @@ def check_part(path: Path) -> Entries:
 
 
 class Dataset:
-    """The parts in a folder, in the order of their numbers.
+    """All rows of a run: the Parquet files (parts) of a folder, in the order of their numbers.
 
     Args:
-        folder: folder of the parts, which need not exist.
+        folder: folder of the files; it is created when the first file is written.
     """
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def files(self) -> list[Path]:
-        """Return all files of the folder except hidden ones, sorted."""
+        """Return the paths of all files in the folder except hidden files, sorted by name."""
         there = self.folder.iterdir() if self.folder.is_dir() else ()
         return sorted(path for path in there if not path.name.startswith("."))
 
     def write(self, number: int, content: bytes) -> None:
-        """Write the content of a part, and remove other files of the same number."""
+        """Write the file of part `number`, and remove other files with the same part number."""
         self.folder.mkdir(exist_ok=True)
         path = self.folder / f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
         with replacing(path) as scratch:
@@ -97,11 +97,14 @@ class Dataset:
                 other.unlink()
 
     def write_rows(self, rows: pa.Table) -> None:
-        """Write rows as the only part."""
+        """Write a table as the only file of the dataset, part 0."""
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return a text on each damaged file; for a wrong number of rows, on the folder."""
+        """Return the reasons why files are damaged, by path.
+
+        If all files are sound but do not hold `num` rows, the folder gets a reason.
+        """
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
@@ -117,18 +120,18 @@ class Dataset:
         return found
 
     def read(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Return some columns, by default all, of all rows."""
+        """Return the named columns of all rows as one table; None returns all columns."""
         return self._open().to_table(columns=None if columns is None else list(columns))
 
     def parts(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield the rows part by part."""
+        """Yield one table for each file, with those of the named columns that the file has."""
         for fragment in self._open().get_fragments():
             names = fragment.physical_schema.names
             known = None if columns is None else [name for name in columns if name in names]
             yield fragment.to_table(columns=known)
 
     def pick(self, rows: Sequence[int], columns: Sequence[str] | None = None) -> list[Row]:
-        """Return the rows with some indices, in ascending order; read only their row groups."""
+        """Return the rows with some indices, sorted by index; read only their row groups."""
         wanted, first, picked = sorted(set(rows)), 0, []
         for fragment in self._open().get_fragments():
             size = fragment.metadata.num_rows

@@ -1,4 +1,4 @@
-"""The environment of a run: versions, code, commit and device."""
+"""The environment of a run, stored in its manifest: versions, code digest, commit and device."""
 
 import functools
 import hashlib
@@ -12,7 +12,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.machine import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
 
-_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # these affect the numbers of rows
+_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # their versions affect the rows
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -38,7 +38,7 @@ def code_digest() -> str:
 
 
 def environment() -> Entries:
-    """Return versions, code, git commit and device for the manifest."""
+    """Return versions of packages, digest of the code, git commit and device, for the manifest."""
     import jax
 
     device = jax.devices()[0]
@@ -63,7 +63,7 @@ def environment() -> Entries:
 
 
 def makers_of(found: Entries) -> Entries:
-    """Return the entries of `environment()` that affect the numbers of rows."""
+    """Return the entries of `environment()` that affect the numbers in the rows of a run."""
     device = found["device"]
     return {
         **{name: found["versions"][name] for name in _PACKAGES},
@@ -84,7 +84,7 @@ def require_backend() -> str:
     try:
         return jax.default_backend()
     except (RuntimeError, AssertionError) as error:
-        # JAX 0.10 raises an empty AssertionError if it knows a platform but has no device of it.
+        # JAX 0.10 raises an AssertionError without text if the platform has no device here.
         reason = (str(error) or "JAX finds no device of it").splitlines()[0]
         asked = os.environ.get("JAX_PLATFORMS", "")
         raise ArgumentError(
@@ -96,7 +96,7 @@ def require_backend() -> str:
 
 
 def _git_commit() -> str | None:
-    """Return the commit of this checkout, with "+" if files were changed; None without git."""
+    """Return the checkout's commit hash, with "+" if tracked files differ; None without git."""
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(_PACKAGE), *arguments]

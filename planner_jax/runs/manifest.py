@@ -1,7 +1,7 @@
-"""JSON files of runs: their format, and a digest that detects damage.
+"""JSON files of runs, such as `manifest.json`: their format version, and a digest against damage.
 
-A file holds an object with the entries `format`, a number, and `digest`, the SHA-256 of all other
-entries.
+A file holds one JSON object. Its entry `format` is the version number of the format, and its entry
+`digest` is the SHA-256 of all other entries.
 """
 
 import hashlib
@@ -13,33 +13,33 @@ from typing import Any, TypeAlias
 from planner_jax.core.errors import ArgumentError, PlannerJaxError
 from planner_jax.host.files import open_plain
 
-FORMAT = 2  # version of manifest, parts, rows and recordings
+FORMAT = 2  # version number of the format of all files in a run's folder
 MANIFEST = "manifest.json"
-_LARGEST = 1 << 26  # [bytes]
+_LARGEST = 1 << 26  # [bytes] greatest size of a file that is read
 
 Entries: TypeAlias = dict[str, Any]  # entries of a JSON object, such as a manifest
 Row: TypeAlias = Mapping[str, Any]  # values of a row by column
 
 
 class JsonError(PlannerJaxError, ValueError):
-    """A text is not what was written; the message says why."""
+    """A text is not a JSON object as `to_write` made it; the message states the reason."""
 
 
 def digest_of(entries: Mapping[str, object]) -> str:
-    """Return the SHA-256 of all entries except `digest`; their order does not matter."""
+    """Return the SHA-256 of all entries except `digest`, independent of their order."""
     kept = {name: value for name, value in entries.items() if name != "digest"}
     text = json.dumps(kept, sort_keys=True, separators=(",", ":"))
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 def to_write(entries: Mapping[str, object]) -> Entries:
-    """Return entries with their format and digest."""
+    """Return a JSON object with `entries`, the version number of the format, and their digest."""
     kept = {"format": FORMAT, **{k: v for k, v in entries.items() if k not in ("format", "digest")}}
     return {**kept, "digest": digest_of(kept)}
 
 
 def parse_object(text: bytes | str) -> Entries:
-    """Return the JSON object in a text; raise `JsonError` if there is none."""
+    """Parse a text as one JSON object; raise `JsonError` if it is anything else."""
     try:
         found = json.loads(text)
     except RecursionError:
@@ -52,7 +52,7 @@ def parse_object(text: bytes | str) -> Entries:
 
 
 def parse_written(text: bytes | str) -> Entries:
-    """Return entries that `to_write` returned; raise `JsonError` if the text was changed."""
+    """Parse a text written from `to_write`; raise `JsonError` if format or digest do not match."""
     entries = parse_object(text)
     if type(found := entries.get("format")) is not int or found != FORMAT:
         shown = "no format" if found is None else f"format {str(found)[:40]}"
@@ -67,15 +67,15 @@ def parse_written(text: bytes | str) -> Entries:
 
 
 def read_written(path: Path, name: str, what: str) -> Entries:
-    """Return the entries of a file that holds what `to_write` returned.
+    """Read a JSON file whose object `to_write` made, and return its entries.
 
     Args:
-        path: the file.
-        name: the caller's argument that holds the folder, for messages.
-        what: noun for the contents, such as "a run", for messages.
+        path: path of the file.
+        name: name of the caller's argument that holds the folder, for error messages.
+        what: noun for the contents, such as "a run", for error messages.
 
     Raises:
-        ArgumentError: the file is missing, of another format, or was changed.
+        ArgumentError: the file is missing, has another format, or was edited or damaged.
     """
     shown = repr(str(path.parent))
     try:

@@ -1,8 +1,8 @@
-"""The folder of a run: manifest, rows, table, figures and page.
+"""The folder of a run: manifest, rows, table, figures and HTML page.
 
-Files are written under another name and renamed when they are complete, so that a run which was
-killed at any moment can be resumed. One process writes at a time. It holds a lock on the file
-`.lock`, which the system releases when the process ends.
+Each file is written under a scratch name and renamed when it is complete. A run that was killed at
+any moment can therefore be resumed. Only one process writes to the folder at a time: it holds a
+lock on the file `.lock`, which the operating system releases when the process ends.
 """
 
 import contextlib
@@ -26,16 +26,16 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_write
 
 LOCK = ".lock"
-FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # numbers of rows in figures
-_TRIES, _BETWEEN = 20, 0.01  # attempts to take the lock, and the pause between them [s]
+FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # numbers of failed and of all rows that figures show
+_TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] pause between attempts
 
 
 class RunFolder:
-    """The folder of one run.
+    """The folder of one run, with methods that create, lock, read and write it.
 
     Args:
-        path: folder, which need not exist.
-        name: the caller's argument that holds the path, for messages.
+        path: path of the folder, which need not exist.
+        name: name of the caller's argument that holds the path, for error messages.
     """
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
@@ -47,7 +47,7 @@ class RunFolder:
         self._made: list[Path] = []
 
     def require_new(self) -> None:
-        """Raise `ArgumentError` unless a run can be written here; write nothing."""
+        """Raise `ArgumentError` unless a new run can be written to this path; write nothing."""
         try:
             if (self.path / LOCK).exists():
                 with self._hold_lock():
@@ -55,21 +55,21 @@ class RunFolder:
             if self.path.is_dir():
                 self._require_empty()
             ancestor = next(p for p in [self.path, *self.path.absolute().parents] if p.exists())
-        except OSError as error:  # for example, the name is too long
+        except OSError as error:  # for example because the path is too long
             raise self._unwritable(error) from None
         if not ancestor.is_dir() or not os.access(ancestor, os.W_OK | os.X_OK):
             raise self._unwritable()
 
     @contextlib.contextmanager
     def create(self, manifest: Entries) -> Iterator[None]:
-        """Create the folder with its first manifest, and hold its lock within the block.
+        """Create the folder, write the first manifest, and hold the lock within the `with` block.
 
         Raises:
             ArgumentError: the folder cannot be created, or is not empty.
         """
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
         with self.lock():
-            self._require_empty()  # another process may have written a run meanwhile
+            self._require_empty()  # another process may have written a run since `require_new`
             try:
                 self.write_manifest(manifest)
             except OSError as error:
@@ -79,7 +79,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Create the folder if it is missing, and hold its lock within the block.
+        """Create the folder if it is missing, and hold its lock within the `with` block.
 
         Raises:
             ArgumentError: another process holds the lock, or the folder cannot be written.
@@ -95,7 +95,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def _hold_lock(self) -> Iterator[None]:
-        """Hold the lock; its file names the process that holds it."""
+        """Hold the lock within the `with` block; the lock file contains this process's number."""
         with contextlib.ExitStack() as opened:
             try:
                 handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
@@ -110,9 +110,9 @@ class RunFolder:
             yield
 
     def _acquire(self, handle: int) -> None:
-        """Lock an open file.
+        """Lock an open file; raise `ArgumentError` if another process holds the lock for 0.2 s.
 
-        Retry for a moment: a process that only checks the folder holds the lock briefly.
+        A shorter wait is normal: a process that only checks the folder holds the lock briefly.
         """
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
@@ -129,9 +129,9 @@ class RunFolder:
         return ArgumentError(self.name, rule, shown=f"{str(self.path)!r}{why}")
 
     def _require_empty(self) -> None:
-        """Raise `ArgumentError` if the folder holds files.
+        """Raise `ArgumentError` if the folder holds files other than a lock and scratch files.
 
-        Files that a killed process leaves before its first manifest do not count.
+        A process that is killed before its first manifest is complete leaves such files.
         """
         if not all(path.name == LOCK or is_scratch(path) for path in self.path.iterdir()):
             rule = "a new or empty folder"
@@ -140,7 +140,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, str(self.path))
 
     def discard(self) -> None:
-        """Remove all files written since `create`, and the folders created for them."""
+        """Remove all files of the folder, and the folders that this object created."""
         for path in self.path.iterdir() if self.path.is_dir() else ():
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path, ignore_errors=True)
@@ -154,30 +154,30 @@ class RunFolder:
                 folder.rmdir()
 
     def _remove_scratch(self) -> None:
-        """Remove scratch files of a killed process."""
+        """Remove incomplete files that a killed process left behind."""
         for folder in (self.path, self.plans.folder, self.baselines.folder, self.figures):
             for path in folder.iterdir() if folder.is_dir() else ():
                 if is_scratch(path):
                     path.unlink(missing_ok=True)
 
     def read_manifest(self) -> Entries:
-        """Return the manifest; raise `ArgumentError` if it is missing or was changed."""
+        """Read the manifest; raise `ArgumentError` if it is missing, edited or damaged."""
         return read_written(self.path / MANIFEST, self.name, "a run")
 
     def write_manifest(self, manifest: Entries) -> Entries:
-        """Replace the manifest, and return it as it is written."""
+        """Replace the manifest, and return the JSON object that the file now holds."""
         text = json.dumps(to_write(manifest), indent=2, allow_nan=False)
         self.write_text(MANIFEST, text + "\n")
         return json.loads(text)
 
     def write_text(self, name: str, text: str) -> None:
-        """Write a file of the folder."""
+        """Write a text file atomically; `name` is its path within the folder."""
         with replacing(self.path / name) as scratch:
             scratch.write_text(text, encoding="utf-8")
 
     @contextlib.contextmanager
     def reading_rows(self) -> Iterator[None]:
-        """Raise `ArgumentError` if the block fails to read the rows of the run."""
+        """Convert errors of reading rows within the `with` block to `ArgumentError`."""
         errors = (pa.ArrowException, LookupError, OSError, TypeError, ValueError, ZeroDivisionError)
         try:
             yield
@@ -186,7 +186,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, shown=why) from None
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
-        """Raise `ArgumentError`, with a remedy, if a part of some rows is missing or damaged."""
+        """Raise `ArgumentError`, with advice `remedy`, unless files are sound with `num` rows."""
         for path, why in rows.damages(num).items():
             place = path.relative_to(self.path)
             rule = f"a run whose {place} is whole"
@@ -196,14 +196,14 @@ class RunFolder:
 
 @dataclasses.dataclass(frozen=True)
 class RunRows:
-    """Manifest and rows of a run, from which its figures are drawn."""
+    """What the figures of a finished run are drawn from: its manifest and its rows."""
 
     folder: RunFolder
     manifest: Entries
-    failures: list[Row]  # the first few rows that failed
+    failures: list[Row]  # the first rows whose plans the referee rejected
 
     def sample(self) -> list[Row]:
-        """Return evenly spaced rows of the run, with further failures if few are among them."""
+        """Return about 60 evenly spaced rows, and further failures up to 12 failures in total."""
         last = self.manifest["summary"]["num"] - 1
         spread = np.linspace(0, last, _CASES_SHOWN).astype(int).tolist()
         shown = self.folder.plans.pick(spread)
@@ -212,7 +212,7 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return planner and row of the run's example, then of other planners for this case."""
+        """Return all plans for the example case as (planner, row), the run's own plan first."""
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []

@@ -1,7 +1,7 @@
-"""Settings of a run, checked before anything is read, compiled or written.
+"""Settings of runs, which are checked before anything is read, compiled or written.
 
-Settings are frozen dataclasses; the options of the command line are made from their fields. Nothing
-here imports JAX.
+Settings are frozen dataclasses. The options of the command line are made from their fields. Nothing
+here imports JAX, so that the help of a command appears at once.
 """
 
 import dataclasses
@@ -22,61 +22,61 @@ from planner_jax.core.registry import Task, require_name
 
 AnySettings = TypeVar("AnySettings", bound="SweepSettings")
 KnownSettings = TypeVar("KnownSettings")
-Options = dict[str, Any]  # values by the names of their fields
+Options = dict[str, Any]  # keyword arguments: values by name
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
-    """Workers could not make a chunk of a run: "workers must RULE". The run can be resumed."""
+    """Worker processes could not plan a chunk of cases ("workers must ..."); resume the run."""
 
 
 def option(default: object, metavar: str, text: str) -> Any:
-    """Return a field of settings with its help text; a switch has no `metavar`."""
+    """Return a dataclass field with the help text of its option; a switch has `metavar` ""."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": text})
 
 
 def recovery_option(usual: str = NONE) -> str:
-    """Return the field `recovery` of the settings of a task of quadrotors."""
+    """Return the field `recovery` of settings: what the quadrotor does after its last contact."""
     words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return the options of a planner for the setting `recovery`; raise unless it is known."""
+    """Return a planner's keyword arguments for the setting `recovery`; raise if it is unknown."""
     require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
 
 def require_count(name: str, value: int | None, least: int, *, none: bool = False) -> None:
-    """Raise unless a value is a whole number >= `least`; None is accepted if `none` is set."""
+    """Raise unless a setting is a whole number >= `least`, or None where `none` is true."""
     if value is not None or not none:
         require_size(name, value, least)  # type: ignore[arg-type]
 
 
 @dataclasses.dataclass(frozen=True)
 class SweepSettings:
-    """Settings that the sweeps of all tasks have; the class of a task adds its own.
+    """Settings that the sweeps of all tasks have; a task's subclass adds further settings.
 
-    Together the settings decide every number of the rows of a run. A value that breaks its rule
+    Together the settings determine every number in the rows of a run. A value that breaks its rule
     raises `ArgumentError`.
     """
 
-    planner: str | None = option(None, "NAME", "")  # None selects the first of the task
-    suite: str | None = option(None, "NAME", "")  # None selects the first of the task
-    # None: `DEFAULT_NUM`, or all of a folder
+    planner: str | None = option(None, "NAME", "")  # None selects the task's first planner
+    suite: str | None = option(None, "NAME", "")  # None selects the task's first suite
+    # None selects `DEFAULT_NUM` drawn cases, or all cases of a folder if cases are read from files.
     num: int | None = option(None, "N", "number of cases")
     batch: int | None = option(
         None, "B", "cases planned, judged and written at once; bounds the memory"
     )
     seed: int = option(0, "K", "seed of the drawn cases")
 
-    RUN: ClassVar[str] = ""  # subclass of `Sweep`, "module:Class"; "" is `Sweep` itself
-    DEFAULT_NUM: ClassVar[int] = 1000
-    # Estimates of the memory of a case in a batch, and of the size of a row on the disk.
-    CASE_BYTES: ClassVar[int] = 20_000
-    ROW_BYTES: ClassVar[int] = 1_000
-    CPU_BATCH: ClassVar[int] = 1024
-    GPU_BATCH: ClassVar[int] = 65536
-    # Names of the fields that are options of the task's `planner`, `draw` and `judge`.
+    # The task's subclass of `Sweep` as "module:Class"; "" stands for `Sweep` itself.
+    RUN: ClassVar[str] = ""
+    DEFAULT_NUM: ClassVar[int] = 1000  # number of cases if the settings specify none
+    CASE_BYTES: ClassVar[int] = 20_000  # [bytes] estimated memory of one case of a batch
+    ROW_BYTES: ClassVar[int] = 1_000  # [bytes] estimated size of one row on the disk
+    CPU_BATCH: ClassVar[int] = 1024  # default number of cases in a batch on a CPU
+    GPU_BATCH: ClassVar[int] = 65536  # default number of cases in a batch on a GPU
+    # Names of the fields that are keyword arguments of the task's `planner`, `draw` and `judge`.
     PLANNER: ClassVar[tuple[str, ...]] = ()
     DRAW: ClassVar[tuple[str, ...]] = ()
     JUDGE: ClassVar[tuple[str, ...]] = ()
@@ -87,7 +87,7 @@ class SweepSettings:
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
-        """Return the settings with the task's planner and suite; None selects the first."""
+        """Return the settings with the task's first planner and suite in place of None."""
         planners, suites = task.all_planners(), task.all_suites()
         filled = dataclasses.replace(
             self,
@@ -100,27 +100,27 @@ class SweepSettings:
 
     @property
     def case_bytes(self) -> int:
-        """Memory [bytes] of one case of a batch while it is planned, judged and written."""
+        """Estimated memory [bytes] of one case of a batch while it is planned and judged."""
         return self.CASE_BYTES
 
     def require_disk_space(self, out: str | os.PathLike) -> None:
-        """Raise `ArgumentError` if the rows of the run do not fit on the disk of `out`."""
+        """Raise `ArgumentError` if the disk of the folder `out` has no space for all rows."""
         require_disk("num", self.num or self.DEFAULT_NUM, self.ROW_BYTES, out)
 
     def parameters(self) -> Options:
-        """Return the settings as plain values for `manifest.json`; the class accepts them again."""
+        """Return the settings as plain values for `manifest.json`, by the names of the fields."""
         return dataclasses.asdict(self)
 
     def planner_options(self) -> Options:
-        """Return the options of the planner that these settings decide."""
+        """Return the keyword arguments for the task's `planner` that follow from the settings."""
         return self._values(self.PLANNER)
 
     def draw_options(self) -> Options:
-        """Return the options of the task's `draw` that these settings decide, without None."""
+        """Return the keyword arguments for the task's `draw` that follow from the settings."""
         return {k: value for k, value in self._values(self.DRAW).items() if value is not None}
 
     def judge_options(self) -> Options:
-        """Return the options of the task's `judge` that these settings decide."""
+        """Return the keyword arguments for the task's `judge` that follow from the settings."""
         return self._values(self.JUDGE)
 
     def _values(self, names: tuple[str, ...]) -> Options:
@@ -128,10 +128,11 @@ class SweepSettings:
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the settings of a run that is resumed, after a check of the settings passed again.
+    """Return the settings of a run that is resumed, from the `parameters` in its manifest.
 
     Raises:
-        ArgumentError: a passed value differs from the run's, or these are not of `kind`.
+        ArgumentError: one of the settings `given` again by the user differs from the stored
+            setting, or the class `kind` does not accept the stored settings.
     """
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
@@ -144,10 +145,10 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
-    """Return the settings of a run; `name` is the argument that holds its folder.
+    """Return the settings of a run, of class `kind`, from the `parameters` in its manifest.
 
     Raises:
-        ArgumentError: the parameters do not fit the class, as another version wrote them.
+        ArgumentError: the class does not accept the settings, because another version wrote them.
     """
     try:
         return kind(**parameters)
@@ -157,7 +158,7 @@ def settings_of_manifest(
 
 
 def _difference(name: str, old: object, new: object) -> tuple[str, object, object]:
-    """Return name and both values of the first field in which two settings differ."""
+    """Return the dotted name and both values of the first field in which two values differ."""
     if dataclasses.is_dataclass(old) and dataclasses.is_dataclass(new) and type(old) is type(new):
         for field in dataclasses.fields(old):
             mine, other = vars(old)[field.name], vars(new)[field.name]

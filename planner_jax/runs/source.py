@@ -1,4 +1,4 @@
-"""Sources of the cases of a sweep, chunk by chunk."""
+"""Sources of the cases of a sweep, which yield the cases in chunks of one batch each."""
 
 import abc
 import dataclasses
@@ -14,16 +14,16 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 
-_MOST_PARTS = 10**6  # greatest number of files in the folder of a run
+_MOST_PARTS = 10**6  # greatest number of files of rows in the folder of a run, one for each chunk
 
 
 @dataclasses.dataclass(frozen=True)
 class Chunk:
-    """B consecutive cases of a sweep."""
+    """B consecutive cases of a sweep, which are planned, judged and stored together."""
 
-    index: np.ndarray  # (B,) int, indices in the sweep
-    cases: PyTree  # the task's pytree, NumPy leaves with leading axis B
-    origin: object = None  # data that the cases were made from, in some tasks
+    index: np.ndarray  # (B,) int, indices of the cases in the sweep
+    cases: PyTree  # cases of the task's class, NumPy leaves (B, ...)
+    origin: object = None  # data from which some tasks make their cases, such as serves
 
     def __len__(self) -> int:
         return len(self.index)
@@ -31,7 +31,7 @@ class Chunk:
 
 @dataclasses.dataclass(frozen=True)
 class Source(abc.ABC):
-    """The source of the cases of a sweep."""
+    """A source of the cases of a sweep; subclasses draw the cases or read them from files."""
 
     settings: SweepSettings  # settings of the sweep, with `num` and `batch` filled in
     num: int  # number of all cases
@@ -43,11 +43,11 @@ class Source(abc.ABC):
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
-        """Return the cases of one chunk, checked."""
+        """Return the cases of chunk `number`; raise `ArgumentError` if one breaks a rule."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
-        """Check one chunk before anything is written, and return its cases."""
+        """Draw and check the first chunk before a run writes any file, and return its cases."""
         return self.chunk(0).cases
 
     @abc.abstractmethod
@@ -61,12 +61,12 @@ class Source(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class DrawnSource(Source):
-    """The cases of a suite, drawn chunk by chunk."""
+    """A source that draws the cases of one of the task's suites, chunk by chunk, from a seed."""
 
     task: Task
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases `first` to `last - 1`."""
+        """Draw the cases with indices `first` to `last - 1` of the suite."""
         settings = self.settings
         drawn = self.task.draw(
             last - first, settings.suite, settings.seed, first=first, **settings.draw_options()
@@ -74,7 +74,7 @@ class DrawnSource(Source):
         return Chunk(index=np.arange(first, last), cases=jax.tree.map(np.asarray, drawn))
 
     def description(self) -> Entries:
-        """Return the suite, and a digest of the numbers of the first chunk."""
+        """Return the suite's name and the SHA-256 of the first chunk's cases, for the manifest."""
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(self.chunk(0).cases):
             digest.update(np.ascontiguousarray(leaf).tobytes())
@@ -82,7 +82,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return the fields of a `Source`; `num` and `batch` are defaults of the settings.
+    """Return the fields of a `Source`; `num` and `batch` replace settings that are None.
 
     Raises:
         ArgumentError: the cases of a chunk do not fit into memory, or there are too many chunks.

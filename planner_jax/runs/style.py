@@ -1,4 +1,4 @@
-"""One style for all figures, in the colours of Okabe and Ito for colour-blind readers."""
+"""One style for all figures, in Okabe and Ito's colours, which colour-blind people distinguish."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -32,7 +32,7 @@ PLANNER_COLOURS = {
     "constant": SKY,
 }
 
-Look: TypeAlias = dict[str, Any]  # keyword arguments of Matplotlib
+Look: TypeAlias = dict[str, Any]  # keyword arguments of Matplotlib's drawing functions
 
 _STYLE: "dict[RcKeyType, object]" = {
     "font.size": 10.0,
@@ -58,13 +58,13 @@ _STYLE: "dict[RcKeyType, object]" = {
 
 
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
-    """Draw one figure and write it as PNG.
+    """Draw one figure in the common style and write it atomically as a PNG file.
 
     Args:
-        path: file to write.
-        figure: function that draws into an empty figure, called with the figure and the data.
-        size: (width, height) [inch].
-        *data: arguments of `figure`.
+        path: path of the file.
+        figure: function that draws into an empty figure, called as `figure(canvas, *data)`.
+        size: (width, height) [inch] of the figure.
+        *data: further arguments of `figure`.
     """
     with matplotlib.rc_context(_STYLE):
         canvas = Figure(figsize=size)
@@ -75,7 +75,7 @@ def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *da
 
 
 def label(axes: Axes, x: str, y: str, title: str = "") -> None:
-    """Set the labels of both axes, with units, and the title."""
+    """Set the labels of the x and y axis, and the title of a panel."""
     axes.set_xlabel(x)
     axes.set_ylabel(y)
     axes.set_title(title)

@@ -1,4 +1,4 @@
-"""Success rates of a sweep, counted from the rows that were written."""
+"""Success rates and other counts of a sweep, computed from its stored rows."""
 
 from collections import Counter
 from typing import ClassVar
@@ -11,11 +11,11 @@ from planner_jax.runs.manifest import Entries
 
 
 def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """Return the 95 % Wilson interval of a success rate.
+    """Return the 95 % Wilson confidence interval of a success rate.
 
     Args:
         successes: number of successful trials.
-        num: number of trials; the interval of no trial is (0, 1).
+        num: number of trials; without any trial the interval is (0, 1).
     """
     if num == 0:
         return 0.0, 1.0
@@ -24,21 +24,21 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
 
 
 def percent(successes: int, num: int) -> str:
-    """Return a success rate in percent with two decimals; 100 and 0 only if exact."""
+    """Return a rate in percent, as "100.00" or "0.00" only if all or no trials succeed."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)
     return f"{rate:.2f}"
 
 
-# Columns that every tally reads.
+# Columns of the rows that every subclass of `Tally` reads.
 COUNTED = ("index", "success", "status", "failed_limit")
 
 
 class Tally:
-    """Counts over the rows of a sweep; memory does not grow with the number of rows."""
+    """Counts over the rows of a sweep, to which the rows are added one table after another."""
 
-    READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all
+    READS: ClassVar[tuple[str, ...]] = ()  # columns that are read; () stands for all columns
     MEANS: ClassVar[tuple[str, ...]] = ()  # columns whose mean over the successes is reported
 
     def __init__(self) -> None:
@@ -46,12 +46,12 @@ class Tally:
         self.successes = 0
         self.status: Counter[str] = Counter()
         self.failed_limits: Counter[str] = Counter()
-        self.example = 0  # index of the case that the figure of one plan shows
+        self.example = 0  # index of the case whose plan the report's figures show
         self._example_rank: int | None = None
         self._sums = dict.fromkeys(self.MEANS, 0.0)
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Add some rows of the run to the counts."""
         success = rows["success"].to_numpy().astype(bool)
         self.num += len(success)
         self.successes += int(success.sum())
@@ -66,11 +66,11 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of the rows that may serve as example, the preferred ones first."""
+        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:
-        """Return success rates from 0 to 1, and means over the successes, None without any."""
+        """Return success rate, counts, and means over successes (None if no plan is a success)."""
         num = self.successes
         means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
         return {

@@ -1,4 +1,4 @@
-"""The table of a run as text, Markdown and HTML, and its headline."""
+"""The table of success rates in a report, as text, Markdown and HTML, and the report's headline."""
 
 import html
 from collections.abc import Sequence
@@ -9,16 +9,16 @@ from planner_jax.runs.summary import percent, wilson_interval
 
 
 class RateTable(NamedTuple):
-    """Cells of a table as text."""
+    """A table of success rates whose cells are text."""
 
     title: str
-    header: list[str]
+    header: list[str]  # headings of the columns
     rows: list[list[str]]
-    strong: int | None = None  # index of the highlighted row
+    strong: int | None = None  # index of the row that is set in bold
 
 
 def rate_cells(successes: int, num: int) -> list[str]:
-    """Return number of cases, success rate [%] and its interval [%] as cells."""
+    """Return three cells: number of cases, success rate [%], and its 95 % Wilson interval [%]."""
     low, high = wilson_interval(successes, num)
     return [
         f"{num:,}",
@@ -28,7 +28,7 @@ def rate_cells(successes: int, num: int) -> list[str]:
 
 
 def align(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return lines of cells; the first column is aligned to the left, others to the right."""
+    """Return a line of text for each row, with the first column flush left, the others right."""
     first, *widths = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [
         "  ".join([row[0].ljust(first), *map(str.rjust, row[1:], widths)]).rstrip() for row in rows
@@ -36,7 +36,7 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
-    """Return sentences on success, findings of the task, speed and failures of a run."""
+    """Return the sentences at the head of a report: success, `findings`, speed and failures."""
     summary, times = manifest["summary"], manifest["times"]
     settings, device = manifest["parameters"], manifest["device"]
     low, high = summary["wilson_95"]
@@ -57,7 +57,7 @@ def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
 
 
 def to_markdown(title: str, lines: Sequence[str], table: RateTable, remarks: Sequence[str]) -> str:
-    """Return the contents of `table.md`."""
+    """Return the Markdown text of `table.md`: title, headline, table and remarks."""
     text = [f"# {title}", "", *(line + "  " for line in lines), ""]
     text += [_bars(table.header), _bars(["---"] + ["---:"] * (len(table.header) - 1))]
     for index, row in enumerate(table.rows):
@@ -72,7 +72,7 @@ def _bars(cells: Sequence[str]) -> str:
 
 
 def to_html(table: RateTable) -> str:
-    """Return the table as HTML, without its title."""
+    """Return the HTML element of a table, without the table's title."""
     rows = [_html_row(table.header, "th")]
     for index, row in enumerate(table.rows):
         rows.append(_html_row(row, "td", " class=strong" if index == table.strong else ""))

@@ -1,4 +1,4 @@
-"""Time measurements of a sweep: seconds of compilation, and seconds of planning without it."""
+"""Time measurements that separate JAX's compilation from the computation itself."""
 
 import time
 from collections.abc import Callable
@@ -12,16 +12,17 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
-# Events of tracing, lowering and compilation, which includes reading the compile cache. Inner
-# functions are traced within outer functions, so that time spans are joined, not added.
+# Prefix of JAX's events of tracing, lowering and compiling, which includes reading the compile
+# cache. Inner functions are traced within outer functions, so that the time spans of events
+# overlap. Their union is measured, because their sum would count the overlaps twice.
 _COMPILING = "/jax/core/compile/"
-_WARM_CALLS = 3  # greatest number of calls until nothing is compiled
+_WARM_CALLS = 3  # greatest number of calls by which `measure_warm` tries to avoid compilation
 
 ResultT = TypeVar("ResultT")
 
 
 class CompileClock:
-    """Seconds in which JAX traced, lowered or compiled within the block, in any thread."""
+    """A clock of JAX's tracing, lowering and compilation within a `with` block, in any thread."""
 
     def __init__(self) -> None:
         self._spans: list[tuple[float, float]] = []
@@ -40,7 +41,7 @@ class CompileClock:
 
     @property
     def seconds(self) -> float:
-        """Length [s] of the union of all time spans so far."""
+        """Time [s] spent on compilation so far: the length of the union of all time spans."""
         total, reached = 0.0, 0.0
         for start, end in sorted(self._spans):
             total += max(end - max(start, reached), 0.0)
@@ -54,7 +55,7 @@ class CompileClock:
 
     @property
     def compiled(self) -> bool:
-        """True if the call compiled a program."""
+        """True if JAX traced, lowered or compiled anything within the block so far."""
         return bool(self._spans)
 
 
@@ -71,7 +72,7 @@ class Stopwatch:
 
 
 def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
-    """Return the result of a call, its seconds, and whether nothing was compiled meanwhile."""
+    """Return a call's result, its duration [s], and True if JAX compiled nothing meanwhile."""
     watch = Stopwatch()
     with CompileClock() as clock:
         found = call()
@@ -79,9 +80,10 @@ def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
 
 
 def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
-    """Return the result of a call, and its seconds when nothing is compiled.
+    """Return a call's result and its duration [s] without compilation.
 
-    The seconds include compilation if every call compiles something.
+    The call is repeated up to three times until JAX compiles nothing. If every call compiles, the
+    duration includes compilation.
     """
     for _ in range(_WARM_CALLS - 1):
         found, seconds, warm = measure(call)
@@ -91,7 +93,7 @@ def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
 
 
 def measure_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
-    """Return plans of cases (B,), made one after another, and their warm seconds (B,)."""
+    """Plan B cases one after another; return plans and durations (B,) [s] without compilation."""
     num = jax.tree.leaves(cases)[0].shape[0]
     timed_each = [measure_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)

@@ -41,7 +41,7 @@ class BlockTally(Tally):
         self._study.add(rows)
 
     def summary(self) -> Entries:
-        """Return rates and means; with a camera errors [m] of flight fits, or planning times [s]."""
+        """Return rates and means, and errors [m] of flight fits or planning times [s] if stored."""
         return super().summary() | self._study.summary()
 
 
