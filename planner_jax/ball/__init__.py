@@ -1,1 +1,1 @@
-"""The ball: flight, impact, prediction and estimation."""
+"""Models of the ball: flight with drag, impact on a racket, prediction and state estimation."""

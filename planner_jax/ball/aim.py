@@ -1,7 +1,7 @@
-"""The velocity that takes a ball to a target in a specified time, and the apex of its flight.
+"""The initial velocity with which a ball reaches a target in a specified time, and its apex.
 
-Derivatives are computed in forward mode, and reverse mode only multiplies by them. Otherwise
-reverse mode would go back through every step of a flight for the derivatives of a few numbers.
+The planner of hits computes the ball's return with this module. Custom derivative rules use forward
+mode, since a flight has few inputs: reverse mode would store and retrace every integration step.
 Shapes and units are as in `ball.flight`.
 """
 
@@ -15,25 +15,32 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 from planner_jax.core.arithmetic import reciprocal
 
-_FLIGHT_STEPS = 10  # error of the landing of a 2 s flight: 0.2 mm
-_COARSE_STEPS = 8  # enough for derivatives; fewer diverge for strong drag
+# Runge-Kutta steps of a flight; the landing point of a 2 s flight then has an error of 0.2 mm.
+_FLIGHT_STEPS = 10
+# Runge-Kutta steps of the coarse flight that gives Newton's method its first Jacobians. With fewer
+# steps the computation diverges for strong drag.
+_COARSE_STEPS = 8
 
 Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
-    """Return the velocity of a drag-free ball that reaches a target after a time > 0."""
+    """Return the initial velocity (3,) with which a drag-free ball reaches a target.
+
+    The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s].
+    """
     return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
 
 def aim_with_drag(
     pos: Array, target: Array, flight_time: Array, drag: Array, gravity: Array
 ) -> Array:
-    """Return the velocity of a ball with quadratic drag that reaches a target after a time > 0.
+    """Return the initial velocity with which a ball with quadratic drag reaches a target.
 
-    Newton's method starts from the drag-free velocity. Two steps integrate a coarse flight, and two
-    further steps integrate a fine flight with the last Jacobian. The root is differentiated by the
-    implicit function theorem.
+    The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s]. Newton's method starts
+    from the drag-free velocity. Two steps integrate the flight coarsely with its Jacobian, and two
+    more steps integrate it finely and reuse the last Jacobian. The implicit function theorem gives
+    the derivatives of the result.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 
@@ -51,7 +58,7 @@ def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -
         slope, end = jax.jacfwd(landing, has_aux=True)(vel)
         return vel - _solve3(slope, end - displacement), slope
 
-    # Loops reduce the compiled program of an optimiser to a third of its size.
+    # Loops instead of unrolled steps reduce an optimiser's compiled program to a third of its size.
     start = aim_drag_free(jnp.zeros_like(displacement), displacement, flight_time, gravity)
     vel, slope = lax.fori_loop(0, 2, newton_step, (start, jnp.eye(3, dtype=start.dtype)))
 
@@ -74,7 +81,7 @@ def _aim_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Arr
 
 
 def _changing(tangents: Sequence[Tangent]) -> list[int]:
-    """Return the indices of arguments with a tangent."""
+    """Return the indices of the arguments whose tangent is not symbolically zero."""
     return [k for k, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
 
 
@@ -84,30 +91,30 @@ _aim.defjvp(_aim_jvp, symbolic_zeros=True)
 def _displacement(
     vel: Array, flight_time: Array, drag: Array, gravity: Array, num_steps: int = _FLIGHT_STEPS
 ) -> Array:
-    """Return the displacement (3,) [m] of a ball after a flight."""
+    """Return the displacement (3,) [m] of a ball with quadratic drag after `flight_time` [s]."""
     ball = BallState(pos=jnp.zeros_like(vel), vel=vel)
     return fly(ball, flight_time, drag, gravity, num_steps=num_steps)[0].pos
 
 
 def _solve3(matrix: Array, rhs: Array) -> Array:
-    """Solve a 3 x 3 system by Cramer's rule, which needs no LAPACK call for each lane."""
+    """Solve a 3 x 3 linear system by Cramer's rule, so that a batch needs no LAPACK calls."""
     a, b, c = matrix[:, 0], matrix[:, 1], matrix[:, 2]
     bc, ca, ab = jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)
     return jnp.stack([jnp.sum(bc * rhs), jnp.sum(ca * rhs), jnp.sum(ab * rhs)]) / jnp.sum(a * bc)
 
 
 def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Return the greatest height [m] of a ball with quadratic drag within `flight_time`.
+    """Return the greatest height [m] of a ball with quadratic drag within `flight_time` [s].
 
-    After the last step at which the ball rises, the remaining climb is approximated by
-    v_z^2 / (2 (g + 2/3 K_D |v| v_z)). A falling ball is highest at time 0.
+    The flight is integrated in steps. From the last step that starts with v_z > 0, the remaining
+    climb is approximated by v_z^2 / (2 (g + 2/3 K_D |v| v_z)). A falling ball is highest at time 0.
     """
     numbers = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
     return ball.pos[2] + _climb(ball.vel, *numbers)
 
 
 def _compute_climb(vel: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Return `apex_with_drag` relative to the initial height [m]."""
+    """Compute the apex of `apex_with_drag` as a height [m] above the ball's initial position."""
     now = BallState(pos=jnp.zeros_like(vel), vel=vel)
     _, path = fly(now, flight_time, drag, gravity, num_steps=_FLIGHT_STEPS)
     height = jnp.concatenate([now.pos[None, 2], path.pos[:-1, 2]])

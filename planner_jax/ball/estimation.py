@@ -1,4 +1,6 @@
-"""Extended Kalman filter of a ball's state [Yu2023bat, eq. 5; Yu2023catch, Section V-A].
+"""Extended Kalman filter for a ball's position and velocity.
+
+It follows [Yu2023bat, eq. 5] and [Yu2023catch, Section V-A].
 
 World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
 """
@@ -13,35 +15,37 @@ from jaxtyping import Float
 
 from planner_jax.ball.flight import BallState, linear_drag_flight
 
-# (ball, duration, drag, gravity) -> ball: `linear_drag_flight` or `rk4_step`.
+# A flight model: a function (ball, duration, drag, gravity) -> ball after the duration, such as
+# `linear_drag_flight` or `rk4_step`.
 Flight = Callable[[BallState, Array, Array, Array], BallState]
 
 
 @struct.dataclass
 class EkfModel:
-    """Parameters of flight and sensor."""
+    """Parameters of the filter's flight model and of its position sensor."""
 
     drag: Array  # (3,) K_i [1/s] for `linear_drag_flight`, () K_D [1/m] for `rk4_step`
     gravity: Array  # () [m/s^2], magnitude
-    acceleration_density: Array  # () [m^2/s^3], power density of accelerations not modelled
+    # () [m^2/s^3], power spectral density of the process noise, a white acceleration.
+    acceleration_density: Array
     observation_std: Array  # () or (3,) [m], standard deviation of an observed position
 
 
 @struct.dataclass
 class EkfState:
-    """A Gaussian belief about position (first three) and velocity (last three) of the ball."""
+    """A Gaussian belief about the ball's position (first three entries) and velocity."""
 
     mean: Array  # (6,) [m, m/s]
     covariance: Array  # (6, 6)
 
     @property
     def ball(self) -> BallState:
-        """Mean of the belief as a ball, leaves (..., 3)."""
+        """Mean of the belief as a ball, whose position and velocity are (..., 3)."""
         return BallState(pos=self.mean[..., :3], vel=self.mean[..., 3:])
 
 
 def _congruence(A: Array, P: Array) -> Array:
-    """Return A P A' at full precision on every device, exactly symmetric."""
+    """Return A P A', made exactly symmetric; accelerators may not reduce the precision."""
     full = jnp.einsum("ij,jk,lk->il", A, P, A, precision=lax.Precision.HIGHEST)
     return 0.5 * (full + full.T)
 
@@ -49,7 +53,7 @@ def _congruence(A: Array, P: Array) -> Array:
 def solve_definite(A: Array, B: Array) -> Array:
     """Solve A X = B for X (m, n), with a small symmetric positive definite A (m, m).
 
-    Gaussian elimination without pivoting is unrolled, so that many lanes need no library calls.
+    Gaussian elimination without pivoting is unrolled, so that a batch of systems needs no LAPACK.
     """
     U, X = list(A), list(B)
     size = len(U)
@@ -71,9 +75,9 @@ def ekf_init(
         pos: (3,) [m].
         vel: (3,) [m/s].
         pos_std: () or (3,) [m], standard deviation of each coordinate; it may be large.
-        vel_std: () or (3,) [m/s]. In float32 keep vel_std times the time between observations
-            below 1000 times the standard deviation of an observation: at 3000 rounding destroys
-            the covariance after the second observation.
+        vel_std: () or (3,) [m/s], standard deviation of each coordinate. In float32 keep vel_std
+            times the time between observations below 1000 times the standard deviation of an
+            observation. At a factor of 3000 rounding destroys the covariance.
     """
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
@@ -84,10 +88,10 @@ def ekf_predict(
 ) -> EkfState:
     """Predict the belief after `duration` [s] >= 0 without an observation.
 
-    The covariance becomes F P F' + Q, with the Jacobian F of the flight and the integral Q of a
-    white acceleration over the duration. With `linear_drag_flight` this is [Yu2023catch, eq. 10],
-    except that the paper advances the position by v dt only. With `rk4_step` the duration is one
-    Runge-Kutta step.
+    The covariance P becomes F P F' + Q. F is the Jacobian of the flight, and Q the covariance that
+    a white acceleration causes during `duration`. With `linear_drag_flight` this is
+    [Yu2023catch, eq. 10], except that the paper advances the position by v dt only. With `rk4_step`
+    the whole duration is one Runge-Kutta step.
     """
 
     def transition(mean: Array) -> Array:
@@ -103,12 +107,11 @@ def ekf_predict(
 
 
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
-    """Update the belief with an observed position, s + K_a (Z - H s) [Yu2023bat, eq. 5].
+    """Update the belief with an observed position Z (3,) [m] [Yu2023bat, eq. 5].
 
-    H = [I 0]. The covariance has Joseph's form, which stays positive definite in float32 even if a
-    wide prior meets a precise observation.
-
-    Of the model only `observation_std` is used. If a coordinate of the observation Z (3,) [m] is
+    The mean s becomes s + K_a (Z - H s), with H = [I 0] and the Kalman gain K_a. Joseph's form of
+    the covariance stays positive definite in float32, even if a wide prior meets a precise
+    observation. Only `observation_std` of the model is used. If a coordinate of the observation is
     not finite, the belief is returned unchanged.
     """
     observed = jnp.all(jnp.isfinite(observation))

@@ -24,7 +24,7 @@ Vector = TypeVar("Vector", Array, tuple[Array, Array, Array])
 
 @struct.dataclass
 class BallState:
-    """A ball at one instant, world frame, z up."""
+    """Position and velocity of a ball at one instant, in the world frame with z up."""
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
@@ -53,13 +53,13 @@ def gravity_vector(gravity: Array) -> Array:
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     """Return the acceleration g - K_D |v| v [m/s^2] of a ball in flight [Yu2023bat, eq. 2].
 
-    The velocity may be a tuple of its components, as the result is then. The gradient is finite for
-    zero velocity.
+    If the velocity is a tuple of its three components, the result is a tuple too. The gradient is
+    finite for zero velocity.
     """
     x, y, z = components(vel)
     speed_squared = x * x + y * y + z * z
     moving = speed_squared > 0.0
-    # The inner where keeps the gradient of sqrt finite for zero velocity.
+    # sqrt has no finite gradient at zero. The inner `where` replaces a zero argument by 1.
     speed = jnp.where(moving, jnp.sqrt(jnp.where(moving, speed_squared, 1.0)), 0.0)
     braking = -drag * speed
     acc: PyTree = (braking * x, braking * y, braking * z - gravity)
@@ -69,9 +69,10 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """Advance the ball by one Runge-Kutta step of order 4; a negative duration [s] steps back.
+    """Advance a ball with quadratic drag by one Runge-Kutta step of order 4.
 
-    The vectors of the ball may be arrays, or tuples of their components.
+    A negative duration [s] goes back in time. The vectors of the ball may be arrays, or tuples of
+    their components.
     """
 
     def rate(state: BallState) -> BallState:
@@ -96,8 +97,8 @@ def fly(
     """Integrate the flight of a ball with quadratic drag.
 
     Args:
-        ball: one ball.
-        duration: () [s], of either sign.
+        ball: position and velocity at the start.
+        duration: () [s]; a negative duration goes back in time.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
         num_steps: number of equal Runge-Kutta steps.
@@ -121,7 +122,7 @@ def fly(
 
 
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """Return the ball after a flight with drag -K_i v_i on each axis, in closed form.
+    """Return the ball after a flight with drag acceleration -K_i v_i on each axis i.
 
     [Yu2023bat, eq. 4a], with the constant that is missing in the paper:
     s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K on each axis, with signed g. The result is
@@ -139,8 +140,8 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
 def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
 
-    The direct form of phi_2 suffers from cancellation, so for |x| < 1/2 a series of thirteen terms
-    replaces it. Each branch has an input for which its gradient is finite.
+    For |x| < 1/2 a series of thirteen terms replaces the formula of phi_2, which suffers from
+    cancellation. The branch that is not selected gets an input with a finite gradient.
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
@@ -151,7 +152,7 @@ def _phi(x: Array) -> tuple[Array, Array]:
 
 
 def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallState:
-    """Return the ball after a free fall [Natarajan2024, eqs 5 to 7]."""
+    """Return the ball after `duration` [s] of flight without drag [Natarajan2024, eqs 5 to 7]."""
     g = gravity_vector(gravity)
     return BallState(
         pos=ball.pos + ball.vel * duration + 0.5 * g * duration**2, vel=ball.vel + g * duration
@@ -161,7 +162,7 @@ def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallSt
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:
     """Return the greatest future height [m] of a drag-free ball [Yu2023bat, eq. 22].
 
-    It is z + v_z^2 / (2 g) for a rising ball, and z for a falling one; the paper omits z.
+    The height is z + v_z^2 / (2 g) for a rising ball, and z for a falling ball. The paper omits z.
     """
     return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
 
@@ -174,7 +175,7 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
     """
     discriminant = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - height)
     real = discriminant > 0.0
-    # The inner where keeps the gradient of sqrt finite where the ball never reaches the plane.
+    # The inner `where` keeps the gradient of sqrt finite if the ball never reaches the plane.
     time = (ball.vel[2] + jnp.sqrt(jnp.where(real, discriminant, 1.0))) / gravity
     reached = real & (time > 0.0)
     return jnp.where(reached, time, 0.0), reached
@@ -196,10 +197,10 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
 
 
 def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:
-    """Return the racket's normal and normal speed for a change of the ball's velocity.
+    """Return the racket's unit normal (3,) and its speed () along the normal for a desired bounce.
 
-    [Yu2023bat, eqs 11 and 12]; the normal points along v+ - v-, and is reversed in the paper. The
-    two velocities must differ. Returns the unit normal (3,), and the racket's speed () along it.
+    The bounce changes the ball's velocity from v- to v+, which must differ [Yu2023bat, eqs 11 and
+    12]. The normal points along v+ - v-. In the paper it has the opposite sign.
     """
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)

@@ -1,7 +1,7 @@
-"""Prediction of the ball: a table of integrated states, interpolated by cubic convolution.
+"""Prediction of a ball's flight: a table of integrated states, interpolated between its nodes.
 
-[Yu2023bat, Section III-C, eqs 8 to 10] integrates the flight once into a table. Keys' kernel
-(a = -1/2) [Keys1981] interpolates it at any time with a continuous gradient.
+The flight is integrated once into a table [Yu2023bat, Section III-C, eqs 8 to 10]. Cubic
+convolution [Keys1981] with a = -1/2 interpolates at any time, with a continuous gradient.
 """
 
 import functools
@@ -21,7 +21,7 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.rules import NOT_NEGATIVE, POSITIVE, Field, Table
 from planner_jax.lanes import with_kernel
 
-LEAST_NODES = 5  # of a table
+LEAST_NODES = 5  # least number of nodes of a table
 
 
 @struct.dataclass
@@ -42,15 +42,17 @@ class PathTable:
 def predict_path(
     ball: BallState, horizon: Array, drag: Array, gravity: Array, *, num_nodes: int
 ) -> PathTable:
-    """Integrate the flight of a ball with quadratic drag, one Runge-Kutta step a node.
+    """Integrate the flight of a ball with quadratic drag into a table of states.
+
+    There is one Runge-Kutta step of order 4 between neighbouring nodes.
 
     Args:
         ball: the ball at time 0.
         horizon: () [s], last time of the prediction.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
-        num_nodes: N >= 5. One node is before time 0 and one after the horizon, because the kernel
-            reads two nodes on each side.
+        num_nodes: N >= 5. One node is before time 0 and one node after the horizon, because the
+            interpolation at a time uses two nodes before and two nodes after that time.
 
     Raises:
         ValueError: an argument has a wrong shape or, unless it is a JAX array, is out of range.
@@ -68,10 +70,11 @@ def predict_path(
 
 @functools.cache
 def _node_function(num_nodes: int) -> Callable:
-    """Build the function of positions and velocities (N, 3) at the nodes, with a kernel for lanes.
+    """Build the function that integrates positions and velocities (N, 3) at the nodes of a table.
 
-    It is differentiated in forward mode together with the flight, also inside reverse mode: there
-    are few inputs, and no intermediate states need to be stored.
+    A batch of balls runs in a GPU kernel where one fits (`ball.prediction_kernel`). Derivatives are
+    computed in forward mode, also inside reverse mode: there are few inputs, and no intermediate
+    states need to be stored.
     """
 
     def integrate(
@@ -94,7 +97,7 @@ def _node_function(num_nodes: int) -> Callable:
 
     @functools.cache
     def slopes(moving: tuple[int, ...]) -> Callable:
-        """Build the function of derivatives of positions and velocities by some arguments."""
+        """Build the function that differentiates the nodes by the arguments at indices `moving`."""
         derivatives = jax.jacfwd(integrate, argnums=moving)
         return with_kernel(derivatives, path, num_nodes, moving)
 
@@ -118,14 +121,15 @@ def _node_function(num_nodes: int) -> Callable:
 
 
 def horizon_of(table: PathTable) -> Array:
-    """Return the last time [s] of the table; the first is 0."""
+    """Return the last time [s] that the table covers; the first covered time is 0."""
     return table.resolution * (table.pos.shape[0] - 3)
 
 
 def convolution_weights(u: Array) -> Array:
-    """Return Keys' weights (4,) of the nodes around a point [Yu2023bat, eqs 8 and 10b].
+    """Return the weights (4,) of Keys' cubic convolution kernel [Yu2023bat, eqs 8 and 10b].
 
-    The point is at a fraction `u` () from 0 to 1 between the second and the third node.
+    They multiply the four nodes around a point at the fraction `u` (), from 0 to 1, between the
+    second and the third of these nodes.
     """
     far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
     near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731
@@ -136,7 +140,7 @@ def target_at(table: PathTable, time: Array) -> BallState:
     """Return the state of the target at one time () [s], with a continuous gradient in time.
 
     In [0, horizon] position and velocity are cubic convolutions of the N nodes [Yu2023bat, eq. 9].
-    Outside, the target continues at the velocity at the nearer end.
+    Outside this interval the target keeps its velocity at the nearer end.
     """
     require_kind("table", table, PathTable)
     require_scalar("time", time)

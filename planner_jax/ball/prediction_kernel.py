@@ -1,8 +1,8 @@
-"""A CUDA kernel that integrates the flights of many balls into tables.
+"""A GPU kernel that integrates the flights of a batch of balls into tables.
 
-Steps of a flight depend on each other. As separate operations they take about three hundred kernel
-launches, which dominate the time of a small batch. In this kernel one thread integrates one ball,
-and the requested derivatives with it.
+The steps of a flight must be computed one after the other. As separate XLA operations they take
+about three hundred kernel launches, which dominate the time of a small batch. In this Pallas kernel
+each thread integrates one ball, together with the requested derivatives. `ball.prediction` uses it.
 """
 
 import dataclasses
@@ -19,21 +19,22 @@ from planner_jax.ball.flight import BallState, rk4_step
 from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
-_THREADS = 32  # lanes of a block
-_VEL = 1  # index of the velocity among the arguments; resolution, drag and gravity follow
+_THREADS = 32  # greatest number of threads (balls) in one GPU block
+# Index of the velocity among the arguments: position, velocity, resolution, drag, gravity.
+_VEL = 1
 
 
 def table_kernel(
     num_nodes: int, moving: tuple[int, ...] = (), *, interpret: bool = False
 ) -> Callable:
-    """Build the kernel of the states at the nodes of a `PathTable`.
+    """Build the GPU kernel that computes the states at the nodes of a `PathTable`.
 
     Args:
-        num_nodes: N.
-        moving: indices of arguments, except the position. If there are any, the kernel returns
+        num_nodes: number N of nodes.
+        moving: indices of arguments other than the position. If there are any, the kernel returns
             derivatives by these arguments instead of states: derivatives of the positions, then of
             the velocities, each (N, 3), or (N, 3, 3) by the velocity.
-        interpret: run without a GPU, for tests.
+        interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
@@ -51,10 +52,12 @@ def table_kernel(
 
 @dataclasses.dataclass(frozen=True)
 class _Direction:
-    """One number by which the states are differentiated."""
+    """One scalar input by which the states at the nodes are differentiated."""
 
-    result: int  # index of the result for positions; results for velocities follow all of these
-    index: tuple[int, ...]  # in that result, behind node and axis
+    # Index of the result with the positions' derivatives. All results for positions come before
+    # the results for velocities.
+    result: int
+    index: tuple[int, ...]  # index in this result, after the indices of node and axis
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
     numbers: tuple[float, ...]  # (3,) tangent of resolution, drag and gravity
 
@@ -75,7 +78,7 @@ def _directions(moving: tuple[int, ...]) -> list[_Direction]:
 def _call(
     num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
 ) -> Callable:
-    """Build the kernel for tables of `num_nodes` on `lanes` lanes."""
+    """Build the kernel for `lanes` tables of `num_nodes` nodes, with `threads` threads a block."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities

@@ -1,4 +1,4 @@
-"""Target paths from a user's table of positions: recorded, simulated, or sent by a tracker."""
+"""Target paths from a user's table of positions, such as recorded or simulated motions."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -16,8 +16,9 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
-MOST_NODES = 4096  # of an automatic choice
-_CHECKED = (0.2, 0.5, 0.8)  # fractions between two nodes at which the error is measured
+MOST_NODES = 4096  # greatest number of nodes that `table_path` chooses by itself
+# Fractions of the time between two nodes at which the interpolation error is measured.
+_CHECKED = (0.2, 0.5, 0.8)
 
 
 def table_path(
@@ -29,27 +30,27 @@ def table_path(
     error: float = 1e-3,
     dtype: DTypeLike = jnp.float32,
 ) -> PathTable:
-    """Return the path through positions at times that need not be evenly spaced.
+    """Return a target path through positions at times that need not be evenly spaced.
 
-    Positions are interpolated by the cubic spline with continuous acceleration, or by the cubic
-    Hermite spline if velocities are passed. For a smooth flight with times at most d apart, the
-    error of the position is O(d^4), and the error of the velocity is O(d^3). Noisy observations
-    should be smoothed before.
+    A cubic spline with continuous acceleration interpolates the positions, or a cubic Hermite
+    spline if velocities are passed. For a smooth flight with times at most d apart, the error of
+    the position is O(d^4), and the error of the velocity is O(d^3). Noisy observations should be
+    smoothed before.
 
-    Planner and referee interpolate a table with equal steps by cubic convolution. By default the
-    table has enough nodes to approximate the spline's position to `error`, and its velocity to ten
-    times `error` per second.
+    The result is a table of the spline with equal time steps, between which planner and referee
+    interpolate by cubic convolution. By default the table has enough nodes to approximate the
+    spline's position to `error` [m], and its velocity to ten times `error` per second.
 
     Args:
         times: (K,) [s], rising, K >= 2, NumPy. Planning starts at time 0, which must be within the
-            times. After the last one the target keeps its velocity.
+            times. After the last time the target keeps its velocity.
         positions: (..., K, 3) [m]; leading axes are leading axes of the result, such as (N,) for
             the targets of one catch. The path is differentiable by positions.
         velocities: (..., K, 3) [m/s].
-        nodes: number of nodes, >= 5. Required if positions are traced; pass it also if several
-            batches of tables should share a compiled program.
-        error: [m], > 0, of the table, if `nodes` is not passed.
-        dtype: of every leaf.
+        nodes: number of nodes, >= 5. Required if positions are traced by JAX; pass it also if
+            several batches of tables should share a compiled program.
+        error: [m], > 0, greatest error of the table; used only if `nodes` is not passed.
+        dtype: floating type of every leaf of the result.
 
     Raises:
         ValueError: the times do not rise or exclude time 0, a shape does not fit, or the path
@@ -89,7 +90,7 @@ def _check_times(times: ArrayLike) -> np.ndarray:
 
 
 def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
-    """Check values (..., K, 3); return them in float64 if they are not traced."""
+    """Check values (..., K, 3); convert them to float64 unless they are traced by JAX."""
     if shape_of(name, value)[-2:] != (num, 3):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):
@@ -101,7 +102,10 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Evaluate a derivative (..., T, 3) of the spline at times (T,), linearly in the values."""
+    """Evaluate the spline's derivative (..., T, 3) of the given order at times `at` (T,) [s].
+
+    The result is computed as a matrix product with `values`, so JAX can differentiate by them.
+    """
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]
@@ -119,7 +123,7 @@ def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: in
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
-    """Return the least power of two of nodes whose table approximates the spline to `error`."""
+    """Return the least power of two, from 16, of nodes whose table has at most `error` [m]."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)

@@ -1,8 +1,8 @@
-"""Paths of targets: position and velocity as functions of time.
+"""Paths of targets in space: position and velocity as functions of time.
 
 A target path is a pytree with a method `at(time)`, differentiable in time and in every leaf, that
-returns a `BallState` or a position. The classes of this module cover the targets of the papers;
-users may write their own.
+returns a `BallState` or a position. The classes of this module cover the targets of [Yu2023catch].
+Users may write classes of their own.
 """
 
 from typing import ClassVar, Protocol, runtime_checkable
@@ -18,7 +18,7 @@ from planner_jax.core.rules import NOT_NEGATIVE, Field, Table
 
 @runtime_checkable
 class TargetPath(Protocol):
-    """The path of a target."""
+    """Interface of a target's path, as the planner of catches uses it."""
 
     def at(self, time: Array) -> BallState | Array:
         """Return position (3,) [m], or position and velocity [m/s], at one time () [s]."""

@@ -1,4 +1,8 @@
-"""Random paths of cells through a reach set, drawn backwards from the goal."""
+"""Random paths of a car through a reach set, drawn backwards from the goal.
+
+A reach set (`plane.reach`) marks which cells of a grid the car can reach at each time layer. The
+planner of interceptions starts its optimisation from these paths.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -8,31 +12,31 @@ from jax import Array, lax
 
 from planner_jax.plane.reach import SPAN, Grid, Lattice, ReachSet, bit_at
 
-# Costs of a step of a path, to which noise is added.
-_TURNING = 0.5  # of a turn by one bin, and of a change of the turn by one bin
-_UNEVEN = 1.0  # of a change of speed by one level
+# Costs of one step of a path. The step with the least cost minus Gumbel noise is drawn.
+_TURNING = 0.5  # cost of a turn by one heading bin, and of a change of the turn by one bin
+_UNEVEN = 1.0  # cost of a change of speed by one level
 
 
 @struct.dataclass
 class CellPath:
-    """A path through a reach set: speed, heading and cell after every layer."""
+    """A path through a reach set: speed level, heading bin and cell at every time layer."""
 
-    level: Array  # (layers,) int32, level of speed up to the next layer
-    bin: Array  # (layers,) int32, bin of heading, not wrapped
-    cell: Array  # (layers, 2) int32
+    level: Array  # (layers,) int32, index of the speed up to the next layer
+    bin: Array  # (layers,) int32, index of the heading, not wrapped to one revolution
+    cell: Array  # (layers, 2) int32, indices [x, y] of the cell
 
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise by which D candidates for a path are drawn; a leading axis for many paths."""
+    """Gumbel noise for drawing D candidates of a path; many paths have one more leading axis."""
 
-    layers: Array  # (layers + 1,), for the choice of the last layer
-    ends: Array  # (D, levels, headings, 9), for the choice of the last cell
-    steps: Array  # (D, layers, 3 (2 SPAN + 1)), for the choice of every step before it
+    layers: Array  # (layers + 1,), noise for the choice of the last layer
+    ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell
+    steps: Array  # (D, layers, 3 (2 SPAN + 1)), noise for the choice of every earlier step
 
 
 def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNoise:
-    """Draw the noise of paths, the same for all cases."""
+    """Draw the noise for `num` paths from a seed; all cases of a batch use the same noise."""
     rng = np.random.default_rng(seed)
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
     steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
@@ -41,14 +45,20 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return velocities (..., 2) at levels and bins (...), in levels, along bin 0 and across it."""
+    """Return the velocities (..., 2) of speed levels and heading bins (...).
+
+    The unit is one level of speed, and the axes are along the heading of bin 0 and to its left.
+    """
     dtype = grid.cell.dtype
     angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
     return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)
 
 
 def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
-    """Return the sum of squared changes of velocity over two layers each, in levels."""
+    """Return the sum of |v[n + 2] - v[n]|^2 over the first `num` layers n, in levels of speed.
+
+    The velocities v are those of the path at its layers.
+    """
     velocity = _velocity(path.level, path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))
@@ -63,23 +73,26 @@ def draw_path(
     noise: PathNoise,
     directness: float,
 ) -> CellPath:
-    """Draw candidates for a path to a goal, step by step back from the goal; return the smoothest.
+    """Draw several random paths to a goal, step by step back from the goal; return the smoothest.
 
     Args:
-        grid: of the reach set.
-        reach: the set.
-        num: () int32, the layer that meets the goal.
-        cells: of `goal_cells`.
-        is_reached: of `goal_cells`; if it is nowhere true, the path has no meaning.
-        noise: of one path.
-        directness: cost of the squared difference, in levels, between a velocity and the mean
-            velocity from the start to that cell. A greater value makes paths straight and even.
+        grid: grid of the reach set.
+        reach: set of cells that the car can reach.
+        num: () int32, index of the layer at which the car meets the goal.
+        cells: cells around the goal, from `goal_cells`.
+        is_reached: whether the car can be there, from `goal_cells`. If no entry is true, the
+            returned path is meaningless.
+        noise: noise of one path.
+        directness: weight of the squared difference, in levels of speed, between the velocity at a
+            cell and the mean velocity from the start to this cell. With a greater weight, paths are
+            straighter and their speed is more even.
     """
     lattice, dtype = grid.lattice, grid.cell.dtype
     choices = np.meshgrid([-1, 0, 1], np.arange(-SPAN, SPAN + 1), indexing="ij")
     choices = jnp.asarray(np.stack(choices, axis=-1).reshape(-1, 2), jnp.int32)
 
-    # Velocities are in levels of speed, along the heading of bin 0 and across it.
+    # `along` converts a displacement in cells per layer to a velocity in levels of speed, with axes
+    # along the heading of bin 0 and to its left.
     cosine, sine = jnp.cos(grid.heading), jnp.sin(grid.heading)
     along = jnp.stack([jnp.stack([cosine, sine]), jnp.stack([-sine, cosine])])
     along *= (lattice.levels - 1) / lattice.pace

@@ -1,4 +1,4 @@
-"""Distance from the nearest wall, computed once on a grid and interpolated."""
+"""Distance from the nearest wall in the plane, computed once on a grid and interpolated."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -11,16 +11,16 @@ from planner_jax.plane.obstacles import Obstacles, distances
 class DistanceField:
     """Distances from the nearest wall at equally spaced nodes; negative inside a wall."""
 
-    values: Array  # (F, F) [m], rows are y
+    values: Array  # (F, F) [m], the first index counts along y, the second along x
     corner: Array  # (2,) [m], position of the entry (0, 0)
-    spacing: Array  # () [m]
+    spacing: Array  # () [m], distance between neighbouring nodes
 
     def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Interpolate the distances [m] of points, and their derivatives by x and y.
+        """Interpolate the distances [m] of points from walls, and their derivatives by x and y.
 
         Interpolation is bilinear. Near a corner of a wall it overestimates the distance by up to
-        spacing^2 / (4 distance). A point outside the grid has the distance of the nearest point on
-        it. All arrays have the shape of `x`.
+        spacing^2 / (4 distance). A point outside the grid gets the distance of the nearest point of
+        the grid. All arrays have the shape of `x`.
         """
         most = self.values.shape[0] - 2
         at = [(each - low) / self.spacing for each, low in zip((x, y), self.corner, strict=True)]
@@ -44,10 +44,10 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
     """Compute the distances from the walls on a grid.
 
     Args:
-        walls: obstacles, at their positions of time 0.
-        corner: (2,) [m], of the grid.
-        spacing: () [m], of the nodes.
-        size: F, nodes along either side, static.
+        walls: obstacles, evaluated at their positions at time 0.
+        corner: (2,) [m], position of the grid's first node.
+        spacing: () [m], distance between neighbouring nodes.
+        size: number F of nodes along each side of the grid, a static int.
     """
     offsets = spacing * jnp.arange(size, dtype=corner.dtype)
     x, y = jnp.meshgrid(corner[0] + offsets, corner[1] + offsets)
@@ -60,7 +60,8 @@ def distance_field(walls: Obstacles, corner: Array, spacing: Array, size: int) -
         )
         return jnp.minimum(nearest, distances(*one, x.reshape(1, -1), y.reshape(1, -1))[0])
 
-    # One wall after another: a program for all walls at once takes minutes to compile.
+    # The loop takes one wall after another, since a program for all walls at once takes minutes to
+    # compile.
     none = jnp.full((1, size * size), 1e3, corner.dtype)
     nearest = lax.fori_loop(0, vertices.shape[0], take_nearer, none)
     return DistanceField(values=nearest.reshape(size, size), corner=corner, spacing=spacing)

@@ -1,4 +1,4 @@
-"""Convex polygons that stand or move at constant velocity, and distances from them."""
+"""Obstacles in the plane: convex polygons at constant velocity, and distances from them."""
 
 from collections.abc import Sequence
 
@@ -24,7 +24,7 @@ class Obstacles:
     centre: Array  # (N, 2) [m], at time 0
     corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise; the last may be repeated
     velocity: Array  # (N, 2) [m/s]
-    present: Array  # (N,) bool, whether each of the N exists
+    present: Array  # (N,) bool, whether the entry is an obstacle or only padding
 
     def vertices(self, time: ArrayLike) -> Array:
         """Return the corners (N, V, 2) [m] in the world frame at one time () [s]."""
@@ -38,19 +38,19 @@ def obstacles(
     room: object = None,
     dtype: object = jnp.float32,
 ) -> Obstacles:
-    """Make the obstacles of one case.
+    """Make the obstacles of one case from lists of corners.
 
     Args:
-        polygons: corners (V_k, 2) [m] of each obstacle at time 0, convex, in either sense.
-        velocities: (2,) [m/s] for all obstacles, or (N, 2) for each.
-        room: numbers of obstacles and of corners that the arrays hold, by default the numbers of
-            the polygons. Cases of the same room share a compiled program.
-        dtype: of every floating leaf.
+        polygons: corners (V_k, 2) [m] of each obstacle at time 0, convex, in either orientation.
+        velocities: (2,) [m/s] for all obstacles, or (N, 2) with one velocity per obstacle.
+        room: capacity of the arrays, a pair (number of obstacles, number of corners). By default
+            it is what the polygons need. Cases of equal capacity share a compiled program.
+        dtype: floating type of the arrays.
 
     Raises:
-        TypeError: an argument is of another kind.
-        ValueError: a polygon is empty or not convex, or the polygons exceed the room. The message
-            names the polygon, and proposes convex parts for one that is not convex.
+        TypeError: an argument has a wrong type.
+        ValueError: a polygon is empty or not convex, or the polygons exceed the capacity `room`.
+            The message names the polygon, and proposes to divide it into convex parts.
     """
     dtype = floating(dtype)
     if isinstance(polygons, str) or not isinstance(polygons, Sequence | np.ndarray):
@@ -82,7 +82,7 @@ def obstacles(
 
 
 def _check_room(room: object) -> tuple[int, int] | None:
-    """Return the numbers of obstacles and corners; raise unless these are two sizes, or None."""
+    """Return the argument `room`; raise unless it is None or two positive whole numbers."""
     if room is None:
         return None
     if not isinstance(room, tuple | list) or len(room) != 2:
@@ -93,7 +93,7 @@ def _check_room(room: object) -> tuple[int, int] | None:
 
 
 def _check_polygon(k: int, corners: object) -> np.ndarray:
-    """Return corners counter-clockwise; raise unless they are the corners of a convex polygon."""
+    """Return the corners of polygon k counter-clockwise; raise unless the polygon is convex."""
     if numeric(corners) is None:
         raise ArgumentTypeError("polygons", "corners of numbers", corners, k, verb="have")
     polygon = np.asarray(corners, float)
@@ -120,17 +120,17 @@ def _check_polygon(k: int, corners: object) -> np.ndarray:
 def distances(
     corners: Array, present: Array, x: Array, y: Array
 ) -> tuple[Array, tuple[Array, Array]]:
-    """Return distances of points from convex polygons, and the directions away from them.
+    """Return the signed distances of points from convex polygons, and their gradients.
 
     Args:
-        corners: (N, V, 2) [m], counter-clockwise; they may be repeated.
-        present: (N,) bool; absent polygons are far away.
-        x: (N, P) or (1, P) [m], of points: a row for each polygon, or one row for all.
+        corners: (N, V, 2) [m], counter-clockwise; corners may be repeated.
+        present: (N,) bool; absent polygons get the distance 1000 m.
+        x: (N, P) or (1, P) [m], points: one row for each polygon, or one row for all polygons.
         y: (N, P) or (1, P) [m].
 
     Returns:
-        distance: (N, P) [m]. Inside a polygon it is negative, to the line of the nearest edge.
-        away: two of (N, P), the gradient of the distance by the point, a unit vector.
+        distance: (N, P) [m]. Inside a polygon it is minus the distance of the nearest edge's line.
+        away: x and y components, each (N, P), of the distance's gradient, a unit vector.
     """
     before = jnp.roll(corners, 1, axis=1)
     edge = corners - before
@@ -141,7 +141,8 @@ def distances(
     shape = jnp.broadcast_shapes((corners.shape[0], 1), x.shape)
     nearest, highest = jnp.full(shape, 1e6, x.dtype), jnp.full(shape, -1e6, x.dtype)
     gap_x = gap_y = face_x = face_y = jnp.zeros(shape, x.dtype)
-    for k in range(corners.shape[1]):  # one edge at a time, so that points stay in registers
+    # The loop takes one edge at a time, so that the points' coordinates stay in registers.
+    for k in range(corners.shape[1]):
         exists = is_edge[:, k, None]
         from_x, from_y = x - before[:, k, :1], y - before[:, k, 1:]
         edge_x, edge_y = edge[:, k, :1], edge[:, k, 1:]
@@ -169,18 +170,19 @@ def distances(
 def separation(
     corners: Array, present: Array, x: Array, y: Array, heading: Array, body: tuple
 ) -> Array:
-    """Return separations (N, P) [m] of a rectangle and polygons along their best separating axis.
+    """Return the gaps (N, P) [m] between a rectangle and polygons along their best separating axis.
 
-    A separation is positive if and only if rectangle and polygon do not touch (the separating axis
+    A gap is positive if and only if rectangle and polygon do not touch (the separating axis
     theorem). It is at most their distance.
 
     Args:
-        corners: (N, V, 2) [m], as for `distances`.
-        present: (N,) bool.
-        x: (N, P) or (1, P) [m], of a reference point on the rectangle's long axis.
+        corners: (N, V, 2) [m], counter-clockwise; corners may be repeated.
+        present: (N,) bool; absent polygons get the gap 1000 m.
+        x: (N, P) or (1, P) [m], P positions of a reference point on the rectangle's long axis.
         y: (N, P) or (1, P) [m].
-        heading: (P,) [rad], of the long axis.
-        body: ends of the rectangle behind and ahead of the point, and half its width [m].
+        heading: (P,) [rad], direction of the long axis.
+        body: coordinates [m] along the long axis of the rectangle's rear and front ends, relative
+            to the reference point, and half its width [m].
     """
     behind, ahead, half = body
     cos, sin = jnp.cos(heading)[None], jnp.sin(heading)[None]

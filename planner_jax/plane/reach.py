@@ -1,17 +1,18 @@
-"""The reach set of a car in space and time, with one bit per cell.
+"""The set of states that a car can reach among obstacles, on a grid in space and time.
 
-The set has a layer for each of some equally spaced times. A layer holds one bit for every level of
-speed, every heading and every cell of a square grid: whether the car can be there at that time,
-among obstacles that stand and move. At a layer the speed changes by at most one level, and the
-heading by a few bins. Up to the next layer the car moves straight on; it does so for half a step
-before the first layer.
+The planner of interceptions takes coarse paths from this reach set as starts of its optimisation.
+The set has one layer for each of several equally spaced times. A layer has one bit for every speed
+level, every heading bin and every cell of a square grid. The bit tells whether the car can be there
+at that time without touching a standing or moving obstacle. At a layer the speed changes by at most
+one level, and the heading by a few bins. Between layers, and for half a step before the first
+layer, the car moves straight on.
 
 Path and timing are searched together, so that a car can wait for an obstacle to pass, or pass
-before it. One set covers all paths round the obstacles, all headings and all meeting times;
-`cell_paths` draws paths from it. The result is coarse, a start for an optimiser.
+before it. One set covers all paths around the obstacles, all headings and all meeting times.
+`cell_paths` draws paths from the set.
 
-The x positions of a row of cells are the bits of words: to move the car is to select rows and to
-shift words.
+The bits of a row of cells (constant y) are packed in 32-bit words. The car's motion along y selects
+other rows, and its motion along x shifts the words.
 """
 
 import dataclasses
@@ -26,21 +27,21 @@ from jax import Array, lax
 
 from planner_jax.plane.obstacles import Obstacles, distances
 
-_STENCIL = 32  # cells along either side of the bitmap of one moving obstacle
-_FARTHEST = 16  # most cells that the car moves in half a layer
-SPAN = 3  # most bins of heading that a layer may turn to either side
+_STENCIL = 32  # number of cells along each side of the bitmap of one moving obstacle
+_FARTHEST = 16  # greatest number of cells that the car moves in half a step between layers
+SPAN = 3  # greatest number of heading bins by which the car turns at one layer, to either side
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Lattice:
-    """The sizes of a reach set."""
+    """The sizes of a reach set: its numbers of cells, time layers, speed levels and headings."""
 
-    cells: int = 64  # along either side of the grid, a multiple of 32
-    layers: int = 30  # most layers in time
-    levels: int = 4  # of speed; level 0 is standstill
-    headings: int = 32
-    pace: float = 6.0  # cells that the car moves from layer to layer at its greatest speed
+    cells: int = 64  # number of cells along each side of the grid, a multiple of 32
+    layers: int = 30  # greatest number of layers in time
+    levels: int = 4  # number of speed levels; level 0 is standstill
+    headings: int = 32  # number of heading bins in one revolution
+    pace: float = 6.0  # number of cells between two layers at the car's greatest speed
 
 
 @struct.dataclass
@@ -51,42 +52,45 @@ class Grid:
     lower: Array  # (2,) [m], corner of the map; the vehicle's middle must not leave the map
     upper: Array  # (2,) [m], opposite corner
     corner: Array  # (2,) [m], middle of the cell (0, 0)
-    cell: Array  # () [m]
-    step: Array  # () [s], from layer to layer; layer n is at (n + 1/2) steps
-    num: Array  # () int32, the layer at the horizon
-    start: Array  # (2,) int32, the cell of the start
-    heading: Array  # () [rad], of bin 0: the heading of the start
+    cell: Array  # () [m], side length of a cell
+    step: Array  # () [s], time between two layers; layer n is at (n + 1/2) steps
+    num: Array  # () int32, index of the layer at the horizon
+    start: Array  # (2,) int32, indices [x, y] of the cell at the start
+    heading: Array  # () [rad], heading of bin 0, which is the heading at the start
 
 
 @struct.dataclass
 class Vehicle:
     """A vehicle on the grid: a reference point, and two discs that cover its body."""
 
-    radius: Array  # () [m], of the discs
-    ahead: Array  # (2,) [m], of their middles from the reference point
-    speed: Array  # () [m/s], the greatest
-    turn_rates: Array  # (levels,) [rad/s], the greatest at each level of speed
+    radius: Array  # () [m], radius of the discs
+    ahead: Array  # (2,) [m], distances of the discs' middles ahead of the reference point
+    speed: Array  # () [m/s], greatest speed
+    turn_rates: Array  # (levels,) [rad/s], greatest turn rate at each level of speed
 
 
 @struct.dataclass
 class ReachSet:
-    """The bits of all layers, and the moves and turns between layers."""
+    """The reachable states of all time layers, and the moves and turns between layers."""
 
-    bits: Array  # (layers + 1, words, levels, headings, cells) uint32; rows are y, bits x
-    moves: Array  # (layers, levels, headings, 2, 2) int32, cells [x, y] in each half of a step
-    turns: Array  # (layers, levels, 2 SPAN + 1) bool, turns that are allowed at a level of speed
+    # (layers + 1, words, levels, headings, cells) uint32. The last axis counts cells along y, and
+    # the bits of the words count cells along x.
+    bits: Array
+    # (layers, levels, headings, 2, 2) int32, moved cells [x, y] in each half of a step.
+    moves: Array
+    turns: Array  # (layers, levels, 2 SPAN + 1) bool, allowed turns at each level of speed
 
 
 def grid_of(
     lattice: Lattice, start: Array, time: Array, speed: Array, lower: Array, upper: Array
 ) -> Grid:
-    """Make the grid of a map, with a cell at the start and the last layer at the horizon.
+    """Make the grid of a map, with a cell's middle at the start and the last layer at the horizon.
 
     Args:
         lattice: sizes of the reach set.
-        start: (3,) x, y [m] and heading [rad].
+        start: (3,) x, y [m] and heading [rad] of the car at time 0.
         time: () [s], the horizon.
-        speed: () [m/s], the greatest.
+        speed: () [m/s], greatest speed of the car.
         lower: (2,) [m], corner of the map.
         upper: (2,) [m], opposite corner.
     """

@@ -1,1 +1,1 @@
-"""Float64 NumPy checks of plans against the physics, independent of the planners."""
+"""Referees, independent of the planners: they check plans against the physics in float64 NumPy."""

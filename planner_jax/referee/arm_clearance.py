@@ -1,13 +1,13 @@
 """Clearance of a six-axis arm with a shield from obstacles and from itself, in float64 NumPy.
 
-Base frame of the arm, z up, SI units. Arrays of B lanes and S samples have the components of their
-vectors first, (3, B, S), with S = 1 for solids at rest. Links are modelled by capsules, and the
-shield by a square plate, 0.01 m thick behind its face. The pairs of solids are:
+The referee of blocks tests motions of the arm here. Base frame of the arm, z up, SI units. Vectors
+at S samples of B motions are (3, B, S), with S = 1 for solids that do not move. Links are modelled
+by capsules, and the shield by a square plate that is 0.01 m thick. The tested pairs of solids are:
 
-- floor, pole and beams of the rig: every moving link, and the shield;
-- base: links 2 to 6 and the shield, since link 1 stands on the base;
-- link 1: links 3 to 6 and the shield;
-- shield: links 2 to 4, with a thinner link 4 (`_beside_shield`); links 5 and 6 carry the shield.
+- floor, pole and beams of the rig: with every moving link, and with the shield;
+- base: with links 2 to 6 and the shield, since link 1 is mounted on the base;
+- link 1: with links 3 to 6 and the shield;
+- shield: with links 1 to 4, since links 5 and 6 carry it. For link 4 see `_beside_shield`.
 """
 
 import dataclasses
@@ -28,15 +28,15 @@ from planner_jax.referee.solids import (
 )
 
 KINDS = ("floor", "pole", "rig", "base", "self")
-THICKNESS = 0.01  # [m], of the shield
+THICKNESS = 0.01  # [m], thickness of the shield's plate
 _POLE_HALF = 1e3  # [m], half the length of the pole, practically infinite
-_SLACK = 1e-9  # [m], rounding error of a bound
+_SLACK = 1e-9  # [m], greatest rounding error of the lower bound of a distance
 _BASE = -1  # index of the base, where links 1 to 6 have indices 0 to 5
 
 
 @dataclasses.dataclass(frozen=True)
 class _Capsule:
-    """A capsule at every sample."""
+    """The pose of a capsule (a link, a beam or the pole) at every sample of B motions."""
 
     name: str
     link: int
@@ -55,7 +55,7 @@ class _Capsule:
         return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
-        """Return the height (B, S) [m] of the lowest point."""
+        """Return the height (B, S) [m] of the capsule's lowest point."""
         return np.minimum(self.first[2], self.second[2]) - self.radius
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
@@ -63,19 +63,19 @@ class _Capsule:
         return from_segment(point, self.first, self.second) - self.radius
 
     def distance_to_capsule(self, other: "_Capsule") -> np.ndarray:
-        """Return the distances (P,) [m] to capsules at the same P samples."""
+        """Return the distances (P,) [m] to another capsule, for capsules selected by `at`."""
         apart = between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
-        """Select P samples of lanes: ends (3, P) and radii (P,)."""
+        """Select P samples: return the capsule with ends (3, P) and radii (P,)."""
         first, second = (_pick_samples(end, lane, sample) for end in (self.first, self.second))
         return _Capsule(self.name, self.link, first, second, self.radius[lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Box:
-    """A box at every sample."""
+    """The pose of a box (the shield or the base) at every sample of B motions."""
 
     name: str
     middle: np.ndarray  # (3, B, S) [m]
@@ -88,7 +88,7 @@ class _Box:
         return length(self.half)
 
     def lowest(self) -> np.ndarray:
-        """Return the height (B, S) [m] of the lowest point."""
+        """Return the height (B, S) [m] of the box's lowest point."""
         return self.middle[2] - sum(np.abs(self.turn[2, k]) * self.half[k] for k in range(3))
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
@@ -97,35 +97,40 @@ class _Box:
         return length(np.maximum(np.abs(inside) - self.half, 0.0))
 
     def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
-        """Return the distances (P,) [m] to capsules at the same P samples."""
+        """Return the distances (P,) [m] to a capsule, for solids selected by `at`."""
         first, second = (
             rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
         return segment_to_box(first, second, self.half) - other.radius
 
     def distance_to_box(self, other: "_Box") -> np.ndarray:
-        """Return the distances (P,) [m] to boxes at the same P samples."""
+        """Return the distances (P,) [m] to another box, for boxes selected by `at`."""
         middle = rotate_back(self.turn, other.middle - self.middle)
         turn = np.stack([rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
         return between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
-        """Select P samples of lanes: middles (3, P) and rotations (3, 3, P)."""
+        """Select P samples: return the box with middles (3, P) and rotations (3, 3, P)."""
         middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pair:
-    """Two solids, or a solid and the floor."""
+    """Two solids, or a solid and the floor, whose distance is tested."""
 
-    name: str  # of the parts of the arm
+    name: str  # name of the part of the arm, or of both parts
     bound: np.ndarray  # (B, S) [m], lower bound of the distance
-    exact: Callable[[np.ndarray, np.ndarray], np.ndarray]  # lanes, samples (P,) -> distances (P,)
+    # Function from indices of motions and samples, both (P,), to exact distances (P,) [m].
+    exact: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
-    """Return rotations (3, 3, B, S) of links 1 to 6 and positions (3, B, S) [m] of their joints."""
+    """Return the rotations of links 1 to 6 and the positions [m] of their joints.
+
+    The joint angles are (6, B, S) [rad]. Rotations are (3, 3, B, S), from link to base frame, and
+    positions (3, B, S).
+    """
     turn, position = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
     turns, positions = [], []
     for k in range(6):
@@ -133,7 +138,8 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
         position = position + rotate(turn, origin)
-        # The fixed rotation of the joint's frame, then Rodrigues' formula about the joint's axis.
+        # Multiply by the fixed rotation of the joint's frame, and then by the rotation about the
+        # joint's axis (Rodrigues' formula).
         cos, sin = np.cos(angles[k]), np.sin(angles[k])
         own, along = _rotation(quaternion), axis[:, None] * axis[None]
         still = _product(own, along)
@@ -151,15 +157,15 @@ def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
 def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndarray) -> dict:
     """Return the least distances between an arm and its obstacles, for each of `KINDS`.
 
-    The distance of overlapping solids is minus the penetration depth, but for a capsule not below
-    minus its radius, and for two capsules not below minus the sum. Distances are exact; bounding
-    spheres exclude pairs of solids and samples that cannot have the least distance.
+    The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
+    the depth is at most its radius, and for two capsules at most the sum of both radii. Distances
+    are exact. Bounding spheres exclude samples that cannot have the least distance.
 
     Args:
-        case: arrays of B lanes.
-        links: of the capsules, 0 to 5 for links 1 to 6, -1 for the base.
-        angles: (6, B, S) [rad].
-        sampled: (B, S) bool, samples that count, at least one in each lane.
+        case: arrays of B cases.
+        links: link of each capsule, 0 to 5 for links 1 to 6, -1 for the base.
+        angles: (6, B, S) [rad], joint angles.
+        sampled: (B, S) bool, samples to evaluate, at least one in each motion.
 
     Returns:
         By kind, the least distance (B,) [m], infinite without an obstacle; its sample (B,); and
@@ -187,7 +193,7 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
 
 def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule], _Box]:
-    """Return the arm's capsules and its shield at angles (6, B, S)."""
+    """Compute the poses of the arm's capsules and its shield at joint angles (6, B, S) [rad]."""
     turns, positions = links_of(case, angles)
     capsules = []
     for k, link in enumerate(links):
@@ -206,9 +212,9 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
 def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
     """Return the capsules of links 2 to 4 for the test against the shield.
 
-    Link 4 is wider than thick. A capsule as wide as link 4 would overlap the shield at any angle of
-    joint 5, but the shield approaches link 4 only at its narrow sides. Its radius is therefore
-    reduced to the value at which the shield touches it with joint 5 at 0.
+    Link 4 is wider than thick, and the shield approaches only its narrow sides. A capsule with the
+    width of link 4 would overlap the shield at any angle of joint 5. The capsule's radius is
+    therefore reduced until it only touches the shield when all joint angles are 0.
     """
     num_lanes = len(case["arm.shield_half"])
     straight, shield = _arm(case, links, np.zeros((6, num_lanes, 1)))
@@ -225,7 +231,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """Return the pole, with radius minus infinity where there is none."""
+    """Return the pole as a capsule; its radius is minus infinity in cases without a pole."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -247,7 +253,7 @@ def _base_box(case: dict) -> _Box:
 
 
 def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
-    """Return the pair of a small solid and a larger one, bounded by the sphere around the first."""
+    """Return the pair of two solids, with a lower bound from the sphere around the first solid."""
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
@@ -267,7 +273,10 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the least distance (B,) of all pairs, its sample (B,) and the pair's name (B,)."""
+    """Return the least distance (B,) [m] over pairs and samples, its sample and its pair's name.
+
+    Samples are indices (B,), and names are (B,) str.
+    """
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")
@@ -276,7 +285,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     distances = np.full_like(bounds, np.inf)
 
     def compute(selected: np.ndarray) -> None:
-        """Compute the distances of selected entries (B, pairs x samples)."""
+        """Store the exact distances of the `selected` entries (B, pairs x samples)."""
         for k, pair in enumerate(pairs):
             here = slice(k * num_samples, (k + 1) * num_samples)
             lane, sample = np.nonzero(selected[:, here])
@@ -285,7 +294,8 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     lanes = np.arange(num_lanes)
     first = np.zeros(bounds.shape, bool)
-    # The distance of any pair at any sample is an upper bound of the least distance.
+    # The exact distance of one pair at one sample is an upper bound of the least distance. Entries
+    # with a lower bound above this upper bound need no exact distance.
     first[lanes, bounds.argmin(axis=1)] = True
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK
@@ -296,12 +306,12 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Select P samples of lanes from values (..., B, S), where S = 1 for constant values."""
+    """Select P entries (lane, sample) of values (..., B, S), where S = 1 for constant values."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Multiply matrices (3, 3, ...)."""
+    """Return the matrix products `first` `second` of matrices (3, 3, ...)."""
     return np.stack([rotate(first, second[:, k]) for k in range(3)], axis=1)
 
 

@@ -1,9 +1,10 @@
 """Float64 NumPy referee of blocks: decides by kinematics whether a plan succeeds.
 
-The referee shares no code with the planners. It compares the joints' polynomials with their limits
-at their extrema, measures the clearance of arm and shield at samples, and computes the ball's
-parabola [Natarajan2024, eqs 5 to 7]. It ignores the plan's status and cost, but reads its contact
-time. Robot base frame, z up, SI units. Times count from the first observation of the ball.
+A block stops a thrown ball with a shield on a six-axis arm. The referee compares the joints'
+polynomials with their limits at their extrema, measures the clearance of arm and shield at samples,
+and computes the ball's parabola [Natarajan2024, eqs 5 to 7]. It reads the plan's motion and contact
+time, and ignores its status and cost. It shares no code with the planners. Robot base frame, z up,
+SI units. Times count from the first observation of the ball.
 """
 
 import dataclasses
@@ -49,7 +50,7 @@ _SENTENCES = {
     "outer box before it gets into the inner one",
 }
 LIMITS = tuple(_SENTENCES)
-# May be infinite, besides the limits of the joints.
+# Fields of a case that may be infinite, like the limits of the joints.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
@@ -63,22 +64,24 @@ _CASE_SHAPES: dict[str, tuple[int, ...]] = {
 }
 _JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
 
-LONGEST_STEP = 0.002  # [s], between two samples
-LARGEST_TURN = 0.017  # [rad], norm of the change of all joint angles between two samples
-_FASTEST = 100.0  # [rad/s], norm of all joint rates, above which samples get no denser
-LONGEST_PLAN = 60.0  # [s], until the contact
-REST = 0.01  # [rad/s], fastest joint of an arm at standstill
-_HALVINGS = 45  # of an interval in the search for a root
-_SAMPLES = 16384  # poses whose clearances are computed at once: they fit the cache
+LONGEST_STEP = 0.002  # [s], greatest time between two samples of the arm's motion
+# [rad] Greatest norm of the change of all joint angles between two samples.
+LARGEST_TURN = 0.017
+# [rad/s] Norm of all joint rates above which the time between samples is not reduced further.
+_FASTEST = 100.0
+LONGEST_PLAN = 60.0  # [s], latest contact that the referee accepts
+REST = 0.01  # [rad/s], greatest joint rate that counts as standstill
+_HALVINGS = 45  # number of bisections in the search for a root
+_SAMPLES = 16384  # number of poses whose clearances are computed together and fit the cache
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockVerdict(Verdict):
-    """Verdict on blocks, one entry a plan.
+    """Verdict on B plans of blocks.
 
-    Measurements are NaN where the inputs are not finite or the plan's times are wrong. Clearances
-    are least distances over the samples: minus the penetration depth where solids overlap, but for
-    a capsule not below minus its radius; infinite without an obstacle.
+    Measurements are NaN where the inputs are not finite or the plan's times are wrong. A clearance
+    is the least distance of solids over the samples. It is minus the penetration depth if they
+    overlap (at most a capsule's radius), and infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
@@ -111,28 +114,29 @@ def referee_blocks(
     tolerance: float = 1e-3,
     contact_tolerance: float = 1e-3,
 ) -> BlockVerdict:
-    """Judge every plan of a batch.
+    """Decide for every plan of a batch of blocks whether it succeeds.
 
     Angles, rates and accelerations are compared with their limits at the ends of each piece and at
-    their extrema inside. An extremum is a root of the next derivative. Roots are bracketed by the
-    extrema of that derivative, recursively up to the constant derivative, and found by bisection.
+    their extrema inside. An extremum is a root of the next derivative. Bisection finds the roots
+    between the extrema of that derivative, recursively from the constant derivative down.
 
-    Clearances are computed at the ends of the pieces and at samples between them, at most
-    `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the distances
-    between capsules, the shield's plate and boxes (listed in `referee.arm_clearance`) are exact.
+    Clearances are computed at the ends of the pieces and at samples between them. Samples are at
+    most `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the
+    distances between the solids that `referee.arm_clearance` lists are exact.
 
-    The motion starts at the case's delay, and the arm then stays at the motion's end. It must be at
-    standstill there if the case requires it, or if the contact is later.
+    The motion starts at the time `delay` of the case, and the arm then stays at the motion's end.
+    It must be at standstill there if the case requires it, or if the contact is later.
 
     Args:
         cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
         plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients
             (B, M, D + 1, 6), durations (B, M).
-        tolerance: relative, of velocities, accelerations, the case's offset and its tilt; [rad]
-            and [rad/s] of the start and of jumps between pieces; [rad] of positions.
-        contact_tolerance: [m], of the ball's distance from the plane and the square of the
-            shield's face, of the arm's depth in an obstacle, and of the ball's distance from the
-            boxes of the tunnel.
+        tolerance: relative tolerance of velocities, accelerations, the case's offset and its tilt;
+            absolute tolerance of the start and of jumps between pieces [rad], [rad/s], and of joint
+            angles beyond their limits [rad].
+        contact_tolerance: [m], greatest distance of the ball from the square of the shield's face,
+            greatest depth of the arm in an obstacle, and distance by which the outer box of the
+            tunnel is enlarged and the inner box reduced.
 
     Returns:
         A `BlockVerdict`; see `referee_hits`. The offset and the tilt may be infinite too.
@@ -146,7 +150,10 @@ def referee_blocks(
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Read all arrays, check their shapes, and return them and the links of the capsules."""
+    """Read all arrays of cases and plans, and check their shapes.
+
+    Returns the arrays by name, and the link of each capsule of the arm (-1 for the base).
+    """
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
@@ -176,7 +183,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
     """Return the fields of `BlockVerdict` for one chunk of plans."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
-    # Time from the end of the motion to the contact.
+    # Time [s] from the end of the arm's motion to the contact with the ball.
     stays = case["plan.contact_time"] - case["delay"] - execution
     wrong_times = _times(case, stays)
     sound = finite & ~wrong_times[0]
@@ -211,7 +218,10 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test the contact time and the durations; return (failed, greatest error [s], contact)."""
+    """Test the contact time and the pieces' durations; return (failed, error [s], contact time).
+
+    `stays` (B,) [s] is the time from the end of the motion to the contact.
+    """
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -230,8 +240,8 @@ class _Motion:
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
     """Return angles, rates and accelerations at their extrema and at the ends of the pieces.
 
-    Each of the three is a pair of values and times [s] since the piece's start, both
-    (K, 6, B, M). K differs among the three.
+    Each of these three quantities is a pair of values and times [s] since the piece's start, both
+    (K, 6, B, M), for K extrema and ends of 6 joints. K differs among the quantities.
     """
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
@@ -252,7 +262,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,) str."""
+    """Return each plan's greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,)."""
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -261,14 +271,19 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Return measurements, tests by name, and each test's worst joint, (B,) of str."""
+    """Test start, continuity and joint limits of a motion.
+
+    Returns measurements, tests (failed, excess, time) by name, and by test the joint (B,) str with
+    the greatest excess.
+    """
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
         worst, time, parts[name] = _worst(excess, times)
         tests[name] = (worst > allowed, worst, time)
 
-    # Angles and rates at the start of each piece, less the values before it.
+    # Jumps of angles and rates: the values at the start of each piece minus the values at the end
+    # of the preceding piece, or minus the case's values for the first piece.
     begin, end = (
         np.stack([derivative(motion.coeffs, times, order) for order in range(2)])
         for times in (np.zeros_like(motion.durations), motion.durations)
@@ -290,7 +305,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test the rates at the end of the motion; return the fastest joint (B,) str too."""
+    """Test that the motion ends at standstill where it must; also return the fastest joint (B,)."""
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -299,16 +314,17 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
-    """Return the angles (6, B) [rad] at the contact.
+    """Return the joint angles (6, B) [rad] at the contact.
 
-    A motion that ends within the tolerance of the contact time is evaluated at that time.
+    The arm stays at the end of its motion until the contact. If the motion ends at the contact up
+    to `CONTACT_TIME_TOLERANCE`, its polynomial is evaluated at the contact time itself.
     """
     beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return least distances (B,) [m] by kind, their times (B,) [s], and the parts (B,) str.
+    """Return by kind of obstacle the least distance (B,) [m], its time (B,) [s] and its part (B,).
 
     The norm of the joint rates in each piece is at most `turning` (B, M) [rad/s].
     """
@@ -316,7 +332,7 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
     most = count.sum(axis=1).astype(int) + 1
-    # Lanes with similar numbers of samples are computed together.
+    # Plans with similar numbers of samples are computed together, so that few samples are padding.
     order, begin = np.argsort(-most), 0
     nothing = np.zeros(0), np.zeros(0), np.zeros(0, str)
     found = {kind: [nothing] for kind in KINDS}
@@ -339,9 +355,9 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and angles (6, B, S) [rad] of some lanes at sample numbers (S,).
+    """Return times (B, S) [s] and joint angles (6, B, S) [rad] of the plans `lanes` at S samples.
 
-    Each piece has `count` (B, M) samples. Lanes with fewer than S samples repeat the last one.
+    Each piece has `count` (B, M) samples. Plans with fewer than S samples repeat their last sample.
     """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
@@ -354,7 +370,10 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Measure the ball relative to the shield at angles (6, B); test ball, tilt and tunnel."""
+    """Measure the ball relative to the shield at the contact; test ball, tilt and tunnel.
+
+    The joint angles are (6, B) [rad]. Returns measurements, and (failed, excess, time) by test.
+    """
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
@@ -375,11 +394,14 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test that at the contact the ball is in the outer box, and has not entered the inner one."""
+    """Test that at the contact the ball is in the outer box and has not entered the inner box."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """Return the error (B,) [s], with the outer box enlarged and the inner one reduced [m]."""
+        """Return the error (B,) [s] of the contact time if boxes change by `grown` [m] per side.
+
+        The outer box is enlarged, and the inner box reduced.
+        """
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)
@@ -390,10 +412,11 @@ def _tunnel(case: dict, contact: float) -> tuple:
 
 
 def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (2, B) [s] at which balls enter and leave a box enlarged on all sides [m].
+    """Return the times (2, B) [s] at which balls enter and leave a box.
 
-    The first row is of the ball's rise, the second of its fall. A ball that is never inside enters
-    at infinity and leaves at minus infinity.
+    The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. The first row of
+    each result belongs to the ball's rise, the second row to its fall. A ball that is never inside
+    the box enters at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown

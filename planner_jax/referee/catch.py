@@ -1,9 +1,9 @@
 """Float64 NumPy referee of catches: decides by physics whether a plan succeeds.
 
-The referee shares no code with the planners, except the case's extra limits (`referee.extras`).
-`referee.quadrotor` checks the flight. This module computes the targets' positions and compares
-them with the net. It ignores the plan's status and cost, checks its order of the targets, and
-compares its catch times with the ends of its pieces. World frame, z up, SI units.
+A catch is a quadrotor's meeting with a moving target in the hoop of its net. `referee.quadrotor`
+checks the flight. This module checks the plan's order of targets and its catch times, computes the
+targets' positions and compares them with the net. Only the case's extra limits (`referee.extras`)
+are code that planners use too. World frame, z up, SI units.
 
 Equations of [Yu2023catch]: eq. 9 ball with linear drag (with its constant), eq. 22 net centre
 p + l z_d, eq. 25 angle between z_d and minus the ball's velocity, with the thrust direction z_d.
@@ -56,15 +56,16 @@ _SENTENCES = {
 }
 LIMITS = tuple(_SENTENCES)
 
-SLOWEST_TARGET = 1e-6  # [m/s]: the velocity of a slower target is rounding, without a direction
+# [m/s] A slower target counts as standing still: the direction of its velocity is rounding error.
+SLOWEST_TARGET = 1e-6
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchVerdict(FlightVerdict):
-    """Verdict on catches, one entry a plan.
+    """Verdict on B plans that catch up to N targets each.
 
-    Entries (B, N) are in the order of the catches, as the plan's `order` and `times`. They are NaN
-    behind the last catch, and where the plan names a wrong target.
+    Arrays (B, N) are in the order of the catches, like the plan's `order` and `times`. Their
+    entries are NaN after the last catch, and where the plan names a wrong target.
     """
 
     SENTENCES = _SENTENCES
@@ -95,17 +96,16 @@ def referee_catches(
     contact_tolerance: float = 5e-3,
     continuity_tolerance: float = 1e-4,
 ) -> CatchVerdict:
-    """Judge every plan of a batch.
+    """Decide for every plan of a batch of catches whether it succeeds.
 
-    Catch i = 0, 1, ... in the plan's order is the end of piece (i + 1) M - 1. Absent targets are
-    ignored. Pieces behind the last catch are ignored if their duration is zero, and otherwise
-    judged like the others. If targets are optional, the number of catches follows from the pieces
-    with a duration; each of these catches is judged. A plan without targets cannot fail a catch.
+    The trajectory has M pieces for each target. Catch i = 0, 1, ... in the plan's order is at the
+    end of piece (i + 1) M - 1. Absent targets are ignored. Pieces after the last catch are ignored
+    if their duration is zero, and judged like all pieces otherwise. If targets are optional, the
+    pieces with a duration determine the number of catches, and each of these catches is judged.
 
     Target positions are computed in float64 for paths with the fields of `BallPath` (recognised by
-    `ball`), `HarmonicPath` (`amplitude`) or `PathTable` (`resolution`).
-
-    The protocol of [Yu2023catch] is `tolerance=0.05, net_test="ball"`.
+    `ball`), `HarmonicPath` (`amplitude`) or `PathTable` (`resolution`). The arguments
+    `tolerance=0.05, net_test="ball"` reproduce the success criterion of [Yu2023catch].
 
     Args:
         cases: object with the fields of `CatchCase`, leaves with leading axis B; leaves of
@@ -119,8 +119,8 @@ def referee_catches(
             targets are ignored. If passed, the function is called for the known classes too.
         net_test: "plane" requires the target in the hoop's plane, to `contact_tolerance`, and
             within the net's radius there. "ball" requires it within the radius of the centre.
-        tolerance: relative, of every limit of the case, including the net's radius and angle.
-        contact_tolerance: [m], of the distance between target and hoop's plane at the catch.
+        tolerance: relative tolerance of all limits of the case, also of the net's radius and angle.
+        contact_tolerance: [m], greatest distance between target and hoop's plane at the catch.
         continuity_tolerance: see `referee_hits`.
 
     Returns:
@@ -135,7 +135,7 @@ def referee_catches(
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
     leaves = _read(cases, plans)
     shape = leaves["present"].shape
-    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
+    # Very large numbers may overflow. The verdict reports them, so NumPy's warnings are off.
     with np.errstate(all="ignore"):
         order = np.nan_to_num(leaves["order"].astype(np.float64))
         order = np.clip(np.rint(order), 0, shape[1] - 1).astype(np.int64)
@@ -184,11 +184,14 @@ def _ends(durations: np.ndarray, num: int) -> np.ndarray:
 
 
 def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N)."""
+    """Return positions and velocities (B, N, 3) of targets with the indices `order` at `times`.
+
+    Both `order` and `times` [s] are (B, N).
+    """
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        """Return a leaf (B, N, ...) of the targets in the order of the catches."""
+        """Return one array (B, N, ...) of the targets, sorted in the order of the catches."""
         value = check_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
@@ -248,10 +251,11 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 
 
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate positions and velocities (B, N, 3) of tables; node k is at (k - 1) * resolution.
+    """Interpolate positions and velocities (B, N, 3) at `times` from tables with equal time steps.
 
-    Cubic convolution with a = -1/2 [Keys1981] is the cubic between two nodes whose slopes are the
-    central differences there. Outside the table the target keeps its first or last velocity.
+    Node k of a table is at time (k - 1) * resolution. Between two nodes the interpolation is cubic
+    convolution with a = -1/2 [Keys1981]: a cubic polynomial whose slopes at the nodes are central
+    differences. Outside the table the target keeps its first or last velocity.
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)
@@ -290,7 +294,8 @@ def _judge(
     wrong = (~right).sum(axis=1).astype(np.float64)
     order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
     held = due & right
-    # In the order of the catches; values of other entries are not read, and may be anything.
+    # The arrays (B, N) are sorted in the order of the catches. Entries without a catch get neutral
+    # values, since the caller may have stored any numbers there.
     case = case | {
         "coeffs": np.moveaxis(pieces.coeffs, 0, -1),
         "order": np.where(due, case["order"], 0.0),
@@ -322,10 +327,11 @@ def _judge(
 def _test_order(
     order: np.ndarray, present: np.ndarray, due: np.ndarray, optional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Test the entries (B, N) of the plan's order; return which are right, and their targets.
+    """Test the plan's order (B, N) of targets; return which entries are right, and their targets.
 
-    Entries that are `due` (B, N) must name present targets, and the others absent ones (any target
-    if targets are optional). No entry may repeat an earlier one.
+    `due` (B, N) marks entries that are catches: they must name present targets. An entry that is
+    not a catch must name an absent target, or any target if targets are optional. No entry may
+    repeat a target that an earlier entry names.
     """
     num = due.shape[1]
     order = np.nan_to_num(order, nan=-1.0)
@@ -339,7 +345,7 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Return measurements of the catches, and (failed, excess, time) (B, N) by test."""
+    """Measure distance and angle between net and target; return measurements and tests (B, N)."""
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
@@ -377,9 +383,10 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test the catch times: positive and rising, as claimed, and not after the horizon.
+    """Test that the catch times are positive, rise, agree with the pieces, and keep the horizon.
 
-    Every piece up to a catch must have a positive duration, and none behind a negative one.
+    Every piece up to the last catch must have a positive duration, and no later piece a negative
+    duration. The plan's `times` must be the ends of the pieces, and not after the target's horizon.
     """
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
@@ -391,7 +398,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """Reduce a test (B, N) of all catches to the worst catch (B,) of each plan."""
+    """Reduce a test (failed, excess, time), each (B, N), to the worst catch (B,) of each plan."""
     failed, excess, time = test
     failed = failed & held
     counts = failed | (held & np.isnan(excess))

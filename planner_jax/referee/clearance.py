@@ -1,26 +1,31 @@
 """Clearance of a moving rectangle from convex polygons, in float64 NumPy.
 
-World frame in the plane, SI units.
+The referee of interceptions tests the car's body against obstacles here. World frame in the plane,
+SI units.
 """
 
 import numpy as np
 
-_PAIRS = 16384  # of a pose and a polygon whose distance is computed at once: they fit the cache
-_SLACK = 1e-9  # [m], rounding error of a bound, and shorter than any edge
+# Number of distances between a pose and a polygon that are computed together and fit the cache.
+_PAIRS = 16384
+# [m] Greatest rounding error of a bound of a distance; a shorter edge counts as a point.
+_SLACK = 1e-9
 
 
 def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarray) -> tuple:
-    """Return the least distance (B,) [m] of rectangles from polygons, its time and polygon (B,).
+    """Return the least distance (B,) [m] of each moving rectangle from N moving polygons.
 
-    Lower bounds exclude pairs of a sample and a polygon that cannot have the least distance: first
-    by circles around both, then by the lines of the polygon's edges and a circle around the
-    rectangle.
+    Also returns the time (B,) [s] of the least distance and the index (B,) of the polygon. Lower
+    bounds of the distance exclude most pairs of a sample and a polygon. The first bound uses
+    circles around both bodies, the second the lines through the polygon's edges and a circle around
+    the rectangle.
 
     Args:
-        group: "centre" and "velocity" (B, N, 2), "corners" (B, N, V, 2), "present" (B, N).
+        group: the polygons, as arrays "centre" [m] and "velocity" [m/s] (B, N, 2), "corners"
+            (B, N, V, 2) [m] relative to the centre, and "present" (B, N).
         half: (B, 2) [m], half sides of the rectangles.
-        times: (B, S) [s].
-        poses: (B, S, 3), of the rectangles' middles.
+        times: (B, S) [s], of the samples.
+        poses: (B, S, 3), pose of the rectangle's middle: x [m], y [m], heading [rad].
     """
     num_lanes, num_samples, num = *times.shape, group["present"].shape[1]
     least, when = np.full(num_lanes, np.inf), np.zeros(num_lanes)
@@ -34,10 +39,10 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     for axis in range(2):
         centre, velocity = (group[key][:, None, :, axis] for key in ("centre", "velocity"))
         apart += (poses[..., axis, None] - centre - velocity * times[..., None]) ** 2
-    apart = np.sqrt(apart) - reach[:, None]  # infinite for absent ones
+    apart = np.sqrt(apart) - reach[:, None]  # infinite for absent polygons
 
     def exact(lane: np.ndarray, sample: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return the distances (P,) of P pairs."""
+        """Return the exact distances (P,) [m] of P pairs of a sample and a polygon."""
         parts = [np.zeros(0)]
         for part in (slice(k, k + _PAIRS) for k in range(0, len(lane), _PAIRS)):
             b, s, n = lane[part], sample[part], which[part]
@@ -47,13 +52,14 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return np.concatenate(parts)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the index of the least `bound` (P,) of each lane; lanes `of` (P,) ascend."""
+        """Return for each plan the index of its least `bound` (P,); plan numbers `of` (P,) rise."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])
         return hits[np.unique(of[hits], return_index=True)[1]]
 
-    # The distance of any pair is an upper bound of the least distance; a second pair lowers it.
+    # The exact distance of any pair is an upper bound of the least distance. A second pair, chosen
+    # with better lower bounds, reduces this upper bound.
     lanes = np.arange(num_lanes)
     sample, which = np.divmod(apart.reshape(num_lanes, num_samples * num).argmin(axis=1), num)
     upper = exact(lanes, sample, which) + _SLACK
@@ -80,8 +86,8 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons.
 
-    The offset is normal . corner. An edge of zero length, between repeated corners, has a zero
-    normal and an infinite offset.
+    The offset is the inner product of normal and corner. An edge of zero length, between repeated
+    corners, has a zero normal and an infinite offset.
     """
     edge = np.roll(corners, -1, axis=-2) - corners
     area = (corners[..., 0] * edge[..., 1] - corners[..., 1] * edge[..., 0]).sum(axis=-1)
@@ -95,9 +101,9 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _separation(corners, normals, pose, half) -> np.ndarray:
     """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
 
-    If the greatest gap along the normals of all edges is negative, the two overlap, and the gap is
-    minus the depth. Otherwise the distance is between a corner of one and an edge of the other.
-    Edges of zero length have zero normals. Half sides `half` are (P, 2) [m].
+    If the greatest gap along the normals of all edges is negative, the bodies overlap, and the gap
+    is minus the depth. Otherwise the distance is the least distance between a corner of one body
+    and an edge of the other body. The half sides `half` of the rectangles are (P, 2) [m].
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 

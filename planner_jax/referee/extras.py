@@ -1,7 +1,8 @@
-"""The excess of a quadrotor over the extra limits of a case, in float64 NumPy.
+"""Test of a quadrotor's trajectory against the extra limits of its case, in float64 NumPy.
 
-The referee calls the method `excess` of the case's extras at points of the trajectory. It is the
-only code that referee and planners share.
+Extra limits are objects in the case's field `extras`, which a user may define. The referee calls
+their method `excess` at points of the trajectory. This method is the only code that the referee
+shares with the planners.
 """
 
 import dataclasses
@@ -15,31 +16,38 @@ from planner_jax.referee.quadrotor import Pieces
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """An extra of a case that is a limit; an extra without `excess` is a term of the cost."""
+    """An extra of a case that is a limit, since it has a method `excess`.
+
+    Extras without this method are terms of the planner's cost.
+    """
 
     def excess(self, pos: np.ndarray, vel: np.ndarray, acc: np.ndarray) -> np.ndarray:
-        """Return the relative excess (...) at states (..., 3) [m], [m/s], [m/s^2]."""
+        """Return the relative excess (...) over the limit; it is positive where the limit fails.
+
+        Position [m], velocity [m/s] and acceleration [m/s^2] are (..., 3).
+        """
         ...
 
 
-# Number of sample intervals in which the maximum is refined, and number of refinements. Each
-# refinement narrows an interval to a quarter.
+# Number of sample intervals in which the maximum of the excess is refined, and number of
+# refinements. Each refinement narrows an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-_STEEP = 1e9  # larger than any rise of the excess from one sample to the next
+# Assumed change of the excess between two samples where a neighbouring sample is missing.
+_STEEP = 1e9
 
 
 def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
-    """Find the greatest relative excess (B,) over extra limits, its time, and the extra's index.
+    """Find each plan's greatest relative excess (B,) over extra limits, its time and its limit.
 
-    The excess is sampled at fractions u (S,) of every piece. Between samples it is searched where
-    the lines through the neighbouring samples allow the greatest values. Without an extra limit
-    the excess and the index are -1.
+    The excess is sampled at fractions u of every piece. Between samples the search refines the
+    intervals in which the lines through neighbouring samples allow the greatest values. The limit
+    is returned as its index in `extras`. Without an extra limit the excess and the index are -1.
 
     Args:
-        pieces: trajectories of B lanes.
-        lanes: (B,), their indices in the arrays of `extras`.
-        extras: of all cases.
-        u: (S,), from 0 to 1.
+        pieces: trajectories of B plans.
+        lanes: (B,), index of each plan's case in the arrays of `extras`.
+        extras: extras of all cases of the batch, limits and terms of the cost.
+        u: (S,), sampled fractions of a piece's duration, from 0 to 1.
     """
     limits = [k for k, extra in enumerate(extras) if isinstance(extra, ExtraLimit)]
     worst, time, which = np.full(len(lanes), -1.0), np.zeros(len(lanes)), np.full(len(lanes), -1)
@@ -53,10 +61,10 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
 
 
 def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[float, float]:
-    """Return the greatest excess of one lane over one extra limit, and its time [s]."""
+    """Return the greatest relative excess of one plan over one extra limit, and its time [s]."""
 
     def excess(coeffs: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Evaluate the excess at times (...) [s] since the start of pieces (D + 1, 3, ...)."""
+        """Evaluate the excess at times (...) [s] since the start of polynomial pieces."""
         state = (derivative(coeffs, times, order) for order in range(3))
         rows = [np.moveaxis(each, 0, -1).reshape(-1, 3) for each in state]
         return np.asarray(extra.excess(*rows), float).reshape(times.shape)
@@ -66,9 +74,9 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
     values = excess(coeffs[..., None], durations[:, None] * u)  # (M, S)
     piece, sample = np.unravel_index(values.argmax(), values.shape)
     worst, time = values[piece, sample], starts[piece] + durations[piece] * u[sample]
-    # A concave excess lies below the line through the two samples before an interval, and below
-    # the line through the two samples after it: their intersection bounds it. The first interval
-    # of a piece has no line before it, the last one has none after it.
+    # Inside an interval a concave excess lies below two lines: through the two samples up to the
+    # interval's start, and through the two samples from its end on. The intersection of these
+    # lines bounds the excess. The first and the last interval of a piece have only one such line.
     rise = np.diff(values, axis=1)
     before = np.pad(rise[:, :-1], ((0, 0), (1, 0)), constant_values=_STEEP)
     after = np.pad(rise[:, 1:], ((0, 0), (0, 1)), constant_values=-_STEEP)
@@ -90,7 +98,7 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
 
 
 def _of_lane(extra, lane: int) -> ExtraLimit:
-    """Return the extra of one lane, with arrays in float64."""
+    """Return a copy of the extra that holds the numbers of case `lane` alone, in float64."""
     numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
     own = {name: np.asarray(vars(extra)[name], float)[lane] for name in numbers}
     return dataclasses.replace(extra, **own)

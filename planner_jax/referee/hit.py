@@ -1,10 +1,10 @@
 """Float64 NumPy referee of hits: decides by physics whether a plan succeeds.
 
-The referee shares no code with the planners, except the case's extra limits (`referee.extras`).
-`referee.quadrotor` checks the flight. This module integrates the ball up to the impact, applies
-the impact, and integrates the ball to its landing. It ignores the plan's status, cost and stroke,
-except the impact time, which must be the end of the trajectory. World frame, z up, ground at
-z = 0, SI units.
+A hit is a quadrotor's return of a ball to a target with a racket. `referee.quadrotor` checks the
+flight. This module integrates the ball up to the impact, applies the impact, and integrates the
+ball to its landing. Only the case's extra limits (`referee.extras`) are code that planners use too.
+The referee ignores the plan's status, its cost and its planned impact, except the impact time,
+which must be the end of the trajectory. World frame, z up, ground at z = 0, SI units.
 
 Equations of [Yu2023bat]: eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits.
 """
@@ -54,14 +54,15 @@ _CASE_SHAPES = {
     **{"hit_limits.hitting_speed": (3,), "hit_limits.min_apex": (), "hit_limits.max_apex": ()},
 }
 
-_INCOMING_STEPS = 60  # of Runge-Kutta up to the impact
-_OUTGOING_STEP, _LONGEST_FLIGHT = 0.01, 20.0  # [s], after the impact
-RIM = 0.9  # share of the racket's radius within which the ball must meet it
+_INCOMING_STEPS = 60  # number of Runge-Kutta steps of the ball's flight up to the impact
+# [s] Step and greatest duration of the integrated flight of the ball after the impact.
+_OUTGOING_STEP, _LONGEST_FLIGHT = 0.01, 20.0
+RIM = 0.9  # fraction of the racket's radius within which the ball must meet the racket
 
 
 @dataclasses.dataclass(frozen=True)
 class HitVerdict(FlightVerdict):
-    """Verdict on hits, one entry a plan."""
+    """Verdict on B plans of hits, with measurements of the impact and of the ball's return."""
 
     SENTENCES = _SENTENCES
     UNBOUNDED = MOTION_UNBOUNDED | {
@@ -89,27 +90,28 @@ def referee_hits(
     contact_tolerance: float = 5e-3,
     continuity_tolerance: float = 1e-4,
 ) -> HitVerdict:
-    """Judge every plan of a batch.
+    """Decide for every plan of a batch of hits whether it succeeds.
 
-    The impact is the end of the trajectory. Errors at time 0 and between pieces count as
-    displacement (`referee.quadrotor.joint_errors`). Eight minimum-snap pieces computed in float32
-    with coordinates up to 4.5 m have at most 1.3e-4 m, under a third of the default tolerance.
+    The impact is at the end of the trajectory. Errors of the state at time 0 and jumps between
+    pieces count as displacement (`referee.quadrotor.joint_errors`). In minimum-snap trajectories of
+    eight pieces, computed in float32 with coordinates up to 4.5 m, rounding causes at most 1.3e-4 m
+    of displacement. That is less than a third of the default tolerance.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.
         plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients
             (B, M, D + 1, 3), durations (B, M).
-        drag_after_impact: the ball has drag after the impact too.
-        tolerance: relative, of every limit of the case.
-        landing_tolerance: [m], of the horizontal distance between landing and target.
-        contact_tolerance: [m], of the distance between racket centre and ball at the impact. If
+        drag_after_impact: whether the ball has drag after the impact too.
+        tolerance: relative tolerance of every limit of the case.
+        landing_tolerance: [m], greatest horizontal distance between landing point and target.
+        contact_tolerance: [m], greatest distance between racket centre and ball at the impact. If
             the case has `racket_radius`, the distance may also not exceed `RIM` times the radius.
-        continuity_tolerance: of the displacement of head state and joints, relative to the largest
-            coordinate at the ends of the pieces (at least 1 m).
+        continuity_tolerance: greatest displacement at time 0 and between pieces, relative to the
+            largest coordinate at the ends of the pieces (at least 1 m).
 
     Returns:
-        A `HitVerdict` of float64 arrays. A plan that is not finite fails as "not finite", without
-        an effect on the others. Limits may be infinite.
+        A `HitVerdict` of float64 arrays. A plan with numbers that are not finite fails as "not
+        finite", without an effect on other plans. Limits of a case may be infinite.
 
     Raises:
         ValueError: an array has the wrong shape.
@@ -172,10 +174,10 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 
 
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
-    """Find the time (B,) [s] within a step at which an entry falls to a level, and the state then.
+    """Find the time (B,) [s] within a step at which an entry of the ball's state falls to a level.
 
-    Newton's method starts at the end of the step. Height and vertical speed are concave or falling
-    there, so it converges to the later crossing.
+    Returns the time and the state (6, B) at that time. Newton's method starts at the end of the
+    step, where height and vertical speed are falling. It therefore converges to the last crossing.
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):
@@ -186,7 +188,11 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
 
 
 def _return_in_air(state, height, drag, gravity) -> tuple:
-    """Return apex, its time, landing point (3, B) and flight time, with quadratic drag."""
+    """Integrate a ball's flight with quadratic drag until it falls to `height` (B,) [m].
+
+    Returns the apex (B,) [m], its time, the landing point (3, B) and its time. Times count from the
+    start `state` (6, B) of the flight.
+    """
     before_top, before_end, state = state.copy(), state.copy(), state.copy()
     top_time, end_time = np.zeros_like(height), np.zeros_like(height)
     flying = np.arange(len(height))
@@ -215,7 +221,7 @@ def _return_in_air(state, height, drag, gravity) -> tuple:
 
 
 def _return_in_vacuum(state, height, gravity) -> tuple:
-    """Return apex, its time, landing point (3, B) and flight time, without drag."""
+    """Compute the results of `_return_in_air` for a ball without drag, in closed form."""
     pos, vel = state[:3], state[3:]
     apex_time = np.maximum(vel[2], 0.0) / gravity
     apex = pos[2] + 0.5 * gravity * apex_time**2
@@ -227,9 +233,9 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """Follow the ball to its landing; return measurements, and (failed, excess, time) by test.
+    """Compute the ball's impact and landing; return measurements, and (failed, excess, time).
 
-    In this function vectors are (3, B), and states of the ball (6, B).
+    In this function vectors are (3, B), and the states of balls are (6, B).
     """
     durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
     end = durations.sum(axis=1)
@@ -268,7 +274,7 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
-    """Test contact, hitting speed, apex and landing; return (failed, excess, time) by name."""
+    """Test contact, hitting speed, apex and landing; return (failed, excess, time) by limit."""
     relative = tolerances["relative"]
     contact, landing = measured["contact_error"], measured["landing_error"]
     widest = np.minimum(tolerances["contact"], RIM * case.get("racket_radius", np.inf))
@@ -287,10 +293,11 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 
 
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
-    """Test the impact time: positive, the end of the trajectory, and before the ball lands.
+    """Test that the impact time is positive, ends the trajectory, and precedes the ball's landing.
 
-    The height of a ball in flight has no local minimum, so both ends bound it from below. A ball
-    below the ground landed about depth / |vertical speed| seconds earlier.
+    The height of a ball in flight has no local minimum, so its heights at time 0 and at the impact
+    bound it from below. A ball that is below the ground at the impact landed about
+    depth / |vertical speed| seconds earlier.
     """
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)

@@ -1,10 +1,10 @@
 """Float64 NumPy referee of interceptions: decides by kinematics whether a plan succeeds.
 
-The referee integrates the car's equations of motion [Qu2022, eq. 1] from the plan's start along
-its speed and curvature, measures the clearance of the body's rectangle at samples, and computes
-the target's position. It shares no code with the planners, except targets of a user's own class.
-It ignores the plan's status, cost and meeting point. World frame in the plane, SI units, headings
-counter-clockwise from the x axis.
+An interception is a car's drive to a moving target. The referee integrates the car's equations of
+motion [Qu2022, eq. 1] with the plan's speed and curvature. It measures the clearance of the car's
+rectangle at samples, and computes the target's position. Only targets of a user's own class are
+code that planners run too. The referee ignores the plan's status, cost and meeting point. World
+frame in the plane, SI units, headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -44,23 +44,24 @@ _SENTENCES = {
     "heading": "the heading is {excess:.3g} rad off the required one at {time:.3f} s",
 }
 LIMITS = tuple(_SENTENCES)
-# May be infinite, besides the limits of the car.
+# Fields of a case that may be infinite, like the limits of the car.
 _UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
 
-LONGEST_STEP = 0.02  # [s], between two samples
-LONGEST_PLAN = 3600.0  # [s]
-# Gauss-Legendre nodes and weights on (0, 1), exact to order 5; used between two samples.
+LONGEST_STEP = 0.02  # [s], greatest time between two samples of the motion
+LONGEST_PLAN = 3600.0  # [s], greatest time of a plan that the referee accepts
+# Gauss-Legendre nodes and weights on (0, 1), exact for polynomials up to degree 5. They integrate
+# the position between two samples.
 _NODES = np.polynomial.legendre.leggauss(3)
 _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 
 @dataclasses.dataclass(frozen=True)
 class InterceptVerdict(Verdict):
-    """Verdict on interceptions, one entry a plan.
+    """Verdict on B plans of interceptions.
 
     Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s.
-    Clearances are least distances of the body from an obstacle over the samples: minus the
-    penetration depth where they overlap, and infinite without an obstacle.
+    A clearance is the least distance of the car's body from an obstacle over the samples. It is
+    minus the penetration depth if they overlap, and infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
@@ -93,16 +94,16 @@ def referee_intercepts(
     tolerance: float = 1e-3,
     contact_tolerance: float = 1e-3,
 ) -> InterceptVerdict:
-    """Judge every plan of a batch.
+    """Decide for every plan of a batch of interceptions whether it succeeds.
 
-    Speed and curvature are linear between knots, so the heading is a cubic. The position is
-    integrated between samples by Gauss-Legendre quadrature, to rounding. Speed, acceleration,
-    curvature, steering rate and lateral acceleration are compared with their limits at their
-    extrema, not at samples.
+    Speed and curvature are linear between knots, so the heading is a cubic polynomial of time.
+    Gauss-Legendre quadrature integrates the position between samples, exact to rounding. Speed,
+    acceleration, curvature, steering rate and lateral acceleration are compared with their limits
+    at their extrema, not at samples.
 
     Map, walls and movers are tested at the knots and at samples between them, at most
-    `LONGEST_STEP` apart: 3 cm at 1.5 m/s. At a sample the distance between rectangle and convex
-    polygon is exact.
+    `LONGEST_STEP` apart: a car at 1.5 m/s drives 3 cm in this time. At a sample the distance
+    between rectangle and convex polygon is exact.
 
     Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
     by `turn_rate`), `PolynomialPath` (`coeffs`), or a `LaterPath` (`path` and `begin`) of either.
@@ -119,9 +120,11 @@ def referee_intercepts(
             be a prediction.
         target_positions: function `(target, times (B,) [s]) -> positions (B, 2) [m]` for targets
             of other classes. If passed, it is called for the known classes too.
-        tolerance: relative, of every limit of the car, of the case's tolerance and its heading
-            tolerance; absolute, in their own units, of the plan's first pose, speed and curvature.
-        contact_tolerance: [m], of the body's depth in an obstacle, and of its middle off the map.
+        tolerance: relative tolerance of every limit of the car, of the case's tolerance and its
+            heading tolerance; absolute tolerance, in SI units, of the plan's first pose, speed and
+            curvature.
+        contact_tolerance: [m], greatest depth of the body in an obstacle, and greatest distance of
+            its middle outside the map.
 
     Returns:
         An `InterceptVerdict`; see `referee_hits`. Tolerances and the map's bounds may be infinite.
@@ -132,7 +135,7 @@ def referee_intercepts(
     leaves = _leaves(cases, plans)
     times = leaves["plan.time"].astype(np.float64)
     target = cases.target if truth is None else truth
-    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
+    # Very large numbers may overflow. The verdict reports them, so NumPy's warnings are off.
     with np.errstate(all="ignore"):
         where = (target_positions or target_positions_of)(target, times)
     leaves["target"] = check_leaf("target_positions", where, (*times.shape, 2))
@@ -163,7 +166,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
-    """Return the arrays of walls or movers by name, zero for absent ones."""
+    """Return the arrays of walls or movers by name; the numbers of absent obstacles are zero."""
     corners = np.asarray(group.corners)
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
@@ -180,7 +183,7 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
 
 
 def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
-    """Return positions (B, 2) [m] of targets of the known classes at times (B,) [s]."""
+    """Return the positions (B, 2) [m] of targets of the library's classes at times (B,) [s]."""
     fields, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
@@ -239,7 +242,10 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
 
 
 def final_poses(plans, body) -> np.ndarray:
-    """Return the final poses (B, 3) of the rear axles for plans with the fields of `CarPlan`."""
+    """Return the poses (B, 3) of the rear axles at the end of plans with the fields of `CarPlan`.
+
+    A pose is x [m], y [m] and heading [rad].
+    """
     case = {
         "plan.start": plans.start,
         "plan.speed": plans.speed,
@@ -266,7 +272,10 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def _start(case: dict, allowed: float) -> tuple:
-    """Test the plan's first pose, speed and curvature; return (failed, largest error, time)."""
+    """Test that pose, speed and curvature at time 0 are the case's; return (failed, error, time).
+
+    The error is the largest of the four errors in SI units: distance, heading, speed, curvature.
+    """
     away = case["plan.start"] - case["start"]
     errors = [
         np.linalg.norm(away[:, :2], axis=1),
@@ -279,27 +288,29 @@ def _start(case: dict, allowed: float) -> tuple:
 
 
 def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the greatest of values (B, M), and its time (B,) [s]."""
+    """Return the greatest of M values for each of B plans, and its time (B,) [s]."""
     lanes, top = np.arange(len(values)), values.argmax(axis=1)
     return values[lanes, top], np.broadcast_to(times, values.shape)[lanes, top]
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure and test the motion in pieces of duration (B,) [s].
+    """Measure and test speed, acceleration, curvature, steering rate and lateral acceleration.
 
-    Returns measurements, and (failed, excess, time) by test.
+    Each piece between two knots lasts `span` (B,) [s]. Returns measurements, and
+    (failed, excess, time) by test.
     """
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
     rise, bend = np.diff(v) / h, np.diff(k) / h
-    # delta = atan(L k) changes fastest where |k| is least.
+    # The steering angle atan(L k), of wheelbase L and curvature k, changes fastest where |k| is
+    # least, since k is linear in time.
     zero = np.clip(np.where(bend == 0.0, 0.0, -k0 / bend), 0.0, h)
     zero = np.where(k0 * k1 < 0.0, zero, np.where(np.abs(k0) <= np.abs(k1), 0.0, h))
     least = np.where(k0 * k1 < 0.0, 0.0, np.minimum(np.abs(k0), np.abs(k1)))
     wheelbase = case["body.wheelbase"][:, None]
     steering = np.abs(wheelbase * bend) / (1.0 + (wheelbase * least) ** 2)
-    # v^2 k has its extrema where v = 0, and where 2 v' k + v k' = 0.
+    # The lateral acceleration v^2 k has its extrema where v = 0, and where 2 v' k + v k' = 0.
     slope = 3.0 * rise * bend
     inside = np.where(slope == 0.0, 0.0, -(2.0 * rise * k0 + bend * v0) / slope)
     inside = np.clip(inside, 0.0, h)
@@ -319,7 +330,8 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
         name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
         for name, (value, time) in peaks.items()
     }
-    # The car may not reverse: a speed below zero counts like one above the limit.
+    # The car may not drive backwards, so a negative speed fails the same test as a speed above the
+    # limit.
     limit = case["limits.speed"][:, None]
     scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
     excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)
@@ -328,9 +340,10 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 
 
 def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and poses (B, S, 3) of the body's middle, in pieces of (B,) [s].
+    """Integrate the motion; return times (B, S) [s] and poses (B, S, 3) of the body's middle.
 
-    Lanes with fewer samples than others repeat the end of each piece.
+    Each piece between two knots lasts `span` (B,) [s]. All plans have the same number S of samples:
+    plans that need fewer samples repeat the end of each piece.
     """
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
@@ -338,7 +351,7 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
     rise, bend = (np.where(h > 0.0, np.diff(each, axis=1) / h, 0.0) for each in (v, k))
 
     def heading_change(tau: np.ndarray) -> np.ndarray:
-        """Integrate v k (B, K, ...) since the start of each piece."""
+        """Return the heading's change [rad], the integral of v k from each piece's start to tau."""
         return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
 
     count = np.maximum(np.ceil(span / LONGEST_STEP - 1e-9), 1.0)
@@ -367,7 +380,7 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Measure clearances at poses (B, S, 3) of the body's middle; test map, walls and movers."""
+    """Test map, walls and movers at poses (B, S, 3) of the body's middle; measure clearances."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

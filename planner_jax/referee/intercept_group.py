@@ -23,10 +23,10 @@ from planner_jax.referee.judging import check_leaf
 
 @dataclasses.dataclass(frozen=True)
 class GroupVerdict(InterceptVerdict):
-    """Verdict on groups of interceptions, one entry a group.
+    """Verdict on B plans in which a car meets several targets in turn.
 
-    Measurements are of the first leg that fails, or of the last leg of a success. Times count
-    from the start of the first leg.
+    The drive to one target is a leg. Measurements are those of the first leg that fails, or of the
+    last leg if all succeed. Times count from the start of the first leg.
     """
 
     SENTENCES = {
@@ -46,11 +46,11 @@ class GroupVerdict(InterceptVerdict):
 def referee_groups(
     cases: Any, plans: Any, *, target_positions: Callable | None = None, **settings: Any
 ) -> GroupVerdict:
-    """Judge every plan of a batch.
+    """Decide for every plan of a batch of group interceptions whether it succeeds.
 
-    Leg k must start with the pose, speed and curvature at the end of leg k - 1, within the
-    tolerance of `referee_intercepts`. It must end within the remainder of the case's time. Legs to
-    absent targets are not read.
+    Leg k, the drive to the k-th target, must start with the pose, speed and curvature at the end of
+    leg k - 1, within the tolerance of `referee_intercepts`. It must end within the remainder of the
+    case's time. Legs to absent targets are not read.
 
     Args:
         cases: object with the fields of `InterceptGroup`, leaves with leading axis B.
@@ -96,7 +96,10 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """Return the interceptions that start at times (B,) [s] with a pose, speed and curvature."""
+    """Return the cases of legs that start at times `begin` (B,) [s] with the state `car`.
+
+    The state `car` is pose, speed and curvature.
+    """
     movers, (start, speed, curvature) = shared.movers, car
     centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}
@@ -106,12 +109,12 @@ def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNames
 
 
 def _delay(where: Callable, begin: np.ndarray) -> Callable:
-    """Return the function `where` of times that count from `begin` (B,) [s]."""
+    """Return the function of positions `where` for times that count from `begin` (B,) [s]."""
     return lambda target, times: where(target, begin + times)
 
 
 def _index(tree: Any, at: tuple) -> Any:
-    """Index every array of a dataclass, whose fields may be dataclasses too."""
+    """Return a copy of a (nested) dataclass in which every array x is replaced by x[at]."""
     if not dataclasses.is_dataclass(tree):
         return np.asarray(tree)[at]
     return type(tree)(**{name: _index(leaf, at) for name, leaf in vars(tree).items()})

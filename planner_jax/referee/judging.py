@@ -1,4 +1,8 @@
-"""Verdicts, and the steps of every referee: read arrays, distribute plans, name failures."""
+"""Parts that the referees of all four tasks share.
+
+The module has the base class of verdicts, checks the shapes of arrays, distributes a batch of
+plans over threads or processes, and finds the first limit that each plan violates.
+"""
 
 import dataclasses
 import functools
@@ -13,25 +17,30 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"  # sentence for a failed limit
+# Sentence that describes the violation of an upper limit, for most limits of a verdict.
+ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """The referee's decision on a batch of B plans, or on one plan, whose fields have no axis.
+    """The referee's decision on a batch of B plans, with its measurements.
 
-    Measurements are NaN where the plan or its case is not finite.
+    In a verdict on a single plan the fields have no batch axis. Measurements are NaN where the
+    plan or its case is not finite.
     """
 
-    # Sentence for the failure of each limit, in the order of the tests. It may name `time`,
-    # `excess` and any field of the verdict. A failed plan is named after its first failed test.
+    # By limit: the sentence that describes its violation. A sentence may contain `{time}`,
+    # `{excess}` and any field of the verdict. The order of the limits is the order of the tests,
+    # and `failed_limit` is the first limit whose test fails.
     SENTENCES: ClassVar[dict[str, str]]
-    UNBOUNDED: ClassVar[dict[str, str]] = {}  # sentences for an infinite excess
+    # By limit: the sentence that replaces the one of `SENTENCES` if the excess is infinite.
+    UNBOUNDED: ClassVar[dict[str, str]] = {}
 
-    success: np.ndarray  # (B,) bool
+    success: np.ndarray  # (B,) bool, every limit holds
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
     failed_time: np.ndarray  # (B,) [s], when that limit is exceeded most; NaN for a success
-    # (B,), in the unit of the limit's sentence, tolerance not subtracted; NaN for a success.
+    # (B,) greatest excess over the failed limit, in the unit of the limit's sentence. The
+    # tolerance is not subtracted. NaN for a success.
     failed_excess: np.ndarray
 
     def sentence(self, k: int | None = None) -> str:
@@ -56,7 +65,7 @@ class Verdict:
 
 @dataclasses.dataclass(frozen=True)
 class FlightVerdict(Verdict):
-    """Verdict on plans of a quadrotor, with measurements of the whole flight."""
+    """Verdict on plans of a quadrotor, with extreme values that are measured over the flight."""
 
     max_speed: np.ndarray  # (B,) [m/s]
     max_acceleration: np.ndarray  # (B,) [m/s^2]
@@ -71,14 +80,18 @@ class FlightVerdict(Verdict):
     worst_extra: np.ndarray  # (B,) int, index of the extra limit with the greatest excess, or -1
 
 
-CONTACT_TIME_TOLERANCE = 1e-4  # [s], between the claimed time of a contact and the planned one
-SMALLEST_LIMIT = 1e-3  # smallest divisor of a relative excess, in the limit's own unit
-_FEWEST_LANES = 256  # that are worth a thread
-_MANY_LANES, _MANY_CORES = 16384, 4  # least numbers for which processes judge instead of threads
+# [s] Greatest allowed difference between the contact time that a plan reports and the time at
+# which its trajectory makes the contact.
+CONTACT_TIME_TOLERANCE = 1e-4
+# A relative excess is divided by the limit, or by this number if the limit is smaller.
+SMALLEST_LIMIT = 1e-3
+_FEWEST_LANES = 256  # least number of plans for one thread: fewer do not repay its start
+# Processes instead of threads judge batches of at least so many plans on at least so many cores.
+_MANY_LANES, _MANY_CORES = 16384, 4
 
 
 def check_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
-    """Return `value` as an array; raise ValueError unless it has this shape."""
+    """Convert `value` to an array; raise a ValueError with `name` unless its shape is `shape`."""
     leaf = np.asarray(value)
     if leaf.shape != shape:
         raise ValueError(f"{name} must be {shape}, got {leaf.shape}")
@@ -93,14 +106,14 @@ def read_leaves(
     Args:
         tree: object whose arrays have a leading axis B.
         shapes: shape of each array without that axis, by the path of its fields, as "ball.pos".
-        num_lanes: B.
-        prefix: of each name in the result and in errors.
+        num_lanes: the batch size B.
+        prefix: text before each name in the result and in error messages.
 
     Returns:
-        Arrays by name, without fields that are None.
+        Arrays by name. Fields of `tree` that are None are left out.
 
     Raises:
-        ValueError: an array has another shape.
+        ValueError: an array does not have the shape (B, ...) that `shapes` requires.
     """
     values = {path: operator.attrgetter(path)(tree) for path in shapes}
     return {
@@ -111,23 +124,27 @@ def read_leaves(
 
 
 def flat(values: np.ndarray) -> np.ndarray:
-    """Reshape (B, ...) to (B, N), also for B = 0."""
+    """Flatten all axes behind the first: reshape (B, ...) to (B, N), also if B is zero."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
 def cut(num_lanes: int, size: int) -> list[slice]:
-    """Cut lanes into slices of at most `size`; return one empty slice if there are no lanes."""
+    """Divide a batch of `num_lanes` plans into slices of at most `size` plans.
+
+    An empty batch gives one empty slice.
+    """
     return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
 
 
 def judge_in_chunks(
     judge: Callable[[dict], dict], leaves: dict[str, np.ndarray], chunk: int
 ) -> dict[str, np.ndarray]:
-    """Judge arrays with leading axis B in chunks, and return the fields of the verdict.
+    """Judge B plans in chunks, and return the fields of their verdict as arrays (B, ...).
 
-    At most `chunk` plans are judged together, which bounds the memory. Threads judge the chunks,
-    one for each core, since NumPy releases the interpreter in its loops. If there are many lanes
-    and many cores, and `judge` can be pickled, processes judge instead.
+    At most `chunk` plans are judged together, which bounds the memory. One thread per core judges
+    chunks, since NumPy releases the interpreter lock in its loops. Processes replace the threads
+    if the batch is large (`_MANY_LANES`), there are enough cores (`_MANY_CORES`), and `judge` can
+    be pickled.
     """
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
@@ -146,7 +163,7 @@ def judge_in_chunks(
 
 
 def _judge_in_float64(judge: Callable[[dict], dict], case: dict[str, np.ndarray]) -> dict:
-    # Absurd numbers may overflow: the verdict reports them, so NumPy need not warn.
+    # Very large numbers may overflow. The verdict reports them, so NumPy's warnings are off.
     with np.errstate(all="ignore"):
         return judge({name: leaf.astype(np.float64) for name, leaf in case.items()})
 
@@ -160,7 +177,11 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def cores() -> int:
-    """Return the number of cores to use: `NPROC`, as XLA does, or all that the process may use."""
+    """Return the number of CPU cores that the referee uses.
+
+    The environment variable `NPROC`, which XLA reads too, sets the number. Without it the number
+    is that of the cores on which the process may run.
+    """
     setting = os.environ.get("NPROC", "")
     if setting.isdecimal():
         return max(int(setting), 1)
@@ -171,7 +192,10 @@ def cores() -> int:
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
-    """Test which lanes (B,) are finite; limits and `unbounded` may be infinite, but not NaN."""
+    """Test for each of B plans whether all numbers of its case and plan are finite.
+
+    Arrays of `limits` and the arrays named in `unbounded` may be infinite, but not NaN.
+    """
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded
@@ -181,12 +205,13 @@ def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
 
 
 def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> dict:
-    """Return the fields of `Verdict`: success, and the first failed limit, its time and excess.
+    """Find the first failed limit of each plan, and return the fields of `Verdict`.
 
     Args:
-        tests: (failed, excess, time) by name, each (B,).
-        limits: "not finite", then names in the order of the tests; some may have no test.
-        finite: (B,) bool, the inputs are finite.
+        tests: by name of a limit, the arrays (failed, excess, time), each (B,).
+        limits: "not finite", then the names of limits in the order of the tests. A limit without
+            an entry in `tests` is skipped.
+        finite: (B,) bool, all numbers of the plan and its case are finite.
     """
     limits = (limits[0], *(name for name in limits[1:] if name in tests))
     failed, excess, time = (
@@ -207,14 +232,17 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
 
 
 def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarray) -> tuple:
-    """Test value <= limit; return (failed, relative excess, time)."""
+    """Test value <= limit up to a relative tolerance; return (failed, relative excess, time)."""
     scale = np.where(np.isinf(limit), 1.0, np.maximum(np.abs(limit), SMALLEST_LIMIT))
     excess = (value - limit) / scale
     return excess > tolerance, excess, time
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate a derivative (3, ...) of polynomials (D + 1, 3, ...) at times (...) [s]."""
+    """Evaluate the `order`-th derivative (3, ...) of polynomials at times (...) [s].
+
+    `coeffs` (D + 1, 3, ...) has the coefficients of rising powers on its first axis.
+    """
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

@@ -26,7 +26,8 @@ from planner_jax.referee.judging import (
 class Pieces:
     """Polynomial pieces of B trajectories in float64.
 
-    A piece that is not flown is a copy of the last one that is, which changes no extremum.
+    A piece that the plan does not fly is replaced by a copy of the last flown piece before it. The
+    copy does not change the extreme values of the trajectory.
     """
 
     coeffs: np.ndarray  # (3, B, M, D + 1)
@@ -35,15 +36,16 @@ class Pieces:
     flown: np.ndarray  # (B, M) bool
 
     def of(self, lanes: slice) -> "Pieces":
-        """Return the pieces of some lanes."""
+        """Return the pieces of the trajectories in the slice `lanes` of the batch."""
         others = (part[lanes] for part in (self.durations, self.starts, self.flown))
         return Pieces(self.coeffs[:, lanes], *others)
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
-    """Return the pieces with coefficients (B, M, D + 1, 3) and durations (B, M) [s].
+    """Build `Pieces` from coefficients (B, M, D + 1, 3) and durations (B, M) [s].
 
-    By default all pieces are flown. The others, by `flown` (B, M) bool, must have zero duration.
+    `flown` (B, M) bool marks the pieces that the plans fly, by default all. Unmarked pieces must
+    have zero duration.
     """
     coeffs = np.moveaxis(coeffs, -1, 0)
     starts = np.cumsum(durations, axis=1) - durations
@@ -59,7 +61,7 @@ def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | Non
 
 
 def append_recovery(pieces: Pieces, case: dict) -> Pieces:
-    """Append the pieces of the recovery trajectories, if the plans have any."""
+    """Append the recovery trajectories to standstill behind the pieces, if the plans have them."""
     if "recovery.coeffs" not in case:
         return pieces
     durations = case["recovery.durations"]
@@ -96,22 +98,23 @@ MOTION_SENTENCES = {
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
-SHORTEST_PIECE = 0.1  # [s], least time over which an error of a derivative counts as displacement
-_INTERVALS = 400  # least number between two contacts
-_FEWEST_INTERVALS = 16  # of a piece
-# Multiplications of one matrix product, and lanes whose peaks are searched at once: many to a call
-# of NumPy, but few enough for the cache. Up to 2^18 multiplications OpenBLAS starts no threads of
-# its own, which would compete with the referee's threads.
+# [s] Least duration that converts an error of a derivative to a displacement; see `joint_errors`.
+SHORTEST_PIECE = 0.1
+_INTERVALS = 400  # least number of sample intervals between two contacts
+_FEWEST_INTERVALS = 16  # least number of sample intervals of one polynomial piece
+# Greatest number of multiplications in one matrix product, and of plans whose maxima are searched
+# together. Both limits keep the data in the cache. Above 2^18 multiplications OpenBLAS would also
+# start its own threads, which would compete with the referee's threads.
 _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return the number of sample intervals of each piece between two contacts."""
+    """Return the number of sample intervals per piece, for `num_pieces` between two contacts."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
 def check_coeffs(value: ArrayLike) -> np.ndarray:
-    """Return the coefficients as an array; raise ValueError unless they are (B, M, D + 1, 3)."""
+    """Convert coefficients to an array; raise a ValueError unless it is (B, M, D + 1, 3)."""
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
@@ -121,8 +124,8 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
     """Read the arrays of cases and plans that `judge_motion` needs, except the head state.
 
-    Acceleration, thrust and rotors are optional limits of a case, and the recovery trajectory is
-    an optional part of a plan: they are None if absent.
+    The result has no entries for parts that are None. These parts are a case's limits of
+    acceleration, thrust and rotors, and a plan's recovery trajectory.
     """
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
@@ -142,7 +145,10 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Evaluate the derivatives (3, B, M, S) of order 0 to 3 at fractions u (S,) of all pieces."""
+    """Evaluate position, velocity, acceleration and jerk at fractions u (S,) of all pieces.
+
+    Each of the four arrays is (3, B, M, S).
+    """
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
@@ -183,7 +189,8 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
     return np.where(upright > 0.0, rate, np.inf)
 
 
-# Quantities whose maximum is searched: the derivatives that each one needs, and its function.
+# Quantities whose maximum along the trajectory is searched. Each entry has the orders of the
+# derivatives of the position that the quantity needs, and the function that computes it.
 _MEASURES = {
     "speed": ((1,), lambda gravity, vel: _norm_squared(vel)),
     "acceleration": ((2,), lambda gravity, acc: _norm_squared(acc)),
@@ -195,18 +202,18 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the greatest of samples (N, M, S) of M pieces, and the likeliest peak.
+    """Find the greatest of samples (N, M, S) of M pieces, and where the true maximum likely is.
 
-    Returns the index (N,) of the greatest sample among the M S of a row, its value, and the index
-    of the sample under the highest vertex of a parabola through three samples of a piece. The
-    samples are overwritten.
+    Returns three arrays (N,): the index of the greatest of the M S samples, its value, and the
+    index of the sample next to the likely maximum. The likely maximum is the highest vertex of all
+    parabolas through three neighbouring samples of a piece. The array `values` is overwritten.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
     greatest = rows[np.arange(len(rows)), top]
     crest = np.zeros(values.shape, bool)
     crest.ravel()[1:-1] = (line[1:-1] >= line[:-2]) & (line[1:-1] > line[2:])
-    crest[..., 0] = crest[..., -1] = False  # their neighbour belongs to another piece
+    crest[..., 0] = crest[..., -1] = False  # a neighbour of an end sample is in another piece
     peak = np.flatnonzero(crest)
     left, middle, right = line[peak - 1], line[peak], line[peak + 1]
     line[peak] += (right - left) ** 2 / (8.0 * (2.0 * middle - left - right))
@@ -214,10 +221,10 @@ def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
-    """Find the greatest value (B,) of every quantity along the trajectory, and its time [s].
+    """Find the maximum (B,) of every quantity of `_MEASURES` along the trajectory, and its time.
 
-    Every piece is sampled at both ends and inside. Parabolas through three samples give the
-    likeliest peak, which is then refined on the polynomial itself.
+    Every piece is sampled at both ends and inside. The search then starts at the highest vertex of
+    a parabola through three samples, and evaluates the polynomial itself at ever closer times.
     """
     u = np.linspace(0.0, 1.0, intervals + 1)
     parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in cut(len(gravity), _SEARCHED)]
@@ -230,7 +237,7 @@ def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tupl
 
 
 def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
-    """Find the `peaks` of some lanes, from samples at fractions u (S,)."""
+    """Compute `peaks` for a few plans, from samples at fractions u (S,) of each piece."""
     num_lanes, num_pieces = pieces.durations.shape
     products = num_pieces * pieces.coeffs.shape[-1] * len(u)
     tiles = cut(num_lanes, max(_PRODUCT // products, 1))
@@ -250,7 +257,7 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """Return `_tops` of every quantity, (6, B), and `_fastest_turn`, (B,)."""
+    """Sample all six quantities; return `_tops` of each, (6, B), and `_fastest_turn`, (B,)."""
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
@@ -262,14 +269,14 @@ def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the time (B,) [s] of one sample a lane; indices count the samples of all pieces."""
+    """Return the time (B,) [s] of sample `index` (B,) among the samples of all pieces of a plan."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Refine the greatest value (B,) of a quantity near one sample a lane; return its time too."""
+    """Refine the maximum (B,) of a quantity near the sample `likeliest`; also return its time."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
@@ -285,16 +292,17 @@ def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tup
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greater of two values lane by lane, with its time."""
+    """Return the greater of two (value, time) pairs for each plan; all arrays are (B,)."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the fastest rotation of the thrust between two samples: first sample, squared rate.
+    """Find the fastest rotation of the thrust between two neighbouring samples.
 
-    The mean rate over a step is never above the true maximum. It detects a thrust that passes
-    through zero between two samples, which flips the quadrotor.
+    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step. The
+    mean rate is never above the true maximum. It detects a thrust that passes through zero between
+    two samples, where the quadrotor would have to flip.
     """
     tau = acc.copy()
     tau[2] += gravity
@@ -313,12 +321,13 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
-    """Return errors of head state and joints [m], time of the worst joint, and scale [m].
+    """Return how far a trajectory is off its state at time 0, and its jumps between pieces.
 
-    An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n! over
-    the mean duration h of a piece, at least `SHORTEST_PIECE`. The scale is the largest coordinate
-    at the ends of the pieces, at least 1 m. The head state (B, 4, 3) is position, velocity,
-    acceleration and jerk.
+    The result is four arrays (B,): the error at time 0 [m], the greatest jump between pieces [m],
+    the time of this jump [s], and a scale [m]. An error e_n of the n-th derivative (n = 0..3)
+    counts as the displacement |e_n| h^n / n! over the mean duration h of a piece, at least
+    `SHORTEST_PIECE`. The scale is the largest coordinate at the ends of the pieces, at least 1 m.
+    The head state (B, 4, 3) is position, velocity, acceleration and jerk at time 0.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)
@@ -343,10 +352,11 @@ def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
 def judge_motion(
     pieces: Pieces, case: dict, extras: tuple, intervals: int, relative: float, continuity: float
 ) -> tuple[dict, dict]:
-    """Return the measurements of `FlightVerdict`, and tests (failed, excess, time) by name.
+    """Test a flight against its case's limits, start state and continuity.
 
-    A case has "head_state" and the arrays of `read_flight`. The tolerance of head state and joints
-    is `continuity` times the scale of the coordinates.
+    Returns the measurements of `FlightVerdict`, and tests (failed, excess, time) by name. The
+    dictionary `case` has "head_state" and the arrays of `read_flight`. The tolerance of the start
+    state and of jumps between pieces is `continuity` times the scale of `joint_errors`.
     """
     found = peaks(pieces, case["gravity"], intervals)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])
@@ -373,7 +383,8 @@ def judge_motion(
         "continuity": (jump > allowed, jump, jump_time),
         "extra": (beyond > relative, beyond, at),
     }
-    # By test: peak, measurement, field of the limit, sign (1 for an upper limit, -1 for a lower).
+    # By test: the quantity in `found`, the measurement, the limit's field in the case, and the sign
+    # (1 for an upper limit, -1 for a lower limit).
     bounds = {
         "speed": ("speed", "max_speed", "speed", 1.0),
         "acceleration": ("acceleration", "max_acceleration", "acceleration", 1.0),
@@ -398,9 +409,10 @@ def judge_motion(
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """Test that recovery trajectories end at standstill; return no test if plans have none.
+    """Test that recovery trajectories end at standstill.
 
-    Velocity, acceleration and jerk at the end count as displacement, as in `joint_errors`.
+    Velocity, acceleration and jerk at the end count as displacement [m], as in `joint_errors`. The
+    result is empty if the plans have no recovery trajectory.
     """
     if "recovery.coeffs" not in case:
         return {}

@@ -1,8 +1,8 @@
-"""The thrusts of a quadrotor's rotors along a trajectory, in float64 NumPy.
+"""Thrusts of a quadrotor's four rotors along a trajectory, for the referee, in float64 NumPy.
 
 The attitude follows from the thrust (Hopf fibration at zero heading), and the body rate from the
 cross product of thrust and jerk. The angular acceleration is a central difference of body rates,
-whereas the planners compute it from the snap.
+so that the referee checks the planners, which compute it from the snap.
 """
 
 import numpy as np
@@ -10,14 +10,15 @@ import numpy as np
 from planner_jax.referee.judging import cut, derivative
 from planner_jax.referee.quadrotor import Pieces
 
-_MOMENT = 1e-5  # [s], half the step of the central difference
-_NUMBERS = 250_000  # samples that are computed at once: they fit a cache
+_MOMENT = 1e-5  # [s], half the step of the central difference of body rates
+_NUMBERS = 250_000  # greatest number of samples computed at once, so that they fit the cache
 
 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure the least and greatest thrust (B,) [N] of a rotor, and test both.
+    """Measure the least and the greatest thrust (B,) [N] of any rotor, and test both.
 
-    Every piece is sampled at fractions u (S,) of its duration.
+    Every polynomial piece is sampled at fractions u (S,) of its duration. Returns measurements,
+    and tests (failed, relative excess, time) by name.
     """
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
@@ -27,7 +28,7 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
         np.concatenate(found) for found in zip(*parts, strict=True)
     )
     low, high = case["limits.rotors.min_thrust"], case["limits.rotors.max_thrust"]
-    # Both are relative to the upper limit, since the lower one is zero for most rotors.
+    # Both excesses are relative to the upper limit, since the lower limit of most rotors is zero.
     below, beyond = (low - least) / high, most / high - 1.0
     tests = {
         "rotor low": (~(below <= relative), below, least_time),
@@ -37,7 +38,7 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
 
 
 def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return least thrust (B,) [N] of a rotor and its time, greatest thrust and its time."""
+    """Return the least thrust (B,) [N] of any rotor, its time, the greatest, and its time."""
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
@@ -58,7 +59,9 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Return the thrusts (B, M, S, 4) [N] of the rotors; not finite where there is no attitude.
+    """Return the thrusts (B, M, S, 4) [N] of the four rotors at S samples of M pieces.
+
+    The thrusts are not finite where the attitude is undefined: without thrust and upside down.
 
     Args:
         coeffs: (3, B, M, D + 1), of rising powers of the time since each piece's start.
@@ -66,13 +69,14 @@ def rotor_thrusts(
         gravity: (B,) [m/s^2], magnitude.
         mass: (B,) [kg].
         inertia: (B, 3) [kg m^2], about the body's axes.
-        mixer: (B, 4, 4), from thrust and torques to the thrusts of the rotors.
+        mixer: (B, 4, 4), matrix from thrust [N] and torques [N m] to the thrusts of the rotors.
     """
     pull, rate = _pull_and_rate(coeffs, times, gravity)
     before, after = (
         _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
     )
-    # The derivative of the body rate is the same in both frames, as omega x omega = 0.
+    # The angular velocity has the same derivative in the world frame and in the body frame, since
+    # the two differ by omega x omega = 0.
     change = (after - before) / (2.0 * _MOMENT)
     axes = _body_axes(pull)
     own = np.einsum("...ij,...i->...j", axes, rate)
@@ -87,19 +91,26 @@ def rotor_thrusts(
 def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return thrust per unit mass [m/s^2] and world angular velocity [rad/s], (B, M, S, 3)."""
+    """Return the thrust per unit mass [m/s^2] and the angular velocity [rad/s] at samples.
+
+    Both are (B, M, S, 3), in the world frame.
+    """
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
-    # omega = tau x jerk / |tau|^2 + the rate about the thrust that keeps the heading zero.
+    # omega = tau x jerk / |tau|^2 + r tau / |tau|, with the thrust tau. The rate r about the thrust
+    # is the rate that keeps the heading zero.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
     return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
 
 
 def _body_axes(pull: np.ndarray) -> np.ndarray:
-    """Return the shortest rotations (..., 3, 3) from the vertical to thrusts (..., 3)."""
+    """Return rotations (..., 3, 3), body to world, that turn the z axis into thrusts (..., 3).
+
+    They are the shortest such rotations, which is the convention of zero heading.
+    """
     up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
     x, y, z = np.moveaxis(up, -1, 0)
     k = 1.0 / (1.0 + z)

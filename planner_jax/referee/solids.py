@@ -1,23 +1,24 @@
-"""Distances in space between points, segments and boxes, in float64 NumPy.
+"""Distances in space between points, line segments and boxes, in float64 NumPy.
 
-Vectors (3, ...) [m] have their components first, and arguments broadcast. All distances are closed
-forms, exact to rounding.
+The referee's collision tests of the arm call this module. Vectors (3, ...) [m] have their x, y, z
+components on the first axis, and the other axes broadcast. Distances are exact to rounding.
 """
 
 import itertools
 
 import numpy as np
 
-_PARALLEL = 1e-9  # edges are parallel if the cross product of their directions is shorter
+# Two edges count as parallel if the cross product of their unit directions is shorter than this.
+_PARALLEL = 1e-9
 
 
 def dot(a: np.ndarray | list, b: np.ndarray | list) -> np.ndarray:
-    """Return inner products (...) of vectors (3, ...), or of lists of their components."""
+    """Return the inner products (...) of vectors (3, ...), or of lists of three components."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def length(vector: np.ndarray | list) -> np.ndarray:
-    """Return the lengths (...) of vectors (3, ...)."""
+    """Return the Euclidean norms (...) of vectors (3, ...)."""
     return np.sqrt(dot(vector, vector))
 
 
@@ -32,7 +33,10 @@ def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return distances (...) [m] of points from segments, whose length may be zero."""
+    """Return the distances (...) [m] of points from line segments with ends `first` and `second`.
+
+    All three arrays are (3, ...) [m]. A segment may have zero length.
+    """
     span, away = second - first, point - first
     square = dot(span, span)
     share = np.clip(_ratio(dot(away, span), square), 0.0, 1.0)
@@ -57,17 +61,18 @@ def between_segments(
 
 
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Return distances (...) [m] of segments from boxes around the origin; zero where they meet.
+    """Return the distances (...) [m] of line segments from axis-aligned boxes around the origin.
 
-    Along the segment the squared distance is convex. Its slope is piecewise linear, with breaks
-    where the segment crosses the planes of the box's sides. The root of the slope lies between the
-    last break with a negative slope and the first with a positive one. Ends and half edges are
-    (3, ...).
+    The distance is zero where a segment meets its box. Along a segment the squared distance is
+    convex, and its derivative is piecewise linear. The derivative has breaks where the segment
+    crosses the planes of the box's sides. The minimum lies between the last break with a negative
+    derivative and the first break with a positive one. The segment's ends `first` and `second`
+    and the box's half edges `half` are (3, ...) [m].
     """
     span = second - first
 
     def beyond(share: np.ndarray) -> list:
-        """Return the vector from the box to the point of the segment at `share`."""
+        """Return the vector from the box to the point first + share * (second - first)."""
         point = [first[k] + share * span[k] for k in range(3)]
         return [x - np.clip(x, -half[k], half[k]) for k, x in enumerate(point)]
 
@@ -86,17 +91,18 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
 def between_boxes(
     middle: np.ndarray, rotation: np.ndarray, half: np.ndarray, other: np.ndarray
 ) -> np.ndarray:
-    """Return distances (P,) [m] between boxes; minus the penetration depth where they overlap.
+    """Return the distances (P,) [m] between P pairs of boxes.
 
-    Separating axes are the normals of the sides and the cross products of the edges. If the
-    greatest gap along them is negative, the boxes overlap, and the gap is minus the depth.
-    Otherwise a nearest point lies on an edge of one of the boxes.
+    The distance is minus the penetration depth where two boxes overlap. The candidates for a
+    separating axis are the normals of the sides and the cross products of the edges. If the
+    greatest gap along these axes is negative, the boxes overlap, and the gap is minus the depth.
+    Otherwise one of the two nearest points lies on an edge of its box.
 
     Args:
-        middle: (3, P), of the first box in the frame of the second.
-        rotation: (3, 3, P), from the frame of the first box to the frame of the second.
-        half: (3, P), half edges of the first box.
-        other: (3, P), half edges of the second box, around the origin.
+        middle: (3, P) [m], centre of the first box in the frame of the second box.
+        rotation: (3, 3, P), from the frame of the first box to the frame of the second box.
+        half: (3, P) [m], half edges of the first box.
+        other: (3, P) [m], half edges of the second box, which is centred at the origin.
     """
     axes = [np.broadcast_to(axis[:, None], middle.shape) for axis in np.eye(3)]
     own = [rotation[:, k] for k in range(3)]
@@ -118,7 +124,10 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return the least distances (P,) [m] of edges of the first boxes; see `between_boxes`."""
+    """Return the least distance (P,) [m] of the 12 edges of each first box from its second box.
+
+    The arguments are those of `between_boxes`.
+    """
     edges = rotation * half  # (3, 3, P), half of each
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
@@ -129,6 +138,6 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
 
 
 def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Return the quotient, or zero where the divisor is zero."""
+    """Return value / by, or zero where the divisor `by` is zero."""
     none = by == 0.0
     return np.where(none, 0.0, value / np.where(none, 1.0, by))

@@ -1,7 +1,8 @@
-"""Processes that judge, for batches so large that threads would wait for the interpreter.
+"""Worker processes of the referee, for batches of more than 16,000 plans.
 
-A worker runs this module with `python -m`: it imports the referee and NumPy, and nothing of the
-calling program, which therefore needs no `if __name__ == "__main__"`.
+In such batches threads would wait for the interpreter lock. A worker process runs this module with
+`python -m`. It imports the referee and NumPy, but not the calling program. The calling program
+therefore needs no `if __name__ == "__main__"`.
 """
 
 import atexit
@@ -19,13 +20,17 @@ from planner_jax.referee.judging import cores
 
 ArgumentT = TypeVar("ArgumentT")
 ResultT = TypeVar("ResultT")
-_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}  # each worker has one core
+# Environment of a worker: NumPy uses one thread, since there is one worker for each core.
+_ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 
 
 def map_in_processes(
     function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
 ) -> list[ResultT]:
-    """Return `function` of each argument; `pickle` must be able to write both."""
+    """Return the results of `function` for all arguments, computed in worker processes.
+
+    The function, its arguments and its results must be objects that `pickle` can write.
+    """
     threads, idle = _start_workers()
 
     def call(argument: ArgumentT) -> ResultT:
@@ -41,7 +46,7 @@ def map_in_processes(
 def _call(
     worker: subprocess.Popen, function: Callable[[ArgumentT], ResultT], argument: ArgumentT
 ) -> ResultT:
-    """Compute the function's result in a worker; raise the exception that it raises there."""
+    """Compute function(argument) in a worker process; raise the exception that it raises there."""
     assert worker.stdin is not None and worker.stdout is not None
     try:
         pickle.dump((function, argument), worker.stdin, pickle.HIGHEST_PROTOCOL)
@@ -57,7 +62,10 @@ def _call(
 
 @functools.cache
 def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
-    """Start one process a core, and the threads that wait for them; they end with the program."""
+    """Start one worker process per core, and a pool of threads that wait for their results.
+
+    Processes and threads end when the calling program ends.
+    """
     num, idle = cores(), SimpleQueue()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **_ONE_THREAD}
     pipe, command = subprocess.PIPE, [sys.executable, "-m", __name__]
@@ -75,7 +83,7 @@ def _stop_workers(threads: ThreadPoolExecutor, idle: SimpleQueue) -> None:
 
 
 def _serve() -> None:
-    """Answer calls until the pipe is closed."""
+    """Read pickled calls from stdin and write their results to stdout until stdin is closed."""
     calls, answers = sys.stdin.buffer, sys.stdout.buffer
     while True:
         try:

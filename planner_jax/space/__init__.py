@@ -1,1 +1,1 @@
-"""Distances between segments, rectangles, boxes and vertical lines in space."""
+"""Differentiable distances in space between segments, rectangles, boxes and vertical lines."""

@@ -1,8 +1,8 @@
-"""Distances between segments and rectangles in space, and of both from boxes, poles and the ground.
+"""Differentiable distances between segments, rectangles, boxes, vertical lines and the ground.
 
-Every function is a closed form for ONE pair of bodies, without loops or branches; `jax.vmap` makes
-many. The distance of a capsule is the distance of its segment less its radius. Any frame, SI units;
-the ground is the plane of x and y. The bodies are:
+The planner of blocks keeps an arm's links and shield clear of obstacles with this module. Every
+function takes ONE pair of bodies; use `jax.vmap` for many pairs. The distance of a capsule is the
+distance of its axis minus its radius. Any frame, SI units; the ground is the x-y plane. Bodies are:
 
 * a segment: `ends` (2, 3) [m], which may coincide;
 * a rectangle: its `middle` (3,) [m] and `edges` (2, 3) [m], halves of its edges as vectors from the
@@ -11,14 +11,13 @@ the ground is the plane of x and y. The bodies are:
 * a vertical line of infinite length, such as the axis of a pole: its `position` (2,) [m] on the
   ground.
 
-A distance is the least length |gap| of a vector between points of both bodies. Moving the nearest
-points along their bodies changes it only in second order, so the derivative of the distance is the
-derivative of |gap| at fixed nearest points (the envelope theorem). `_shortest` declares this rule
-to JAX: derivatives cost little more than values, and need no division by the sine of the angle
-between nearly parallel bodies. Bodies that cross have distance 0 and derivative 0. If several pairs
-of points are nearest, as between parallel bodies, the derivative belongs to one of them. `approach`
-returns the line through the nearest points, from which the derivatives by many rotations and
-translations follow in a few products.
+A distance is the least length |gap| of a vector between points of two bodies. The derivative of the
+distance is the derivative of |gap| with the nearest points fixed on their bodies (the envelope
+theorem). `_shortest` declares this rule to JAX. Derivatives then cost little more than values, and
+need no division by the sine of the angle between nearly parallel bodies. Bodies that cross have
+distance 0 and derivative 0. Parallel bodies can have several pairs of nearest points; the
+derivative then belongs to one of these pairs. `approach` returns the line through the nearest
+points. Derivatives by many rotations and translations follow from this line in a few products.
 
 Vectors are tuples of components here, so that XLA compiles one elementwise loop over the batch.
 """
@@ -33,70 +32,72 @@ from jax import Array, lax
 
 Vector = tuple[Array, ...]
 
-_TINY = 1e-24  # smaller squares of lengths [m^2] or areas [m^4] count as zero
+_TINY = 1e-24  # a smaller squared length [m^2] or squared area [m^4] counts as zero
 
 
 def segment_to_segment(ends_a: Array, ends_b: Array) -> Array:
-    """Return the distance () [m] of two segments."""
+    """Return the distance () [m] between two segments, each given by its ends (2, 3) [m]."""
     return _shortest(_nearest_of_segments, _gap_of_segments, (ends_a, ends_b))
 
 
 def segment_to_rectangle(ends: Array, middle: Array, edges: Array) -> Array:
-    """Return the distance () [m] of a segment and a flat rectangle, 0 if they cross."""
+    """Return the distance () [m] between a segment and a flat rectangle; it is 0 if they cross."""
     return _shortest(_nearest_of_rectangle, _gap_to_rectangle, (ends, middle, edges))
 
 
 def segment_to_box(ends: Array, lower: Array, upper: Array) -> Array:
-    """Return the distance () [m] of a segment and a box, 0 if a point of the segment is inside."""
+    """Return the distance () [m] between a segment and a box; it is 0 if they intersect."""
     return _shortest(_nearest_of_box, _gap_to_box, (ends, lower, upper))
 
 
 def segment_to_vertical_line(ends: Array, position: Array) -> Array:
-    """Return the horizontal distance () [m] of a segment and a vertical line."""
+    """Return the horizontal distance () [m] between a segment and a vertical line."""
     return _shortest(_nearest_to_line, _gap_to_line, (ends, position))
 
 
 def rectangle_to_vertical_line(middle: Array, edges: Array, position: Array) -> Array:
-    """Return the horizontal distance () [m] of a rectangle and a vertical line, 0 if they cross.
+    """Return the horizontal distance () [m] of a rectangle from a vertical line, 0 if they cross.
 
-    The edges need not be at right angles: any parallelogram is valid, also an upright one.
+    Any parallelogram is valid, including a vertical one: its edges need not be at right angles.
     """
     return _shortest(_nearest_of_projection, _gap_of_projection, (middle, edges, position))
 
 
 def lowest_of_segment(ends: Array) -> Array:
-    """Return the height () [m] of the lowest point of a segment."""
+    """Return the height () [m] of the lowest point of a segment above the ground."""
     return jnp.minimum(ends[0, 2], ends[1, 2])
 
 
 def lowest_of_rectangle(middle: Array, edges: Array) -> Array:
-    """Return the height () [m] of the lowest point of a rectangle."""
+    """Return the height () [m] of the lowest point of a rectangle above the ground."""
     return middle[2] - jnp.abs(edges[0, 2]) - jnp.abs(edges[1, 2])
 
 
 class Approach(NamedTuple):
     """The line through the nearest points of two bodies, in Pluecker coordinates."""
 
-    direction: Vector  # 3 times (), unit, from the second body to the first; 0 if they cross
-    moment: Vector  # 3 times () [m], p x direction for any point p of the line
+    # Three components (), a unit vector from the second body to the first; 0 if the bodies cross.
+    direction: Vector
+    moment: Vector  # three components () [m], p x direction for any point p of the line
 
 
 def approach(distance: Callable, *bodies: Array) -> Approach:
     """Return the line through the nearest points of two bodies.
 
-    If the first body turns about an axis a through a point o, the derivative of the distance by the
-    angle is a . (moment - o x direction). If the second body turns, the sign is the opposite.
+    If the first body rotates about an axis a through a point o, the derivative of the distance by
+    the angle is a . (moment - o x direction). If the second body rotates, the sign is the opposite.
 
     Args:
-        distance: a distance or a height of this module; for a height the second body is the ground.
-        bodies: the arguments of `distance`.
+        distance: function of this module that returns a distance or a height. For a height the
+            second body is the ground.
+        bodies: the arguments of the function `distance`.
     """
     nearest_of, gap_of, point_of = _PARTS[distance]
     nearest = nearest_of(*bodies)
     point, gap = point_of(nearest, *bodies), gap_of(nearest, *bodies)
-    # A horizontal gap has two components.
+    # A horizontal gap has two components; add a third that is zero.
     gap = (*gap, *[jnp.zeros_like(gap[0])] * (3 - len(gap)))
-    # Divide last: XLA computes a quotient once, but other arithmetic once for each use.
+    # Divide last: XLA computes a quotient only once, but repeats cheaper arithmetic for each use.
     length = _length(gap)
     length = jnp.where(length > 0.0, length, jnp.inf)
     direction, moment = (tuple(x / length for x in each) for each in (gap, cross(point, gap)))
@@ -105,10 +106,10 @@ def approach(distance: Callable, *bodies: Array) -> Approach:
 
 @partial(jax.custom_jvp, nondiff_argnums=(0, 1))
 def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Array:
-    """Return the distance () [m] of two bodies.
+    """Return the distance () [m] between two bodies.
 
-    `nearest` returns the parameters of the nearest points, such as shares of segments. `gap`
-    returns the vector from the second body's nearest point to the first body's.
+    `nearest` returns the parameters of the nearest points, such as fractions from 0 to 1 along
+    segments. `gap` returns the vector from the second body's nearest point to that of the first.
     """
     return _length(gap(nearest(*bodies), *bodies))
 
@@ -122,12 +123,13 @@ def _shortest_jvp(nearest: Callable, gap: Callable, primals: Any, tangents: Any)
 
 
 def _nearest_of_segments(ends_a: Array, ends_b: Array) -> tuple[Array, Array]:
-    """Return the shares of both segments at which they are nearest.
+    """Return the fractions, from 0 to 1, along both segments at which they are nearest.
 
-    The first share is where the infinite lines are nearest. Then each segment in turn takes its
-    point nearest to the other's point, which ends at the optimum (C. Ericson, Real-Time Collision
-    Detection, 2005, 5.1.9). The first share is computed from the normal u x v, not from products of
-    dot products, so that it is accurate in float32 for lines at any angle.
+    The first fraction is where the infinite lines are nearest, clipped to [0, 1]. Then the second
+    segment takes its point nearest to the first point, and the first segment its point nearest to
+    that. The result is exact (C. Ericson, Real-Time Collision Detection, 2005, 5.1.9). The first
+    fraction is computed from the normal u x v instead of dot products of u and v, so that it is
+    accurate in float32 for lines at any angle.
     """
     (start_a, end_a), (start_b, end_b) = _rows(ends_a), _rows(ends_b)
     u, v, between = _minus(end_a, start_a), _minus(end_b, start_b), _minus(start_b, start_a)
@@ -144,7 +146,7 @@ def _gap_of_segments(shares: tuple[Array, Array], ends_a: Array, ends_b: Array) 
 
 
 def _nearest_of_box(ends: Array, lower: Array, upper: Array) -> tuple[Array]:
-    """Return the share of the segment at which it is nearest to the box."""
+    """Return the fraction, from 0 to 1, along the segment at which it is nearest to the box."""
     start, end = _rows(ends)
     slabs = [
         _slab(low - x, high - x, speed, speed * speed)
@@ -161,10 +163,11 @@ def _gap_to_box(shares: tuple[Array], ends: Array, lower: Array, upper: Array) -
 
 
 def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
-    """Return the shares of the segment and the half-edges, and whether the bodies are apart.
+    """Return the parameters of the nearest points of a segment and a rectangle.
 
-    Shares of half-edges are from -1 to 1. The rectangle is a box without thickness along axes of
-    its own: the half-edges e and f, and e x f. Squared lengths are in units of |e|^2 |f|^2, which
+    They are the fraction along the segment (0 to 1), the multiples of both half-edges (-1 to 1),
+    and whether the bodies are apart. The rectangle is treated as a box without thickness, whose
+    axes are the half-edges e and f, and e x f. Squared lengths are in units of |e|^2 |f|^2, which
     saves divisions.
     """
     (start, end), (e, f) = _rows(ends), _rows(edges)
@@ -200,23 +203,23 @@ def _gap_to_rectangle(nearest: Any, ends: Array, middle: Array, edges: Array) ->
 
 
 class _Slab(NamedTuple):
-    """The intersection of a segment's line with the space between two parallel planes."""
+    """Where a segment's line enters and leaves a slab, the space between two parallel planes."""
 
-    enters: Array  # () share of the segment at which its line enters
-    leaves: Array  # () share at which the line leaves, at least `enters`
-    weight: Array  # () squared length of the segment across the slab; 0 if it is parallel
+    enters: Array  # () fraction of the segment at which its line enters the slab
+    leaves: Array  # () fraction at which the line leaves the slab, at least `enters`
+    weight: Array  # () squared length of the segment across the slab; 0 if they are parallel
 
 
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
-    """Make a slab from the distances () of both planes from a segment's start.
+    """Make a slab from the signed distances () of its two planes from a segment's start.
 
-    `speed` is the segment's length across the slab, and `weight` its square in a unit that all
-    slabs of a problem share.
+    `speed` is the segment's signed length across the slab. `weight` is the square of this length,
+    in a unit that all slabs of one pair of bodies have in common.
     """
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)
-    # Do not multiply by the inverse: a product may be fused with a later difference, which then
-    # is not exactly 0.
+    # Do not multiply by 1 / step: XLA may fuse a product with a later difference of two equal
+    # numbers, and the difference is then not exactly 0.
     first, last = to_low / step, to_high / step
     return _Slab(
         enters=jnp.minimum(first, last),
@@ -226,20 +229,22 @@ def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
 
 
 def _share_nearest_to_slabs(slabs: list[_Slab]) -> Array:
-    """Return the share () of a segment nearest to the intersection of three orthogonal slabs.
+    """Return the fraction () along a segment nearest to the intersection of orthogonal slabs.
 
-    The squared distance of a point of the segment is the sum over the slabs of its squared distance
-    from each. It is convex in the share s, and half its derivative,
+    A slab is the space between two parallel planes. The squared distance of the segment's point at
+    the fraction s is the sum of its squared distances from three slabs i. It is convex in s, and
+    half its derivative,
 
         sum_i  weight_i (max(s - leaves_i, 0) - max(enters_i - s, 0)),
 
     is piecewise linear and never falls, with kinks where the segment's line enters and leaves the
-    slabs. Its zero lies between the last kink with a value <= 0 and the first with a value >= 0,
-    and is found there by interpolation. If it is 0 on a whole interval, the middle is returned.
+    slabs. The derivative's zero is interpolated between the last kink with a value <= 0 and the
+    first kink with a value >= 0. If it is 0 on an interval, the interval's middle is returned.
 
-    In this form a slab adds exactly 0 at its own kinks, also in float32. Computed from coordinates
-    it would add a rounding error in proportion to the segment's length across it. That error hides
-    the other terms if the segment is nearly parallel to their slabs, and moves the zero.
+    In this form the term of a slab is exactly 0 at the slab's own kinks, also in float32. A term
+    computed from coordinates would have a rounding error in proportion to the segment's length
+    across the slab. This error could exceed the terms of slabs that are nearly parallel to the
+    segment, and move the zero.
     """
 
     def half_derivative(s: Array | float) -> Array:
@@ -273,9 +278,10 @@ def _gap_to_line(shares: tuple[Array], ends: Array, position: Array) -> Vector:
 
 
 def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
-    """Return the shares of both half-edges, from -1 to 1, and whether the line is outside.
+    """Return where a rectangle is nearest to a vertical line, in the projection onto the ground.
 
-    They belong to the nearest point on the four edges of the rectangle's projection.
+    The point of the projection's four edges that is nearest to the line is given as multiples, from
+    -1 to 1, of both half-edges. The third result is whether the line is outside the projection.
     """
     e, f = _ground(edges)
     to_x, to_y = to = tuple(x - m for x, m in zip(position, middle[:2], strict=True))
@@ -295,7 +301,8 @@ def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
             p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # All areas are 0 for points in line with a projection without width, however far off.
+    # The projection of a vertical rectangle has no width. All its areas are 0 for points on its
+    # line, at any distance, so a test of the distance from the middle is added.
     inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 
@@ -310,14 +317,14 @@ def _gap_of_projection(nearest: Any, middle: Array, edges: Array, position: Arra
 
 
 def _length(vector: Vector) -> Array:
-    """Return the length () of a vector; 0, with derivative 0, if it is too short."""
+    """Return the length () of a vector; 0, with derivative 0, if it is below 1e-12."""
     square = dot(vector, vector)
     apart = square > _TINY
     return jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
 
 
 def _ratio(top: Array, square: Array) -> Array:
-    """Return top / square (), or 0 if the square is 0."""
+    """Return top / square (), or 0 if the divisor `square` is at most `_TINY`."""
     is_positive = square > _TINY
     return jnp.where(is_positive, top / jnp.where(is_positive, square, 1.0), 0.0)
 
@@ -327,18 +334,18 @@ def _unit(share: Array) -> Array:
 
 
 def _point(ends: Array, share: Array) -> Vector:
-    """Return the point of a segment (2, 3) at a share ()."""
+    """Return the point start + share * (end - start) of a segment with ends (2, 3)."""
     start, end = _rows(ends)
     return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
 
 
 def _rows(pair: Array) -> tuple[Vector, Vector]:
-    """Split two vectors (2, 3) into their components."""
+    """Split an array (2, 3) of two vectors into two tuples of components."""
     return tuple(pair[0]), tuple(pair[1])
 
 
 def _ground(pair: Array) -> tuple[Vector, Vector]:
-    """Project two vectors (2, 3) onto the ground and split them into their components."""
+    """Split two vectors (2, 3) into tuples of their x and y components, the ground's plane."""
     return tuple(pair[0, :2]), tuple(pair[1, :2])
 
 
@@ -373,7 +380,7 @@ def _lowest_corner(middle: Array, edges: Array) -> Vector:
 
 
 def _gap_to_ground(lowest: Vector, *bodies: Array) -> Vector:
-    """Return a vector upwards; its length does not matter."""
+    """Return the upward unit vector, the direction in which the distance from the ground grows."""
     return (jnp.zeros_like(lowest[0]), jnp.zeros_like(lowest[0]), jnp.ones_like(lowest[0]))
 
 
@@ -390,7 +397,8 @@ def _point_itself(lowest: Vector, *bodies: Array) -> Vector:
     return lowest
 
 
-# Distance -> functions for the nearest points' parameters, the gap, and the first body's point.
+# By distance function, three functions that `approach` needs: they return the parameters of the
+# nearest points, the gap between these points, and the nearest point of the first body.
 _PARTS: dict[Callable, tuple[Callable, Callable, Callable]] = {
     segment_to_segment: (_nearest_of_segments, _gap_of_segments, _point_of_segment),
     segment_to_rectangle: (_nearest_of_rectangle, _gap_to_rectangle, _point_of_segment),
