@@ -1,14 +1,19 @@
-"""Measure the share of balls that the simulated arm blocks, for each row of drive errors.
+"""Measure the share of balls that a simulated arm blocks, with different errors of its drives.
 
     python -m benchmarks.fly_block_rows [--num 200] [--seed 0] [--suite pole]
                                         [--regimes R1,R2] [--rows ideal,drives,...] [--by-clock]
 
-Plans are made once for each regime, one at a time, and executed in every row. A ball is blocked if
-it hits the face of the shield before its centre enters the inner box. A block counts if the arm
-touched nothing until then. The arm may start 163 ms after a ball is first seen: 83 ms of perception
-and 50 ms of overheads [Natarajan2024, Section VI-B], and 30 ms for planning. Planning times depend
-on the machine, so a plan that takes longer still counts as in time unless `--by-clock` is set. The
-share of plans that the referee accepts is what an ideal arm reaches.
+A row simulates joint drives with one kind of error, such as a lag of the torques or noise of the
+encoders. Plans are computed once for each set of joint limits (`--regimes`), one at a time, and the
+same plans are executed in every row. A ball is blocked if it hits the face of the shield before the
+ball's centre enters the inner box. The block is a success if the arm has touched nothing until
+then. An arm that follows its plans exactly would block the share of balls whose plans the referee
+accepts. This share is printed too.
+
+The arm may start 163 ms after a ball is first seen. This is the sum of 83 ms for perception and 50
+ms of overheads [Natarajan2024, Section VI-B], and of 30 ms for planning. Planning times depend on
+the machine, so by default a plan that takes longer than 30 ms counts as ready after 30 ms. With
+`--by-clock` such a plan starts late.
 """
 
 import dataclasses
@@ -21,7 +26,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.block.settings import REGIMES
 
-# Row -> fields of `Drives` that differ from ideal drives; "share" scales the torque limits.
+# Row name -> fields of `Drives` that differ from ideal drives. The key "share" is no such field: it
+# is a factor of the torque limits.
 ROWS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "lag 5 ms": {"lag": 0.005},
@@ -44,7 +50,11 @@ HEADER = (
 
 
 def line(regime: str, name: str, flights: Any, seconds: float) -> str:
-    """Format one row of the table; joints, tracking and contacts are of arms with a plan."""
+    """Format one row of the table as text.
+
+    Joint errors, torques, tracking errors and collisions are computed over the balls that have a
+    plan. `seconds` is the duration of the simulation.
+    """
     from planner_jax.sims.tasks.block_flights import TOUCH
 
     number, good, some = len(flights.miss), flights.success, flights.planned
@@ -75,7 +85,7 @@ def line(regime: str, name: str, flights: Any, seconds: float) -> str:
 
 
 def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
-    """Plan once, and execute the plans in every row."""
+    """Plan all throws once, simulate the plans in every row, and print the rows of the table."""
     from planner_jax.core.protocol import is_solved
     from planner_jax.runs.timing import measure_plans
     from planner_jax.sims.robots.arm.drives import TORQUES, Drives
@@ -129,7 +139,7 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
 
 
 def main() -> None:
-    """Print the requested rows."""
+    """Print the table for the requested joint limits and rows."""
     known = ", ".join(ROWS).replace("%", "%%")
     parser = argument_parser("fly_block_rows", __doc__, num=200, seed=0)
     parser.add_argument(

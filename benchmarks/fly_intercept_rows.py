@@ -1,14 +1,18 @@
-"""Measure the share of targets that the simulated car meets, for each row of drive errors.
+"""Measure the share of targets that a simulated car meets, with different sensing and tyres.
 
     python -m benchmarks.fly_intercept_rows [--suite hard] [--num 50] [--seed 0]
                                             [--rows sensing,replan,latency,slip]
 
-A miss is the distance of the body's middle from the TRUE target when the plan ends. A meeting
-counts if the miss is at most 0.3 m and the car touched nothing, by exact polygons every 20 ms.
-Unless a row differs, targets are observed 15 times before the start and then once a second with 0.1
-m of noise, the car's pose has noise of 1 cm and 0.01 rad, all observations are 50 ms old, and the
-car re-plans once a second. The printed command of a row runs the same drives and writes a run
-folder.
+Each row simulates drives of a car to predicted targets, and changes one setting: what is known
+about the target, the rate of re-planning, the latency of observations, or the slip of the tyres.
+The miss is the distance of the body's middle from the true target when the plan ends. A meeting
+counts as success if the miss is at most 0.3 m and the car has touched nothing. Contacts are checked
+with exact polygons every 20 ms.
+
+By default, targets are observed 15 times before the start and then once a second, with noise of 0.1
+m. The car's own pose is observed with noise of 1 cm and 0.01 rad. All observations are 50 ms old,
+and the car re-plans once a second. For each row the program also prints a command, which runs the
+same drives and writes a run folder.
 """
 
 import argparse
@@ -25,7 +29,7 @@ from planner_jax.sims.tasks.intercept import SUCCESS, TOUCH, InterceptFlights, f
 from planner_jax.sims.tasks.intercept_flights import FAR, NEAR
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# Row -> settings that differ from the defaults of the task.
+# Group of rows -> row name -> settings of the simulation that differ from the defaults.
 ROWS: dict[str, dict[str, dict[str, Any]]] = {
     "sensing": {
         "everything known": {"known_target": True, "noise": "none", "latency": 0.0, "replan": 0.0},
@@ -50,7 +54,7 @@ HEADER = (
 
 
 def line(name: str, flights: InterceptFlights, seconds: float) -> str:
-    """Format one row of the table."""
+    """Format one row of the table as text; `seconds` is the duration of the simulation."""
     good, miss, number = flights.success, flights.miss, len(flights.miss)
     low, high = wilson_interval(int(good.sum()), number)
     within = " / ".join(percent(int((miss <= d).sum()), number) for d in (NEAR, SUCCESS, FAR))
@@ -84,10 +88,10 @@ def command(settings: InterceptFly) -> str:
 def run_drives(
     settings: InterceptFly, first_plans: dict[tuple, InterceptPlan]
 ) -> tuple[InterceptFlights, float]:
-    """Run the drives of a row; return them with their duration [s].
+    """Simulate the drives of a row; return them, and the duration of the simulation [s].
 
-    First plans depend only on observations before the start, so rows with the same observations
-    share them.
+    The plan at the start depends only on observations before the start. Rows with equal
+    observations therefore use the same plans, which are stored in `first_plans`.
     """
     task, key = settings.flight(), (settings.known_target, settings.predict_movers, settings.noise)
     began = time.perf_counter()
@@ -105,7 +109,7 @@ def run_drives(
 
 
 def main() -> None:
-    """Print the requested rows, and the command of each."""
+    """Print the requested rows of the table, and a command that repeats each row."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--suite", default="hard", help="default: hard")
     parser.add_argument("--num", type=int, default=50, help="drives a row; default: 50")

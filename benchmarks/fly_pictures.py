@@ -2,9 +2,10 @@
 
     python -m benchmarks.fly_pictures [--out docs]
 
-The flights have noise `lab`, a latency of 20 ms, and a drag estimate that is 15 % wrong. Catches
-are re-planned at 100 Hz, hits at 50 Hz. Each picture shows the first successful one of a few
-flights.
+The simulated sensors have the noise `lab`, that is the noise of a motion-capture hall, and a
+latency of 20 ms. The initial estimate of the ball's drag is 15 % wrong. Catches are re-planned at
+100 Hz, hits at 50 Hz. Four flights of each kind are simulated, and the picture shows the first
+successful flight.
 """
 
 import argparse
@@ -28,7 +29,7 @@ PICTURES = {
 
 
 def main() -> None:
-    """Fly and draw."""
+    """Simulate the flights, and write one picture of a catch and one of a hit."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
         "--out", type=Path, default=Path("docs"), metavar="DIR", help="default: docs"

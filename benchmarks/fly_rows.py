@@ -1,15 +1,19 @@
-"""Measure catches and hits in closed-loop simulation, on every row of the flight protocol.
+"""Measure success of catches and hits in closed-loop simulation of quadrotors.
 
     python -m benchmarks.fly_rows [--num 1000] [--seed 0] [--rows exact,catch,hit,ablate]
                                   [--limit 300]
 
-The noise is `lab` with a latency of 20 ms. The initial drag estimate is 15 % too large or too
-small. Catches are re-planned at 100 Hz. Hits are re-planned at 50 Hz and, as in [Yu2023bat], not at
-all. A flight of several balls succeeds if all are caught. Each line prints the success rate with
-its 95 % Wilson interval, the required rate if there is one, and the duration of a second run, which
-compiles nothing, separated into flight and planning from scratch. A line that exceeds the time
-limit is abandoned when the running program returns. Prediction errors can be compared with the
-largest errors of [Yu2023bat], (15, 5, 25) cm.
+The option --rows selects groups of lines: `exact` without noise, `catch` and `hit` with noise, and
+`ablate`, which leaves out one part of the control loop at a time. The noise is `lab` with a latency
+of 20 ms, and the initial estimate of the ball's drag is 15 % too large or too small.
+Catches are re-planned at 100 Hz. Hits are re-planned at 50 Hz or, as in [Yu2023bat], not at all. A
+flight of several balls succeeds if all balls are caught.
+
+Each line prints the success rate with its 95 % Wilson interval, and the required rate if there is
+one. Every simulation runs twice, and the time of the second run is printed, which compiles nothing.
+It is divided into simulation with re-planning and planning from scratch. A simulation that exceeds
+the time limit is stopped as soon as the running compiled program returns. The printed prediction
+errors can be compared with the largest errors of [Yu2023bat], (15, 5, 25) cm along x, y and z.
 """
 
 import argparse
@@ -32,23 +36,24 @@ from planner_jax.task import catch, hit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.trajectory.polynomial import evaluate
 
-DRAG_ERROR = 0.15
-CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz], re-planning rates
+DRAG_ERROR = 0.15  # Relative error of the initial estimate of the ball's drag.
+CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz] Re-planning rates of catches and of hits.
 LAB = NOISES["lab"]
-CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # required success rate, by number of balls
-LANDING = 0.05  # [m] from the target, required without noise
-HORIZONS = ((0.9, 1.1), (0.7, 0.9), (0.5, 0.7), (0.3, 0.5), (0.1, 0.3))  # [s]
+CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # Number of balls -> required success rate with noise.
+LANDING = 0.05  # [m] Without noise each hit ball must land this close to its target.
+# [s] Intervals of the time until the contact, for which prediction errors are printed.
+HORIZONS = ((0.9, 1.1), (0.7, 0.9), (0.5, 0.7), (0.3, 0.5), (0.1, 0.3))
 
 
 def format_rate(good: np.ndarray) -> str:
-    """Format a rate with its interval."""
+    """Format the share of successful flights with its 95 % Wilson interval as text."""
     low, high = wilson_interval(int(good.sum()), good.size)
     rate = percent(int(good.sum()), good.size)
     return f"{rate} % ({100 * low:.1f} to {100 * high:.1f}, {good.size} flights)"
 
 
 def format_quantiles(values: np.ndarray, scale: float, unit: str) -> str:
-    """Format median, 90 % quantile and maximum of the finite values."""
+    """Format median, 90 % quantile and maximum of the finite values, multiplied by `scale`."""
     kept = values[np.isfinite(values)]
     if not kept.size:
         return "none"
@@ -58,7 +63,7 @@ def format_quantiles(values: np.ndarray, scale: float, unit: str) -> str:
 
 @contextlib.contextmanager
 def limit_time(name: str, seconds: int) -> Iterator[None]:
-    """Abandon a line with a message when its time limit is exceeded."""
+    """Stop the code in this context with a printed message after `seconds`."""
 
     def stop(*_: Any) -> None:
         raise TimeoutError
@@ -75,7 +80,7 @@ def limit_time(name: str, seconds: int) -> Iterator[None]:
 
 
 def run_twice(fly: Callable[[], Any]) -> tuple[Any, str]:
-    """Run a simulation twice; return its result, and the durations as text."""
+    """Run a simulation twice, first to compile it; return its result, and durations as text."""
     began = time.perf_counter()
     fly()
     between = time.perf_counter()
@@ -89,20 +94,23 @@ def run_twice(fly: Callable[[], Any]) -> tuple[Any, str]:
 
 
 def check_rate(good: np.ndarray, bar: float | None) -> str:
-    """Return text on whether a rate reaches its required value."""
+    """Return text on whether the success rate reaches `bar`; empty if no rate is required."""
     if bar is None:
         return ""
     return f", must reach {100 * bar:g} %: {'yes' if good.mean() >= bar else 'NO'}"
 
 
 def format_tracking(flown: Flown) -> str:
-    """Format the tracking error."""
+    """Format the distance of the flown from the planned position: RMS and greatest value."""
     worst = format_quantiles(flown.tracking[:, 1], 100.0, "cm")
     return f"tracking rms {100.0 * np.median(flown.tracking[:, 0]):.2f} cm, worst {worst}"
 
 
 def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors of the first ball's flown contact against the plan: [m] and [s], (B,) each."""
+    """Compare the flown contact with the first ball to the planned contact.
+
+    Returns the errors of position [m] and of time [s], (B,) each.
+    """
     planned = flown.contact.planned_time[:, 0]
     places = np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, planned - flown.began))
     away = np.linalg.norm(places - flown.contact.robot_pos[:, 0], axis=1)
@@ -110,7 +118,7 @@ def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prediction_errors(flown: Flown) -> None:
-    """Print errors of the predicted contact position, by the time until the contact."""
+    """Print quantiles of the errors of the predicted contact position, for each of `HORIZONS`."""
     assert flown.record is not None
     horizon, error = flown.record.horizon[:, :, 0], np.abs(flown.record.error[:, :, 0])
     for low, high in HORIZONS:
@@ -128,7 +136,10 @@ def prediction_errors(flown: Flown) -> None:
 def catches(
     name: str, loop: Loop, args: Any, drag_error: float, bar: float | None = None, **options: Any
 ) -> CatchFlights | None:
-    """Print one line for catches."""
+    """Simulate catches, and print one line: success rate, distances, tracking error and times.
+
+    Returns the flights, or None if the time limit was exceeded.
+    """
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
         flights, seconds = run_twice(lambda: fly_catches(loop, cases, args.seed, **options))
@@ -147,7 +158,10 @@ def catches(
 def hits(
     name: str, loop: Loop, regions: Any, args: Any, drag_error: float, **options: Any
 ) -> HitFlights | None:
-    """Print one line for hits."""
+    """Simulate hits, and print one line: landing errors, success rates, tracking error and times.
+
+    Returns the flights, or None if the time limit was exceeded.
+    """
     cases = volleys(args.num, regions, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
         flights, seconds = run_twice(lambda: fly_hits(loop, cases, args.seed, **options))
@@ -163,7 +177,7 @@ def hits(
 
 
 def exact_rows(args: Any) -> None:
-    """Print rows without noise: planned and flown contact, and the landing."""
+    """Print lines without noise: errors of the flown contact, and of the hit ball's landing."""
     for rate in (0.0, CATCH_RATE):
         name = f"no noise, catch, re-planned {rate:g} Hz"
         if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):
@@ -180,7 +194,7 @@ def exact_rows(args: Any) -> None:
 
 
 def report_contact(flown: Flown) -> None:
-    """Print one line on planned and flown contact."""
+    """Print one line with errors of the flown contact, and how many are within 2 cm and 2 ms."""
     places, times = contact_errors(flown)
     met = flown.contact.met[:, 0]
     good = (places <= 0.02) & (times <= 0.002) & met
@@ -193,7 +207,7 @@ def report_contact(flown: Flown) -> None:
 
 
 def catch_rows(args: Any) -> None:
-    """Print rows with noise for one, two and three balls that are 0.8 s apart."""
+    """Print lines with noise for catches of one, two and three balls, thrown 0.8 s apart."""
     for number in (1, 2, 3):
         world = dataclasses.replace(CATCH_WORLD, num_balls=number)
         loop = Loop(world, LAB, replan=CATCH_RATE)
@@ -204,7 +218,7 @@ def catch_rows(args: Any) -> None:
 
 
 def hit_rows(args: Any) -> None:
-    """Print rows with noise for the six scenarios, re-planned and not."""
+    """Print lines with noise for hits in six scenarios, with and without re-planning."""
     for rate in (HIT_RATE, 0.0):
         for name, regions in REAL_SCENARIOS.items():
             loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")
@@ -215,7 +229,7 @@ def hit_rows(args: Any) -> None:
 
 
 def make_ablations(whole: Loop) -> dict[str, Loop]:
-    """Return a loop and copies that each lack one part, keyed by the missing part."""
+    """Return a control loop, and copies that each lack one part, by name of the missing part."""
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),
@@ -225,7 +239,7 @@ def make_ablations(whole: Loop) -> dict[str, Loop]:
 
 
 def ablation_rows(args: Any) -> None:
-    """Print the rows that show the effect of each part."""
+    """Print lines that show the effect of each part of the loop, and of other planners."""
     for name, loop in make_ablations(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
     loop = Loop(CATCH_WORLD, LAB)
@@ -245,7 +259,7 @@ ROWS = {"exact": exact_rows, "catch": catch_rows, "hit": hit_rows, "ablate": abl
 
 
 def main() -> None:
-    """Print the requested rows."""
+    """Parse the arguments, and print the requested groups of lines."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--num", type=int, default=1000, help="flights a row (default: 1000)")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")

@@ -1,11 +1,12 @@
-"""Measure simulated physics steps per second in MJX, for batches of one quadrotor and one ball.
+"""Measure simulated physics steps per second in MJX, for batches of a quadrotor with one ball.
 
     python -m benchmarks.fly_steps [--worlds 4096,65536] [--seconds 0.4]
 
-The open loop steps the physics with constant rotor thrusts. The closed loop is a whole flight
-without re-planning: observations, Kalman filter, reference, control, physics, contact. A step
-covers 2 ms of physics and control. If the package crazyflow is installed, the steps of its
-first-principles quadrotor, without a ball, stand beside these. Compilation is reported separately.
+A world is one simulated quadrotor and one ball, and a batch has many worlds. Two simulations are
+measured. The open loop computes the physics alone, with constant rotor thrusts. The closed loop is
+a whole flight without re-planning: observations, Kalman filter, reference, control, physics and
+contact. A step covers 2 ms of simulated time. If the package crazyflow is installed, its
+first-principles quadrotor without a ball is measured too. Compile time is reported separately.
 """
 
 import argparse
@@ -36,7 +37,10 @@ RUNS = 3
 
 
 def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
-    """Print one line: compile time, and steps per second of the fastest of a few runs."""
+    """Run a simulation several times; print steps per second of the fastest run, and compile time.
+
+    `steps` is the number of physics steps that one call of `run` computes, over all worlds.
+    """
     began = time.perf_counter()
     jax.block_until_ready(run())
     first = time.perf_counter() - began
@@ -53,7 +57,7 @@ def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
 
 
 def measure_open_loop(world: World, worlds: int, steps: int) -> None:
-    """Measure the physics alone."""
+    """Report steps per second of the physics alone, with constant rotor thrusts."""
     start = at_rest(world, jnp.array(START))
     start = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (worlds, *leaf.shape)), start)
     drag = jnp.zeros(1)
@@ -69,9 +73,12 @@ def measure_open_loop(world: World, worlds: int, steps: int) -> None:
 
 
 def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
-    """Measure flights without re-planning; initial plans are not part of the time."""
+    """Report steps per second of whole flights without re-planning.
+
+    The time does not include planning. `seconds` is the simulated time of each flight.
+    """
     loop = Loop(world, NOISES["lab"])
-    few = min(worlds, 256)  # different throws, repeated to fill the batch
+    few = min(worlds, 256)  # Number of different throws. They are repeated to fill the batch.
     cases = throws(few)
     drag, guess = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
     starts = jnp.tile(jnp.array(START), (few, 1))
@@ -93,7 +100,7 @@ def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
 
 
 def measure_crazyflow(worlds: int, steps: int) -> None:
-    """Measure the steps of crazyflow, if it is installed."""
+    """Report steps per second of the simulator crazyflow, if it is installed."""
     os.environ.setdefault("SCIPY_ARRAY_API", "1")
     try:
         peer: Any = importlib.import_module("crazyflow.sim")
@@ -111,7 +118,7 @@ def measure_crazyflow(worlds: int, steps: int) -> None:
 
 
 def main() -> None:
-    """Print all lines."""
+    """Measure open loop, closed loop and crazyflow for each batch size, and print the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     default = "256" if jax.default_backend() == "cpu" else "4096,65536"
     parser.add_argument("--worlds", default=default, help=f"batch sizes; default: {default}")

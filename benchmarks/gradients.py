@@ -1,13 +1,16 @@
-"""Measure the cost and the accuracy of the gradient of a plan.
+"""Measure time and accuracy of the gradient of a plan with respect to the numbers of its case.
 
     python -m benchmarks.gradients [--task hit] [--num 4096] [--steps N] [--accuracy 64] [--out DIR]
 
-Gradients are defined at optima, so three calls take turns: plans by the planner's own rounds, plans
-refined to the optimum, and refined plans with their gradient. Times are of whole calls from arrays
-on the device to arrays on the device, compiled before: the fastest and the median of `--repeat`
-calls. The first calls, which compile, are listed separately. Accuracy is the relative difference
-from a reference, over all leaves with respect to which the plan is differentiated. The reference is
-the gradient of float64 optima with the whole Hessian, for cases that the float64 search solves.
+The gradient of a plan's quantity, such as the contact time of a hit, is defined at the optimum of
+the planner's objective. Three calls are timed in turns: planning with the planner's default search,
+planning to the optimum, and planning to the optimum with the gradient. Times are for whole calls
+without compilation, from arrays on the device to arrays on the device: the fastest and the median
+of `--repeat` calls. The first calls, which compile, are listed separately.
+
+The accuracy is the relative difference from a reference gradient, over all arrays of the case with
+respect to which the plan is differentiated. The reference is computed at optima in float64 with the
+whole Hessian, for cases that the search in float64 solves.
 """
 
 import argparse
@@ -40,7 +43,10 @@ def _last_catch(plan: Any) -> jax.Array:
 
 
 def _case(task: str, num: int) -> tuple[Any, Any, Any]:
-    """Return a minimising planner, cases with NumPy leaves, and the quantity to differentiate."""
+    """Return a planner, `num` drawn cases with NumPy leaves, and the quantity to differentiate.
+
+    The quantity is the contact time of a hit, or the time of the last catch.
+    """
     if task == "hit":
         found = pj.hit.planner("exact"), pj.hit.draw(num, seed=_SEED), "stroke.time"
     else:
@@ -50,7 +56,10 @@ def _case(task: str, num: int) -> tuple[Any, Any, Any]:
 
 
 def _time_calls(calls: dict[str, Any], repeat: int) -> dict[str, tuple[float, float, float]]:
-    """Return the durations [s] by name: first call, fastest and median of the others."""
+    """Run the functions in turns; return for each the durations [s] of its calls.
+
+    The durations are of the first call, of the fastest later call, and the median of later calls.
+    """
     first, later = {}, {name: [] for name in calls}
     for turn in range(1 + repeat):
         for name, call in calls.items():
@@ -79,7 +88,11 @@ def _double(tree: Any) -> Any:
 
 
 def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
-    """Format quantiles of the relative difference, each column in units of its median size."""
+    """Format quantiles of the relative difference between gradients `found` and `best` (B, n).
+
+    Each of the n columns is first divided by the median of its absolute value in `best`, because
+    the columns have different units. `lanes` are the indices of the compared cases.
+    """
     has_none = ~np.isfinite(found[lanes]).all(axis=1)
     none, lanes = has_none.mean(), lanes[~has_none]
     unit = np.median(np.abs(best[lanes]), axis=0)
@@ -91,7 +104,7 @@ def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Print the times, then the accuracy."""
+    """Measure times of plans and gradients, then the gradients' accuracy, and print both."""
     parser = argument_parser("gradients", __doc__, num=4096, repeat=10)
     parser.add_argument("--task", choices=_BY, default="hit", help="default: hit")
     parser.add_argument("--steps", type=at_least(0), help="steps of the adjoint solver")
@@ -145,7 +158,7 @@ def _measure(
 
 
 def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few: Any) -> None:
-    """Print the difference of gradients from the gradients of float64 optima."""
+    """Print how much the gradients of a few cases differ from gradients at optima in float64."""
     found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
         best = differentiate(_double(few), curvature="whole", solver=_LONG)

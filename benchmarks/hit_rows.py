@@ -1,12 +1,18 @@
-"""Measure refereed success of a hit planner on every row of the published protocol.
+"""Measure how often the planner of hits succeeds on every row of a published protocol.
 
     python -m benchmarks.hit_rows --serves DIR [--rows base,late-0.5] [--num N] [--out DIR]
 
-Without --serves the serves are drawn by the generator (seed 0). The rows are the base start, starts
-drawn over the half court, planning that starts late, weaker limits, and drag after the impact. The
-row `tight` is not part of the protocol: its limits are 2.5 m/s, 10 m/s^2 and 3 rad/s, and in every
-hundredth case the ball flies away from the quadrotor, so that no plan can reach it. Prints a table.
-The run folder also holds the indices of each row's failures.
+The rows are
+* `base`: the quadrotor starts at the published initial position;
+* `uniform-start`: the initial position is drawn over the half court;
+* `late-T`: planning starts T seconds after the serve, while the quadrotor still hovers;
+* `limits-F`: the limits on speed, acceleration and body rate are multiplied by F;
+* `drag-after-impact`: the ball has drag also after the hit;
+* `tight`, which is not part of the protocol: the limits are 2.5 m/s, 10 m/s^2 and 3 rad/s. In
+  every hundredth case the ball flies away from the quadrotor, so that no plan can reach it.
+
+Success is judged by the referee. Without --serves the serves are drawn with seed 0. The run folder
+also stores the indices of each row's failures.
 """
 
 import dataclasses
@@ -34,7 +40,7 @@ _TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
 
 
 def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
-    """Return the cases of a row."""
+    """Convert serves to the cases of the row `name`, with its start, delay and limits."""
     cases = pj.hit.to_cases(serves, **ROWS[name])
     if name != "tight":
         return cases
@@ -49,7 +55,10 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
 
 
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
-    """Return the figures of one row, and count its successes."""
+    """Plan the serves of one row; return its success rate, costs and times by name.
+
+    The successes are added to the benchmark's summary.
+    """
     drag_after = name == "drag-after-impact"
     planner = pj.hit.planner("exact", drag_after_impact=drag_after)
     cases = cases_of(name, serves)
@@ -80,7 +89,7 @@ def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the requested rows."""
+    """Read or draw the serves, and print a table with the requested rows."""
     parser = argument_parser("hit_rows", __doc__, num=9000)
     parser.add_argument(
         "--serves", type=Path, help="folder of published trial files; default: draw serves"

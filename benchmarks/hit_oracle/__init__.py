@@ -1,1 +1,4 @@
-"""Direct transcription of a hit, to distinguish infeasible cases from failures of a planner."""
+"""A slow, independent solver of hits, by direct transcription with IPOPT.
+
+It tells infeasible cases from failures of a planner. `benchmarks.oracle_hit` runs it.
+"""

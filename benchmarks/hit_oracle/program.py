@@ -1,7 +1,9 @@
-"""The nonlinear program of a hit: snap constant on pieces, the impact as equality constraints.
+"""The nonlinear program that searches a feasible hit, for CasADi and IPOPT.
 
-Shares no code with the planners. The program is built once with symbols, for CasADi and IPOPT; the
-numbers of a case are its parameters. World frame, z up, SI units.
+The quadrotor's snap is constant on each piece of the trajectory. The impact is described by
+equality constraints, and limits by inequalities at samples. The program is built once with
+symbols, and the numbers of a case are its parameters. It shares no code with the planners.
+Positions are in the world frame, with z up, in SI units.
 """
 
 import dataclasses
@@ -17,13 +19,16 @@ from planner_jax.task.hit.case import HitCase
 
 ca: Any = importlib.import_module("casadi")  # from the extra `oracle`
 
-BALL_DEGREE = 10  # of the ball's path up to its landing; its error is below 1e-7 m
-# Typical sizes of position, velocity, acceleration and jerk, and of snap; they scale the variables.
+# Degree of the polynomial that approximates the ball's path until it lands, to 1e-7 m.
+BALL_DEGREE = 10
+# Typical sizes of position [m], velocity, acceleration and jerk, and of snap [m/s^4]. The variables
+# of the program are divided by these numbers.
 STATE_SCALE, SNAP_SCALE = np.array([1.0, 3.0, 10.0, 60.0]), 600.0
-LEAST_THRUST = 1.0  # [m/s^2]; with less thrust the attitude would turn too fast for the samples
-GUESSED_EXCESS = 0.5
+# [m/s^2] Least thrust. With less thrust the attitude could turn too far between two samples.
+LEAST_THRUST = 1.0
+GUESSED_EXCESS = 0.5  # Initial guess of the greatest relative excess over a limit.
 
-# A program's parameters and their number of values, in SI units.
+# Names of the program's parameters, which are numbers of the case in SI units -> count of numbers.
 PARAMETERS = {
     "ball": 3 * (BALL_DEGREE + 1),  # position = sum_k ball[k] (t / landing_time)^k
     "landing_time": 1,
@@ -41,7 +46,8 @@ PARAMETERS = {
     "max_apex": 1,
 }
 
-# Adaptive barriers converge from poor guesses, and from a solution on coarser pieces.
+# Options of IPOPT. With the adaptive barrier strategy it converges from poor initial guesses, and
+# also from a solution with fewer pieces.
 OPTIONS = {
     "max_iter": 250,
     "max_cpu_time": 10.0,
@@ -53,7 +59,10 @@ OPTIONS = {
 
 
 def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
-    """Return the values of `PARAMETERS` for one case (no batch axis); the ball by integration."""
+    """Return the values of `PARAMETERS` for one case, which has no batch axis.
+
+    The ball's path with drag is integrated numerically and approximated by a polynomial.
+    """
     drag, floor = float(case.drag), float(case.target[2])
     fall = np.array([0.0, 0.0, -float(case.gravity)])
 
@@ -80,13 +89,13 @@ def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
 
 
 def unpack(vector, sizes: dict[str, int]) -> dict:
-    """Split a vector, symbolic or not, into named parts."""
+    """Split a vector, numeric or symbolic, into parts by name; `sizes` has the part lengths."""
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return {name: vector[ends[i] : ends[i + 1]] for i, name in enumerate(sizes)}
 
 
 def advance(motion: list, time) -> list:
-    """Return position, velocity etc. after `time`; the last derivative in `motion` is constant."""
+    """Return position and derivatives `time` [s] later; the last derivative stays constant."""
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])
@@ -95,14 +104,18 @@ def advance(motion: list, time) -> list:
 
 
 def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
-    """Return ball position, velocities before and after, racket normal, and size of their change.
+    """Compute the impact of a hit from its time and from the ball's flight time to the target.
+
+    The racket's normal is parallel to the change of the ball's velocity. Returns the ball's
+    position, its velocities before and after the impact, the racket's unit normal, and the length
+    of the velocity change [m/s].
 
     Args:
-        case: parameters, symbolic or not.
-        ball: coefficients (3,) of the ball's path, ascending.
-        impact_time: [s].
+        case: parameters, numeric or symbolic.
+        ball: coefficients (3,) of the polynomial of the ball's path, by ascending power.
+        impact_time: [s], from the start of the plan.
         flight_time: [s], from the impact to the target, under gravity alone.
-        up: (3,) unit vector.
+        up: (3,) unit vector along z.
         norm: function that returns the length of a vector.
     """
     share = impact_time / case["landing_time"]
@@ -114,16 +127,18 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
 
 
 def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
-    """Return the constraints <= 0 at one sample, and the body z axis there.
+    """Return the limits at one sample as expressions that must be <= 0, and the body z axis.
 
-    `allowance` is 1 + the permitted excess. Body rates (Hopf fibration, zero heading) are
-    multiplied by the squared thrust. Divided by it, the solver would diverge for small thrust.
+    `allowance` is 1 + the permitted relative excess. The body rate (Hopf fibration, zero heading)
+    is a quotient with the squared thrust as denominator. Its limit is multiplied by the squared
+    thrust, because the solver diverges for the quotient if the thrust is small.
     """
     pos, vel, acc, jerk = motion[:4]
     gravity = case["gravity"]
     thrust = acc + ca.vertcat(0.0, 0.0, gravity)
     cross, squared = ca.cross(thrust, jerk), ca.sumsqr(thrust)
-    # The constants keep roots smooth; they are small relative to the square of LEAST_THRUST.
+    # The added constants keep square roots differentiable at zero. They are small relative to the
+    # square of LEAST_THRUST.
     upright = ca.sqrt(squared + 0.1) + thrust[2]
     turning = ca.sumsqr(cross) + cross[2] ** 2 * (squared + 0.1) / upright**2
     limits = [
@@ -138,7 +153,10 @@ def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
 
 
 def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[list, list]:
-    """Return the equality constraints, and the constraints <= 0, at the impact."""
+    """Return the constraints at the impact: expressions that must be 0, and that must be <= 0.
+
+    `end` holds the quadrotor's position, velocity and acceleration at the impact.
+    """
     ball = ca.horzsplit(ca.reshape(case["ball"], 3, BALL_DEGREE + 1))
     up, allowance = ca.DM([0.0, 0.0, 1.0]), 1.0 + unknown["excess"]
     pos, before, after, normal, jump = impact(
@@ -163,16 +181,16 @@ def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[li
 
 
 class Program:
-    """Nonlinear program with a given number of pieces, built once for all cases.
+    """Nonlinear program of a hit with a given number of pieces, built once for all cases.
 
     The unknowns are the durations of the pieces, the states at their ends, their snaps, the ball's
-    flight time after the impact, the thrust at the impact [g], and the excess: the greatest
-    relative excess over all limits. The excess is minimised.
+    flight time after the impact, the thrust at the impact [g], and the excess. The excess is the
+    greatest relative amount by which any limit is exceeded. It is minimised.
 
     Args:
-        pieces: number of pieces.
+        pieces: number of pieces of the trajectory.
         samples: number of samples of a piece at which limits are checked, including its end.
-        floor: lower bound of the excess.
+        floor: lower bound of the excess, negative for solutions with a margin to the limits.
     """
 
     def __init__(self, pieces: int, samples: int, floor: float):
@@ -201,7 +219,7 @@ class Program:
         return np.repeat(values, list(self.sizes.values()))
 
     def _build(self, unknown: dict, case: dict, samples: int) -> tuple:
-        """Return cost, equality constraints, and constraints <= 0."""
+        """Return the cost, the expressions that must be 0, and those that must be <= 0."""
         states = ca.horzcat(
             case["head_state"],
             ca.reshape(unknown["states"], 12, self.pieces) * np.repeat(STATE_SCALE, 3),
@@ -212,7 +230,8 @@ class Program:
             duration = unknown["durations"][k]
             motion = [*self._motion(states[:, k]), SNAP_SCALE * unknown["snaps"][3 * k : 3 * k + 3]]
             allowance = 1.0 + unknown["excess"] - case["margins"][k]
-            # Limiting the turn of the axis between samples prevents a flip in between.
+            # The body z axis may turn between two samples by no more than the body rate permits.
+            # Otherwise the quadrotor could flip over between samples without exceeding a limit.
             turn = case["body_rate"] * allowance * duration / samples
             ends = self._motion(states[:, k + 1])
             inside = [advance(motion, duration * i / samples) for i in range(1, samples)]
@@ -235,13 +254,14 @@ class Program:
     def solve(
         self, case: dict, guess: np.ndarray, margins: np.ndarray | None = None
     ) -> tuple[np.ndarray, bool]:
-        """Return the unknowns at which the solver stops, and whether it has converged.
+        """Run IPOPT; return the unknowns at which it stops, and whether it has converged.
 
         Args:
             case: values of `PARAMETERS`.
-            guess: of the unknowns.
-            margins: (M,) relative tightening of the limits on each piece. The durations are then
-                fixed to their guess, so that each margin stays on its part of the trajectory.
+            guess: initial guess of the unknowns.
+            margins: (M,), relative amounts by which the limits on each piece are tightened. Then
+                the durations keep their initial values, so that a margin that was computed for one
+                part of the trajectory applies to this part.
         """
         bounds = dict(self._bounds)
         if margins is not None:
@@ -252,7 +272,11 @@ class Program:
         return np.asarray(found["x"]).ravel(), self._solver.stats()["success"]
 
     def guess(self, case: dict, start: tuple) -> np.ndarray:
-        """Return the polynomial of degree 7 from the head state to the impact of a start."""
+        """Return unknowns that follow a polynomial of degree 7 from the initial state to an impact.
+
+        `start` defines the impact: its time over the ball's landing time, the ball's flight time
+        [s] after the impact, and the thrust at the impact [g].
+        """
         share, flight_time, thrust = start
         duration, up = share * case["landing_time"][0], np.array([0.0, 0.0, 1.0])
         pos, before, _, normal, jump = impact(
@@ -269,7 +293,7 @@ class Program:
         return np.concatenate([np.diff(times), states.ravel(), snaps.ravel(), tail])
 
     def halve(self, case: dict, unknowns: np.ndarray) -> np.ndarray:
-        """Return the same trajectory for a program with twice as many pieces."""
+        """Return the unknowns of the same trajectory for a program with twice as many pieces."""
         motion, durations = self.motion(case, unknowns)
         half = 0.5 * durations
         nodes = np.stack([advance(motion, half[:, None]), advance(motion, durations[:, None])])
@@ -278,7 +302,10 @@ class Program:
         return np.concatenate([np.repeat(half, 2), states.ravel(), snaps.ravel(), unknowns[-3:]])
 
     def motion(self, case: dict, unknowns: np.ndarray) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return position to snap (M, 3) at the start of the pieces, and their durations (M,)."""
+        """Return the motion at the start of each of M pieces, and the pieces' durations (M,) [s].
+
+        The motion is a list of position, velocity, acceleration, jerk and snap, (M, 3) each.
+        """
         found = unpack(unknowns, self.sizes)
         states = found["states"].reshape(-1, 4, 3)[:-1] * STATE_SCALE[:, None]
         states = np.concatenate([case["head_state"].reshape(1, 4, 3), states])

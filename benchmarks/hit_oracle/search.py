@@ -1,4 +1,9 @@
-"""Search from many starts to a verdict: coarse pieces, halved pieces, tightening, referee."""
+"""Decide whether a hit is feasible, by searches from many starting points.
+
+Each search solves the nonlinear program with few pieces. If the limits nearly hold, it solves the
+program with halved pieces, and tightens limits that are exceeded between samples. A hit counts as
+found only if the referee accepts it. `benchmarks.oracle_hit` calls this module.
+"""
 
 import dataclasses
 import functools
@@ -17,19 +22,24 @@ from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import HitPlan, Stroke
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-TOLERANCE = 1e-3  # relative, of the referee
-COARSE_PIECES, COARSE_SAMPLES = 20, 3  # samples of a piece, including its end
-FINE_SAMPLES = 4
-COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # lower bounds of the excess
-REFINED_BELOW = 0.06  # larger coarse excesses are not refined: halving reduces them by 0.03 at most
-NEW_BELOW = 0.001  # difference by which a coarse excess must be below one whose refinement failed
-# A case is abandoned early if this number of starts has no excess below this value.
+# An excess is the greatest relative amount by which a trajectory exceeds any limit.
+TOLERANCE = 1e-3  # The referee accepts an excess up to this value.
+COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Pieces of the coarse program, and samples of each piece.
+FINE_SAMPLES = 4  # Samples of each piece of the fine program, including its end.
+COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess in both programs.
+# A coarse solution with a larger excess is not refined, because halving the pieces reduces the
+# excess by 0.03 at most.
+REFINED_BELOW = 0.06
+# A coarse solution is refined only if its excess is at least this much below the excess of every
+# coarse solution whose refinement has failed.
+NEW_BELOW = 0.001
+# The search of a case ends early if the least excess of HOPELESS_STARTS starts is above this value.
 HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
-MOST_TIGHTENINGS = 5
-INFEASIBLE_ABOVE = 0.01  # a case with a larger least excess counts as infeasible
+MOST_TIGHTENINGS = 5  # Maximum number of times that limits of a solution are tightened.
+INFEASIBLE_ABOVE = 0.01  # A case counts as infeasible if its least excess is above this value.
 
-# Impact time over landing time, flight time after the impact [s], thrust at the impact [g]. The
-# fifth is a smash from above the least apex.
+# Starting points: impact time over the ball's landing time, the ball's flight time after the impact
+# [s], and thrust at the impact [g]. The fifth is a smash of a ball above the least permitted apex.
 STARTS = (
     (0.93, 1.6, 1.2),
     (0.80, 1.3, 1.0),
@@ -40,11 +50,16 @@ STARTS = (
     (0.65, 1.1, 0.8),
     (0.97, 1.0, 1.4),
 )
-START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))  # of random starts
+# Ranges of the same three numbers for random starting points.
+START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))
 
 
 def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) -> np.ndarray:
-    """Return the largest ratio of speed, acceleration or body rate to its limit, by piece (M,)."""
+    """Return for each piece (M,) the largest ratio of a quantity to its limit.
+
+    The quantities are speed, acceleration and body rate. They are evaluated at 41 times of each
+    piece, more densely than in the program.
+    """
     times = durations[:, None, None] * np.linspace(0.0, 1.0, 41)[:, None]
     _, vel, acc, jerk, _ = advance([part[:, None] for part in motion], times)
     thrust = acc + values["gravity"] * np.array([0.0, 0.0, 1.0])
@@ -60,20 +75,20 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
 
 @dataclasses.dataclass
 class Finding:
-    """Result of the oracle for one case."""
+    """Result of the oracle for one case: whether a hit exists, and the best trajectory."""
 
-    feasible: bool = False  # the referee accepts a hit
-    least_excess: float = math.inf  # of the programs that converged
-    starts: int = 0  # number of starts used
+    feasible: bool = False  # whether the referee accepts a hit
+    least_excess: float = math.inf  # least relative excess over the limits, of converged programs
+    starts: int = 0  # number of starting points used
     cpu_seconds: float = 0.0
-    impact_time: float = math.nan  # [s], of the hit, or of the least excess
+    impact_time: float = math.nan  # [s], of the hit, or of the trajectory with the least excess
     flight_time: float = math.nan  # [s]
     thrust: float = math.nan  # [g], at the impact
     coeffs: np.ndarray | None = None  # (M, 5, 3) of a hit
     durations: np.ndarray | None = None  # (M,) [s]
 
     def note(self, unknowns: np.ndarray, durations: np.ndarray) -> None:
-        """Store the result of a converged program if it is the best so far."""
+        """Store a converged solution if its excess over the limits is the least so far."""
         if unknowns[-1] < self.least_excess:
             self.impact_time = float(durations.sum())
             self.flight_time, self.thrust, self.least_excess = unknowns[-3:].tolist()
@@ -88,14 +103,18 @@ class Finding:
 
 
 class Oracle:
-    """Coarse and fine program."""
+    """Search for a feasible hit, with a coarse program and one with twice as many pieces."""
 
     def __init__(self):
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
         self.fine = Program(2 * COARSE_PIECES, FINE_SAMPLES, FINE_FLOOR)
 
     def find(self, case: HitCase, starts) -> Finding:
-        """Search for a hit in one case (NumPy leaves, no batch axis) from several starts."""
+        """Search for a feasible hit in one case from several starting points.
+
+        The case has NumPy leaves without a batch axis. The search ends at the first hit that the
+        referee accepts.
+        """
         began, finding, in_vain = time.process_time(), Finding(), math.inf
         values = case_parameters(case)
         for start in starts:
@@ -119,7 +138,11 @@ class Oracle:
         return finding
 
     def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
-        """Halve the pieces, and tighten limits that peak between samples; return the excess."""
+        """Refine a coarse solution, and store the result in `finding`; return the final excess.
+
+        The pieces are halved. Then the limits of pieces that exceed them between samples are
+        tightened repeatedly, until the referee accepts the hit.
+        """
         guess, margins = self.coarse.halve(values, coarse), np.zeros(self.fine.pieces)
         unknowns, converged = self.fine.solve(values, guess)
         if not converged:
@@ -144,7 +167,7 @@ class Oracle:
 
 
 def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-    """Return whether the library's referee accepts one trajectory."""
+    """Return whether the referee accepts a trajectory, (M, 5, 3) and (M,) [s], as a hit."""
     none: Any = np.zeros(1)
     path: Any = coeffs[None], durations[None]
     stroke = Stroke(
@@ -169,7 +192,7 @@ def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> 
 
 
 def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
-    """Return `STARTS`, then random starts."""
+    """Return `num` starting points: first those of `STARTS`, then random ones."""
     low, high = np.transpose(START_RANGES)
     draws = np.random.default_rng(seed).uniform(low, high, (max(num - len(STARTS), 0), 3))
     return [*STARTS, *map(tuple, draws)][:num]
@@ -177,17 +200,20 @@ def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
 
 @functools.cache
 def oracle() -> Oracle:
-    """Return the one oracle of a process; building it takes a second."""
+    """Return the oracle of this process, which is built at the first call, in about a second."""
     return Oracle()
 
 
 def find_hit(case: HitCase, starts) -> Finding:
-    """Run the process's oracle on one case."""
+    """Search for a feasible hit in one case, with the oracle of this process."""
     return oracle().find(case, starts)
 
 
 def find_hits(cases: HitCase, starts, workers: int = 1) -> list[Finding]:
-    """Return findings for a batch of cases, in order, with a progress bar."""
+    """Search for a feasible hit in each case of a batch, in `workers` processes.
+
+    Shows a progress bar. Returns the results in the order of the cases.
+    """
     cases = jax.tree.map(np.asarray, cases)
     num = len(cases.drag)
     lanes = [jax.tree.map(lambda leaf, i=i: leaf[i], cases) for i in range(num)]
