@@ -1,7 +1,8 @@
-"""The planner of quadrotor trajectories of N minimum-snap segments with free ends.
+"""The base planner of quadrotor trajectories: N minimum-snap segments with free end states.
 
-Hits have one segment that ends at the impact on the racket, catches one segment to each target, and
-recovery trajectories one segment to standstill. A task defines the meaning of the end variables.
+A hit has one segment, which ends at the impact on the racket. Catches have one segment to each
+target, and recovery trajectories one segment to standstill. The subclass of a task defines the
+variables that determine the segments' ends.
 """
 
 import abc
@@ -36,26 +37,27 @@ from planner_jax.trajectory.proportional_minco import (
     proportional_minco,
 )
 
-_ORDER = 4  # minimum snap
+_ORDER = 4  # derivative whose square is minimised: snap
 
 
 @struct.dataclass
 class ChainEnds:
-    """The ends of N segments, as functions of the end variables."""
+    """Durations and states at the ends of N segments, computed from the end variables."""
 
     durations: Float[Array, " N"]  # [s], of the segments
     tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor
     total_time: Float[Array, ""]  # [s], of the active segments
-    excess: Float[Array, "..."]  # over the limits at the ends; feasible if <= 0
+    excess: Float[Array, "..."]  # relative excess over the limits at the ends; feasible if <= 0
     contact: PyTree = None  # task-specific data of the ends for the plan
 
 
 @dataclasses.dataclass(frozen=True)
 class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
-    """A planner of N minimum-snap segments of M pieces each.
+    """A planner of N minimum-snap segments of M polynomial pieces each.
 
-    Decision variables, for each segment in units of `scale`: whitened waypoint offsets, and K end
-    variables. The first end variable is the logarithm of the segment's duration.
+    The decision variables of a segment are whitened waypoint offsets (scaled deviations from the
+    smoothest trajectory) and K end variables, in units of `scale`. The first end variable is the
+    logarithm of the segment's duration.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * total time + integral of the smoothed
     hinges of the limits and of the case's extras + end_weight * smoothed hinges of the excess at
@@ -64,19 +66,19 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     subspace = 0
     package: ClassVar[str]  # package with the measured scales and the networks
-    shipped_name: ClassVar[str] = "exact"  # of the scales in the package
-    num_end_variables: ClassVar[int]  # K
+    shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
+    num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Intervals a piece at which finished plans of one and of several segments are checked. Body
-    # rates peak sharply where the thrust is small, which happens between catches.
+    # Intervals of each piece at which finished plans are checked, with one and with several
+    # segments. Body rates peak sharply where the thrust is small, as happens between catches.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of the pieces
-    nodes: int = 8  # penalty intervals a piece
+    nodes: int = 8  # intervals of each piece at whose ends the penalties are evaluated
     time_weight: float = 0.005
     energy_weight: float = 3e-8
     margin: float = 0.03  # relative distance from a limit at which penalties start
     hinge_width: float = 0.1
-    scale: tuple[float, ...] = ()  # of one segment
+    scale: tuple[float, ...] = ()  # units of a segment's variables; if empty, the measured units
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -89,11 +91,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return the ends for end variables in SI units."""
+        """Return the segments' durations and end states for end variables in SI units."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return the end variables of the first starting points, in SI units."""
+        """Return guessed end variables of the first `num` starting points, in SI units."""
 
     @abc.abstractmethod
     def make_plan(
@@ -103,40 +105,40 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         violation: Float[Array, ""],
         context: PyTree,
     ) -> PlanT:
-        """Return the plan of a trajectory, with `pending` cost and status."""
+        """Return the task's plan of a trajectory; the solver sets its cost and status later."""
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the hinges at the ends, relative to the integrals."""
+        """Weight [s] of the penalties at the segments' ends, relative to the time integrals."""
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which segments exist."""
+        """Return which of the N segments the case uses."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the excess at the ends of a finished plan relative to the limits."""
+        """Convert the excess at the ends of a finished plan to fractions of the limits."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
-        """Return the network for the first starting point of such cases, or None."""
+        """Return the network that improves the first starting point of such cases, or None."""
         return None
 
     def start_features(self, context: PyTree) -> Float[Array, " F"]:
-        """Return the inputs of the network."""
+        """Return the features of a case that are the inputs of the start network."""
         raise NotImplementedError
 
     def limit_learned(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Return a starting point of the network, changed where a search could not leave it."""
+        """Limit a starting point of the network to values that a search can still change."""
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return a scale for the planner's variables, made from a scale for fewer variables."""
+        """Extend the units of fewer variables to all variables of this planner."""
         return scale
 
     @property
     def _usual_scale(self) -> tuple[float, ...]:
-        """Measured scale for this number of pieces."""
+        """Measured units of the variables of a segment with this number of pieces."""
         return load_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
 
     @property
@@ -151,11 +153,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary rows and offsets to a segment."""
+        """Constant linear maps from a segment's boundary states and offsets to its polynomials."""
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return smooth trajectories to guessed ends; a network may improve the first one."""
+        """Return the smoothest trajectories to guessed ends; a network may improve the first."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
@@ -169,29 +171,30 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Return the whitened offsets (N, O, 3), and the end variables (N, K) in SI units."""
+        """Split a point into whitened offsets (N, O, 3) and end variables (N, K) in SI units."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return offsets, natural[:, self.num_offsets :]
 
     def join(self, offsets: Float[Array, "N O 3"], natural: Float[Array, "N K"]) -> Array:
-        """Return the point (n,) of offsets and end variables: the inverse of `split`."""
+        """Return the point (n,) made of offsets and end variables: the inverse of `split`."""
         together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 
     def along(self, nodes: int, case: QuadrotorCase) -> Along:
-        """Return the penalties along the trajectory."""
+        """Return the penalties along a trajectory, evaluated at `nodes` intervals of each piece."""
         return flight_along(self.maps, nodes, case, self.margin, self.hinge_width)
 
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Return the contribution of the end variables to the objective.
+        """Return all that the objective needs to know about the end variables.
 
         Returns:
-            Boundary rows (N, 8, 3) and mean durations of a piece (N,) [s] of the segments, the cost
-            of time and of the ends (), and the greatest excess at the ends ().
+            Boundary rows (N, 8, 3), which are scaled states at both ends of the segments; mean
+            durations of a piece (N,) [s]; the cost () that depends on the end variables alone; and
+            the greatest excess at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces
@@ -205,11 +208,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return rows, durations, core, jnp.max(ends.excess)
 
     def _count(self, values: Float[Array, " N"], context: PyTree) -> Array:
-        """Return the sum over the active segments."""
+        """Return the sum of one value for each segment over the segments that the case uses."""
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return cost and largest excess at the penalty nodes, as a ratio of squares."""
+        """Return the cost and the largest excess over a limit, with squared ratios at the nodes."""
         case = context.case
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
@@ -228,8 +231,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def curvature_at(self, point: Float[Array, " n"], context: PyTree) -> Curvature:
-        """Return evaluation, gradient, and second derivatives; see `chain_curvature`."""
-        # Only Newton's method needs it
+        """Return evaluation, gradient and second derivatives at a point; see `chain_curvature`."""
+        # Imported here because only Newton's method needs this module.
         from planner_jax.optimise.chain_curvature import chain_curvature
 
         case = context.case
@@ -248,7 +251,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point; its violation covers `decode_nodes` and the peaks between."""
+        """Return the plan at a point, with its violation at `decode_nodes` and between them."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

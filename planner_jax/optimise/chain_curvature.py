@@ -1,8 +1,8 @@
-"""Second derivatives of a minimum-snap trajectory by its end variables and its offsets.
+"""Second derivatives of the objective of minimum-snap segments, for Newton's method.
 
-`cost.along_curvature` differentiates the penalties along the trajectory by the columns and the
-duration of a segment. The end variables determine columns and durations, and the chain rule pulls
-those derivatives back to them.
+`cost.along_curvature` differentiates the penalties along a segment by its columns (scaled boundary
+states and waypoint offsets) and by its duration. Columns and durations depend on the end variables,
+and the chain rule converts the derivatives to derivatives by the end variables.
 """
 
 import functools
@@ -20,8 +20,8 @@ from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
-# Takes the end variables (N, k). Returns boundary rows (N, 2s, 3), mean durations of a piece (N,)
-# [s], the cost of the ends (), and the greatest excess at the ends ().
+# A function of the end variables (N, k). It returns boundary rows (N, 2s, 3), mean durations of a
+# piece (N,) [s], the cost of the ends (), and the greatest excess at the ends ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 
@@ -41,8 +41,8 @@ def chain_curvature(
 
     The objective is the cost of the ends, plus for each active segment the energy of its offsets
     and the integral of its penalties. A point lists, segment by segment, the offsets and the end
-    variables, in units of `scale`. All second derivatives enter products with directions. The
-    preconditioner uses those among the end variables, and the diagonal for the offsets.
+    variables, in units of `scale`. Products with the Hessian contain all second derivatives. The
+    preconditioner contains the ones among the end variables, and the offsets' diagonal.
 
     Args:
         maps: constants of a segment; M pieces, s = order.
@@ -53,7 +53,7 @@ def chain_curvature(
         natural: (N, k) end variables.
         offsets: (N, M - 1, 3) whitened waypoint offsets.
         scale: (3 (M - 1) + k,) units of one segment's variables.
-        parameters: second argument of the excess.
+        parameters: gravity, limits and extras of the case, for the functions in `along`.
         energy_weight: weight of the energy in the cost.
         active: (N,) bool, the segments that exist.
 
@@ -62,7 +62,7 @@ def chain_curvature(
     """
     rows, durations, core, excess = found
     num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
-    given = order if num == 1 else 0  # rows of a head state, which depend on the duration alone
+    given = order if num == 1 else 0  # number of rows of the fixed initial state, if it is the only
     columns = jnp.concatenate([rows, offsets], axis=1)
     one = functools.partial(curvature_along, along, parameters=parameters, given=given)
     of = jax.vmap(lambda columns, duration: one(columns, duration))(columns, durations)
@@ -72,7 +72,7 @@ def chain_curvature(
         return jnp.where(active.reshape(-1, *[1] * (values.ndim - 1)), values, 0.0)
 
     of = jax.tree.map(keep_active, of)
-    num_rows = rows.shape[1] - given  # variable rows
+    num_rows = rows.shape[1] - given  # number of rows that depend on the end variables
     energies = jax.vmap(functools.partial(offset_energy, maps))(offsets, durations)
     energies = energy_weight * keep_active(energies)
     bend = keep_active(2.0 * energy_weight * maps.offset_energy / durations**power)[:, None, None]
@@ -89,7 +89,8 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within`: Hessian (N k, N k) of `pull_back`; `turned`: Jacobian of rows (N k, N, rows, 3).
+    # `within` is the Hessian (N k, N k) of `pull_back`, `turned` the rows' Jacobian (N k, N, rows,
+    # 3).
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies
@@ -125,7 +126,7 @@ def chain_curvature(
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # Second derivatives among all end variables, and the diagonal for the offsets.
+    # For the preconditioner: second derivatives among all end variables, and the offsets' diagonal.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)

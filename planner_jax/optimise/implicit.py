@@ -1,8 +1,8 @@
-"""Gradients of an optimal plan by the implicit function theorem.
+"""Gradients of an optimal plan by the implicit function theorem, for `pj.optimal_plan`.
 
 At an optimum u*(theta) the gradient of the objective J vanishes, so
-du*/dtheta = -J_uu^-1 J_utheta: one linear solve with the Hessian, whatever the number of
-iterations that found u*; nothing is unrolled.
+du*/dtheta = -J_uu^-1 J_utheta. This takes one linear solve with the Hessian J_uu, for any number of
+iterations that found u*; the iterations are not differentiated.
 """
 
 import functools
@@ -24,7 +24,7 @@ from planner_jax.optimise.settings import LbfgsConfig, Objective
 
 @struct.dataclass
 class _Newton:
-    """The state of the refinement: the best point so far, and the next point to evaluate."""
+    """The state of Newton's method: the best point so far, and the next point to evaluate."""
 
     point: Array  # (n,)
     cost: Array  # ()
@@ -39,12 +39,12 @@ class _Newton:
 def newton_refine(
     objective: Objective, point: Array, *, max_steps: int, stationarity: Array | float
 ) -> tuple[Array, Array]:
-    """Move a nearly stationary point (n,) to the optimum of its basin.
+    """Move a nearly stationary point (n,) to the local optimum near it, by damped Newton steps.
 
-    Damped Newton steps, with the eigenvalues of the Hessian made positive. A step is accepted if it
-    lowers the cost, or lowers the gradient at a cost that is equal up to rounding; otherwise the
-    damping grows. The refinement ends after `max_steps` Hessians, or where the norm of the gradient
-    is at most `stationarity`. This norm () is the second result.
+    Negative eigenvalues of the Hessian are replaced by their absolute values. A step is accepted if
+    it lowers the cost, or if it lowers the gradient at a cost that is equal up to rounding.
+    Otherwise the damping grows. The refinement ends after `max_steps` Hessians, or when the norm of
+    the gradient () is at most `stationarity`. This norm is the second result.
     """
 
     def gradient(x: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -95,16 +95,16 @@ def optimal_plan(
     *,
     solver: LbfgsConfig | None = None,
 ) -> PyTree:
-    """Return the plan at the optimum of the first guess's basin, differentiable by the case.
+    """Return the plan at the local optimum near the first guess, differentiable by the case.
 
     `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, use the
     implicit function theorem. Use float64 (`jax.enable_x64`) where gradients must have more than
     two correct digits.
 
     Args:
-        planner: a planner that minimises. If it decides first, its first choice is planned, and if
-            it searches for a path first, the result of its first search; both are constant to
-            derivatives.
+        planner: a planner that minimises. If it first decides something or searches for a path, its
+            first decision or path is used, and derivatives treat this decision or path as a
+            constant.
         case: one case; derivatives are by its leaves.
         solver: settings of the search before the refinement; 200 iterations by default.
 
@@ -126,7 +126,7 @@ def optimal_plan(
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = minimiser.prepare(case)
     start = lax.stop_gradient(minimiser.guesses(context, 1)[0])
-    # Gradients of this size, relative to the cost, can be due to rounding alone.
+    # A gradient smaller than this number, relative to the cost, can be due to rounding alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:

@@ -1,7 +1,7 @@
-"""The inverse of a small matrix on many lanes as one kernel for CUDA.
+"""A CUDA kernel that inverts one small matrix for each lane, that is, each problem of a batch.
 
-A thread keeps its lane's matrix in registers. As separate operations the pivots would depend on
-each other, and all entries would pass through memory at each pivot.
+A thread keeps the matrix of its lane in registers. As separate JAX operations, each elimination
+step would read and write all entries in memory and wait for the step before it.
 """
 
 import functools
@@ -13,12 +13,12 @@ from jax import Array
 from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes
 
-_THREADS = 32  # lanes of a block
-_LARGEST = 12  # most rows for which a thread can keep all entries
+_THREADS = 32  # threads of a block, one for each matrix
+_LARGEST = 12  # greatest number of rows for which a thread keeps all entries in registers
 
 
 def inverse_kernel(*, interpret: bool = False) -> Callable:
-    """Make the kernel of `preconditioner.positive_inverse`; `interpret` runs it without a GPU."""
+    """Make the CUDA kernel of `positive_inverse`; with `interpret` it runs without a GPU."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         (matrix,) = leaves
@@ -34,7 +34,7 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
 
 @functools.cache
 def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
-    """Make the kernel for matrices of `size` rows on `lanes` lanes."""
+    """Make the kernel that inverts `lanes` matrices of `size` rows each."""
 
     def body(matrix, out):
         entries = [[matrix[i, j] for j in range(size)] for i in range(size)]

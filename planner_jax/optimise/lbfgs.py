@@ -1,11 +1,12 @@
-"""L-BFGS for small smooth problems, many at once.
+"""L-BFGS for small smooth problems, made for batches.
 
-The functions solve ONE problem; `jax.vmap` makes a batch, in which finished lanes stand still. Each
-iteration tries several step lengths at once, because under `vmap` a backtracking search would
-continue until the slowest lane is done. The solver also tracks feasibility, and returns the best
-feasible iterate.
+The functions solve ONE problem; `jax.vmap` makes a batch. A lane is one problem of the batch. A
+finished lane keeps its point while other lanes continue. Each iteration tries several step lengths
+at once, because under `vmap` a backtracking search would continue until the slowest lane is done.
+The solver also tracks feasibility, and returns the best feasible iterate.
 
-Direction: [Liu1989], two-loop recursion, with gamma = s.y / y.y of the newest pair.
+The direction is computed by the two-loop recursion of [Liu1989]. Its initial scale is
+gamma = s.y / y.y, for the newest step s and the change y of the gradient along it.
 """
 
 import functools
@@ -23,26 +24,26 @@ from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 @struct.dataclass
 class Memory:
-    """The newest m pairs of steps and changes of the gradient, newest last."""
+    """The newest m pairs of a step and the change of the gradient along the step, newest last."""
 
-    steps: Array  # (m, n), s_k of Liu and Nocedal
+    steps: Array  # (m, n), s_k of [Liu1989]
     changes: Array  # (m, n), y_k
-    inverse_curvature: Array  # (m,), 1 / s.y; 0 where the slot is empty
+    inverse_curvature: Array  # (m,), 1 / s.y; 0 where no pair is stored
 
 
 @struct.dataclass
 class LbfgsNumbers:
-    """The scalars in the state of one lane."""
+    """The scalars in the state of one problem of the batch."""
 
     best: Evaluation  # at the best point; not finite before the first iteration
-    reach: Array  # (), factor on the trial steps; shrinks while none lowers the cost
+    reach: Array  # (), factor on the trial steps; it shrinks while no trial lowers the cost
     iteration: Array  # () int32
-    stalled: Array  # () int32, iterations in a row without a decrease
+    stalled: Array  # () int32, iterations in a row that hardly lowered the cost
 
 
 @struct.dataclass
 class LbfgsState:
-    """The state of one lane between iterations."""
+    """The state of one problem of the batch between two iterations."""
 
     point: Array  # (n,)
     step: Array  # (n,), last step, which led to the point; 0 if there was none
@@ -73,32 +74,32 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
 
 
 def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Array, Array]:
-    """Return the weight of a new pair, given s.y, y.y and s.s.
+    """Decide from s.y, y.y and s.s whether a new pair (step s, change of gradient y) is stored.
 
-    The results are whether its curvature is positive, so that the pair is kept; whether the squared
-    length of the step is not zero; and 1 / s.y if the pair is kept, otherwise 0.
+    Returns whether the curvature s.y is positive, so that the pair is stored; whether the step is
+    longer than zero; and 1 / s.y if the pair is stored, otherwise 0.
     """
     keep = curvature > 1e-8 * change
     return keep, step > 0.0, jnp.where(keep, 1.0 / jnp.where(keep, curvature, 1.0), 0.0)
 
 
 def start_scale(newest: Array, change: Array, grad: Array) -> Array:
-    """Return gamma, given 1 / s.y (0 without a pair) and y.y of the newest pair, and g.g."""
+    """Return gamma from the newest pair's 1 / s.y and y.y; without a pair (0), 1 / sqrt(g.g)."""
     size = change * newest
     slope = jnp.sqrt(jnp.maximum(grad, 1e-30))
     return jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
 
 
 def shortening(squared_length: Array, step_cap: float) -> Array:
-    """Return the factor that limits a direction to the length `step_cap`."""
+    """Return the factor <= 1 that limits a direction of this squared length to `step_cap`."""
     return jnp.minimum(1.0, step_cap / jnp.sqrt(jnp.maximum(squared_length, 1e-30)))
 
 
 def remember(memory: Memory, step: Array, change: Array) -> Memory:
-    """Return the memory with another pair (n,), (n,).
+    """Return the memory with one more pair: a step (n,) and the change of the gradient (n,).
 
-    A pair without positive curvature is left out. If the squared length of the step is zero, the
-    memory is emptied, so that the next direction is steepest descent.
+    A pair without positive curvature is not stored. A step of length zero empties the memory, so
+    that the next direction is steepest descent.
     """
     keep, moved, inverse = weigh_pair(jnp.sum(step * change), jnp.sum(change**2), jnp.sum(step**2))
 
@@ -116,8 +117,8 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
 def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
     """Return the quasi-Newton direction -H g (n,), at most as long as the step cap.
 
-    Without a pair in memory it is steepest descent of unit length: in scaled variables one is a
-    sensible length of a step, for any size of the gradient.
+    Without a stored pair the direction is steepest descent with length 1. This is a sensible
+    length for any size of the gradient, because the variables are scaled.
     """
     q = grad
     alphas = []
@@ -136,7 +137,7 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
 
 @functools.cache
 def _turn(num_pairs: int, step_cap: float) -> Callable:
-    """Return the function that updates memory and direction, with a kernel for many lanes."""
+    """Make the function that updates memory and direction; on a GPU a batch uses a CUDA kernel."""
 
     def turn(memory: Memory, step: Array, change: Array, grad: Array) -> tuple[Memory, Array]:
         memory = remember(memory, step, change)
@@ -149,8 +150,8 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
     """Return the state after one iteration: gradient, memory, direction, and the best trial step.
 
-    The gradient is evaluated first, so that k iterations take exactly k gradients. A finished lane
-    stands still: of its state only memory and gradient change, which it does not use again.
+    The gradient is evaluated first, so that k iterations take exactly k gradients. A finished
+    problem of a batch keeps its point; only its memory and gradient change, which are not used.
     """
 
     def value(point: Array) -> tuple[Array, Array]:
@@ -178,33 +179,33 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
 
 
 def is_unfinished(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
-    """Return whether a lane has iterations left and is not stationary, () bool."""
+    """Return whether a problem has iterations left and is not stationary, () bool."""
     return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
 
 
 def is_stationary(numbers: LbfgsNumbers, config: LbfgsConfig) -> Array:
-    """Return whether `patience` iterations in a row brought no decrease, () bool."""
+    """Return whether `patience` iterations in a row hardly lowered the cost, () bool."""
     return numbers.stalled >= config.patience
 
 
 @struct.dataclass
 class _Choice:
-    """The result of an iteration."""
+    """The outcome of one iteration: the step length, and the scalars of the state after it."""
 
     numbers: LbfgsNumbers  # after the iteration
     length: Array  # (), factor on the direction; 0 without a decrease
     better: Array  # () bool, whether the new point is the best one
-    going: Array  # () bool, False for a finished lane, which stands still
+    going: Array  # () bool, False for a finished problem, which keeps its point
 
 
 def _choose(
     config: LbfgsConfig, numbers: LbfgsNumbers, here: Evaluation, lengths: Array, trials: Evaluation
 ) -> _Choice:
-    """Select the lowest of the trials (k,), if it is lower than the cost at the current point."""
+    """Select the cheapest of the trial points (k,), if it costs less than the current point."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
 
-    def of_chosen(values: Array) -> Array:  # a gather would need a loop of its own
+    def of_chosen(values: Array) -> Array:  # a masked sum; a gather would need its own loop
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
     decreased = of_chosen(costs) < here.cost
@@ -214,7 +215,7 @@ def _choose(
     progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
-        # Without a decrease the next trial steps are shorter.
+        # If no trial lowers the cost, the next trial steps are shorter.
         reach=jnp.where(decreased, 1.0, 0.05 * numbers.reach),
         iteration=numbers.iteration + 1,
         stalled=jnp.where(progress, 0, numbers.stalled + 1),

@@ -1,8 +1,8 @@
-"""The next direction of L-BFGS on many lanes as one kernel for CUDA.
+"""A CUDA kernel that computes the next direction of L-BFGS for many problems of a batch.
 
-As separate operations it is a chain of about thirty dependent sums. Here a block of threads keeps
-the gradient and the pairs of its lanes in registers. It reads every pair once and overwrites the
-memory in place, so that nothing is copied between iterations.
+As separate JAX operations, a direction takes about thirty sums that depend on each other. In the
+kernel, a block of threads keeps the gradients of its problems and their pairs of steps and changes
+of the gradient in registers. It reads every pair once and overwrites the memory of pairs in place.
 """
 
 import functools
@@ -16,11 +16,11 @@ from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import block_width, kernel_by_lanes, load_masked, store_masked
 from planner_jax.optimise.lbfgs import shortening, start_scale, weigh_pair
 
-_LANES, _THREADS = 32, 128  # of a block
+_LANES, _THREADS = 32, 128  # problems and threads of a CUDA block
 
 
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
-    """Make the kernel of `lbfgs.remember` followed by `lbfgs.search_direction`, for m pairs."""
+    """Make the CUDA kernel that does `lbfgs.remember` and then `lbfgs.search_direction`."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]
@@ -36,8 +36,8 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
 def _call(
     num_pairs: int, step_cap: float, n: int, lanes: int, width: int, interpret: bool
 ) -> Callable:
-    """Make the kernel for vectors of n numbers on `lanes` lanes."""
-    height = 1 << (n - 1).bit_length()  # a block's rows are a power of two
+    """Make the kernel for `lanes` problems of n variables each."""
+    height = 1 << (n - 1).bit_length()  # n rounded up to a power of two, as GPU blocks require
 
     def body(steps, changes, inverses, step, change, grad, *out):
         new_steps, new_changes, new_inverses, direction = out
@@ -58,7 +58,8 @@ def _call(
         keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
-        # Newest first. If the new pair is kept, each slot takes the pair of the next newer slot.
+        # From the newest pair to the oldest. If the new pair is stored, pair k + 1 moves to index
+        # k.
         alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
             old, earlier = [read(steps, k), read(changes, k)], inverses[k]

@@ -1,9 +1,9 @@
 """Levenberg-Marquardt: least squares of few unknowns, one Cholesky factorisation a step.
 
-For problems whose terms are squares of residuals with known Jacobians, such as hinges on limits.
-The curvature J'J is then accurate enough for a dozen steps where a quasi-Newton method takes many
-more. Each step tries one point. It is accepted with less damping for the next step if it costs
-less, and rejected with more damping otherwise.
+The method suits costs that are sums of squared residuals with known Jacobians J, such as hinges on
+limits. The curvature J'J is then accurate enough to finish in a dozen steps, where a quasi-Newton
+method takes many more. Each step tries one point. If it costs less, it is accepted, and the damping
+is reduced for the next step. Otherwise it is rejected, and the damping is increased.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from jax.scipy.linalg import cho_factor, cho_solve
 
 @struct.dataclass
 class Model:
-    """A sum of squares and its quadratic model at a point."""
+    """A sum of squares at a point: its cost, gradient and approximate curvature."""
 
     cost: Array  # ()
     gradient: Array  # (n,)
@@ -28,18 +28,18 @@ class Model:
 
 @dataclasses.dataclass(frozen=True)
 class LevenbergConfig:
-    """Sizes and switches; static."""
+    """Settings of a Levenberg-Marquardt search; hashable, so static under jit."""
 
     max_steps: int = 20
-    damping: float = 1e-2  # initial, times the mean diagonal of the curvature
+    damping: float = 1e-2  # initial damping, relative to the mean diagonal of the curvature
     ease: float = 0.2  # factor on the damping after an accepted step
     tighten: float = 6.0  # factor on the damping after a rejected step
     longest: float = 1.5  # greatest change of an unknown in one step
-    # A search ends after `settled` steps at feasible points that each lower the cost by less than
-    # the share `tolerance`.
+    # A search ends after `settled` steps in a row at feasible points that each lower the cost by
+    # less than the fraction `tolerance`.
     settled: int = 2
     tolerance: float = 1e-2
-    # A search is aborted once its cost is above `hope` * `fade`^k, k steps after the step `trial`.
+    # k steps after step `trial`, a search is aborted if its cost exceeds hope * fade^k.
     trial: int = 0
     hope: float | None = None
     fade: float = 1.0
@@ -47,7 +47,7 @@ class LevenbergConfig:
 
 @struct.dataclass
 class LevenbergState:
-    """The best point so far, and what the next step needs."""
+    """The best point of a search so far, and the numbers that the next step needs."""
 
     point: Array  # (n,)
     model: Model  # at the point
@@ -59,18 +59,18 @@ class LevenbergState:
 def least_squares(
     evaluate: Callable[[Array], Model], start: Array, config: LevenbergConfig
 ) -> LevenbergState:
-    """Minimise a sum of squares from one start (n,); pure, so jit and vmap it.
+    """Minimise a sum of squares from one start (n,); the function is pure, so jit and vmap it.
 
-    `evaluate` returns the model at a point. In the last state, which is returned, the search has
-    settled if `stalled` has reached `config.settled`.
+    `evaluate` returns the model at a point. The result is the last state of the search. The search
+    has converged if `stalled` in this state has reached `config.settled`.
     """
     return continue_search(evaluate, start_search(start, config), config)
 
 
 def start_search(start: Array, config: LevenbergConfig) -> LevenbergState:
-    """Return the state of a search before the evaluation of its start (n,)."""
-    # The first step, of length zero, evaluates the start: to do so here would compile the model
-    # twice.
+    """Return the initial state of a search from `start` (n,), before any evaluation."""
+    # The first step has length zero and evaluates the start. If the start were evaluated here, the
+    # model would be compiled twice.
     zero = jnp.zeros((), start.dtype)
     nothing = Model(
         cost=zero + jnp.inf,
@@ -93,7 +93,7 @@ def continue_search(
     config: LevenbergConfig,
     most: Array | int | None = None,
 ) -> LevenbergState:
-    """Continue a search from a state to `most` steps in all, and return its last state."""
+    """Continue a search until it has made `most` steps in total, and return its last state."""
     most = config.max_steps if most is None else most
 
     def is_unfinished(state: LevenbergState) -> Array:
@@ -112,7 +112,7 @@ def _step(
     evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
 ) -> LevenbergState:
     model = state.model
-    # One damping for all unknowns, so that unknowns without effect on the residuals do not move.
+    # All unknowns have the same damping > 0. An unknown without effect on the residuals then stays.
     scale = jnp.mean(jnp.diagonal(model.curvature)) * state.damping
     damped = model.curvature + scale * jnp.eye(state.point.size, dtype=state.point.dtype)
     change = -cho_solve(cho_factor(damped), model.gradient)

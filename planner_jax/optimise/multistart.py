@@ -1,4 +1,4 @@
-"""The iteration of the solver, for one case and several starts, or for a batch of cases."""
+"""The search loops of planners that minimise: several starts of one case, or a batch of cases."""
 
 import dataclasses
 import functools
@@ -31,13 +31,13 @@ from planner_jax.optimise.settings import (
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import OptimisedPlanner
 
-# Up to this number iterations are counted, which spares a GPU the test for the end.
+# Up to this number of iterations the loop has a fixed length, which saves a test in every pass.
 _COUNTED = 16
 
 
 @struct.dataclass
 class Optimum:
-    """The result of the search of one lane."""
+    """The result of a search from one start of one case."""
 
     point: Array  # (n,), the best feasible iterate, or the iterate of least violation
     evaluation: Evaluation
@@ -48,9 +48,10 @@ class Optimum:
 def minimise(
     objective: Objective, start: Array, config: Solver, curved: Curved | None = None
 ) -> Optimum:
-    """Minimise from one start (n,) until stationary or out of iterations.
+    """Minimise from one start (n,) until the point is stationary or no iterations are left.
 
-    `curved` returns derivatives for Newton's method, if there is a faster function than products.
+    `curved` returns the derivatives for Newton's method. By default these are computed from the
+    objective, with one automatic differentiation for each product with the Hessian.
     """
     if config.max_steps == 0:
         return _optimum_at(start, objective(start), config)
@@ -71,9 +72,9 @@ def minimise_lanes(
     config: Solver,
     curved: Callable[[Array, PyTree], Curvature] | None = None,
 ) -> Optimum:
-    """Minimise on many lanes, each with its own start and context.
+    """Minimise many problems of a batch at once, each with its own start and context.
 
-    The starts are (n, B), and the contexts and the optima have the lanes last on every leaf.
+    The starts are (n, B). The B problems are on the last axis of every leaf of contexts and optima.
     `objective` and `curved` take one point and one context.
     """
     if config.max_steps == 0:
@@ -118,10 +119,10 @@ def minimise_lanes(
 
 
 def _method(config: Solver) -> ModuleType:
-    """Return the module of a method."""
+    """Return the module of the solver that the settings select: `lbfgs` or `newton`."""
     if isinstance(config, LbfgsConfig):
         return lbfgs
-    from planner_jax.optimise import newton  # only planners that search for low costs need it
+    from planner_jax.optimise import newton  # only planners that search for low costs use it
 
     return newton
 
@@ -134,7 +135,7 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Return the settings with the number of iterations that a straggler may take."""
+    """Return the settings with the total number of iterations that a slow problem may take."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -151,16 +152,16 @@ def _optimum_of(state: PyTree, config: Solver) -> Optimum:
 
 
 def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
-    """Return the start itself as the optimum."""
+    """Return the start itself as the optimum, for a search without iterations."""
     stationary = jnp.full((), config.patience == 0)
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
 
 def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> PyTree:
-    """Plan one case with one round's starts and iterations; pure, so jit and vmap it.
+    """Plan one case with the starts and iterations of one round (attempt); pure.
 
-    The plan of the best start has its `status` and `iterations` set. For a batch `solve_batch` is
-    faster.
+    The result is the plan of the best start, with its `status` and `iterations`. For many cases
+    `solve_batch` is faster.
     """
     last = planner.with_settings(attempt.settings)
     context = last.prepare(case)
@@ -186,20 +187,20 @@ def solve_round(planner: "OptimisedPlanner", attempt: Round, case: PyTree) -> Py
         if stage.keep is not None:
             kept = _cheapest(optimum.evaluation.cost, stage.keep)
             points, spent = points[kept], spent[kept]
-    assert optimum is not None  # a round has a stage
+    assert optimum is not None  # a round has at least one stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = _of_each(lambda found: _plan_at(last, found, context), optimum)
     return jax.tree.map(lambda leaf: leaf[0], plans) if len(points) == 1 else _best(plans)
 
 
 def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> PyTree:
-    """Plan a batch of cases with one round's starts and iterations; pure."""
+    """Plan a batch of cases with the starts and iterations of one round (attempt); pure."""
     last, num = planner.with_settings(attempt.settings), attempt.starts
     lanes = jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), cases)
     contexts = over_lanes(last.prepare)(lanes)
     before = planner.with_settings(_stages(attempt)[0].settings)
     starts = over_lanes(lambda context: before.guesses(context, num))(contexts)
-    # A lane of the solver is one start of one case; the starts of a case are neighbours.
+    # Each start of each case is one problem of the solver; the starts of a case are adjacent.
     points = jnp.moveaxis(starts, 0, -1).reshape(starts.shape[1], -1)
     of_starts = _repeat(contexts, num)
     spent = jnp.zeros(points.shape[1:], jnp.int32)
@@ -218,7 +219,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
             kept = (kept + num * jnp.arange(len(costs))[:, None]).ravel()
             points, spent, num = points[:, kept], spent[kept], min(stage.keep, num)
             of_starts = _repeat(contexts, num)
-    assert optimum is not None  # a round has a stage
+    assert optimum is not None  # a round has at least one stage
     optimum = dataclasses.replace(optimum, iterations=spent)
     plans = over_lanes(functools.partial(_plan_at, last))(optimum, of_starts)
     plans = jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), plans)
@@ -229,31 +230,31 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches in order; the last one is the search of the round itself."""
+    """Return the searches of a round in order; the last one is the round's own search."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
 def _of_each(function: Callable, starts: PyTree) -> PyTree:
-    """Return a function of every start, without a batch where there is only one."""
+    """Apply a function to every start, by `vmap` if there is more than one start."""
     if len(jax.tree.leaves(starts)[0]) > 1:
         return jax.vmap(function)(starts)
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))
 
 
 def _repeat(contexts: PyTree, num: int) -> PyTree:
-    """Return the context of every start: the context of each case `num` times."""
+    """Repeat the context of each case `num` times, once for each start of the case."""
     if num == 1:
         return contexts
     return jax.tree.map(lambda x: jnp.repeat(x, num, axis=-1), contexts)
 
 
 def _cheapest(costs: Array, num: int) -> Array:
-    """Return the indices (num,) of the least of costs (S,); non-finite costs come last."""
+    """Return the indices (num,) of the least of the costs (S,); non-finite costs come last."""
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
 def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
-    """Return the plan of one optimum."""
+    """Return the plan at an optimum, with its cost, its iterations and its status."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
     status = status_of(cost, plan.violation, optimum.stationary)
@@ -263,6 +264,6 @@ def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> 
 
 
 def _best(plans: PyTree) -> PyTree:
-    """Return the plan that is selected from the plans of several starts."""
+    """Select the best plan of a case from the plans of its starts."""
     best = index_of_best(plans)
     return jax.tree.map(lambda leaf: leaf[best], plans)

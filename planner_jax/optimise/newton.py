@@ -1,23 +1,23 @@
-"""Newton's method for small smooth problems, many at once.
+"""Newton's method for small smooth problems, made for batches.
 
-Each iteration builds a subspace of a few vectors from the gradient by products with the damped
+Each iteration builds a subspace of a few vectors from the gradient, by products with the damped
 Hessian [Lanczos1950]. In this subspace the Hessian is tridiagonal. If it has negative eigenvalues
-there, it is shifted until it has none, as in trust-region methods ([More1983]; in such
-a subspace [Gould1999]). As in `optimise.lbfgs`, the solver also tracks
-feasibility and returns the best feasible iterate.
+there, it is shifted until it has none, as in trust-region methods ([More1983]; in such a subspace
+[Gould1999]). As in `optimise.lbfgs`, the solver also tracks feasibility and returns the best
+feasible iterate. A lane is one problem of the batch.
 
-Few vectors are enough if the planner has a preconditioner, the inverse of the strong part of the
-Hessian. There are two kinds of damping. Each lane has its own damping, a multiple of the identity
-that is added to the Hessian: far from the optimum it leads down the gradient, in scaled variables.
-In addition several multiples of the preconditioner's curvature are tried at once, for a few
-operations each, because under `vmap` a search for the right multiple would continue until the
-slowest lane is done. The best multiple determines the lane's next damping. The damping fades, and
-the last steps are undamped Newton steps, also along flat valleys.
+Few vectors are enough if the planner has a preconditioner, an inverse of the dominant part of the
+Hessian. There are two kinds of damping. First, each lane has its own damping, a multiple of the
+identity that is added to the Hessian. Far from the optimum it turns the step towards the negative
+gradient. Second, several multiples of the preconditioner's curvature are tried at once, for a few
+operations each. A search for the best multiple would, under `vmap`, continue until the slowest lane
+is done. The best multiple determines the lane's next damping. The damping fades towards the
+optimum, and the last steps are undamped Newton steps, also along flat valleys.
 
-Near an optimum two costs differ by less than their rounding, while slopes still show where the
-optimum is. With a `slack` the search continues from the least damped step that costs no more up to
-rounding, as in the approximate Wolfe conditions [Hager2005], until steps make no
-progress.
+Near an optimum the costs of two points differ by less than their rounding errors, while gradients
+still show where the optimum is. With a `slack` > 0 a step may raise the cost by a rounding error,
+as in the approximate Wolfe conditions [Hager2005]. Among such steps the least damped one is taken,
+until steps make no progress.
 """
 
 import functools
@@ -39,14 +39,14 @@ from planner_jax.optimise.settings import (
 )
 
 _HIGHEST = lax.Precision.HIGHEST
-_HALVINGS = 14  # of the interval that contains the least eigenvalue
+_HALVINGS = 14  # bisections of the interval that contains the least eigenvalue
 _LEAST_DAMPING = 1e-10  # least damping of a lane
 _LEAST = 1e-7  # least pivot, relative to the greatest entry of its matrix
 
 
 @struct.dataclass
 class NewtonNumbers:
-    """The scalars in the state of one lane."""
+    """The scalars in the state of one problem of the batch."""
 
     best: Evaluation  # at the best point; not finite before the first iteration
     damping: Array  # ()
@@ -57,7 +57,7 @@ class NewtonNumbers:
 
 @struct.dataclass
 class NewtonState:
-    """The state of one lane between iterations."""
+    """The state of one problem of the batch between two iterations."""
 
     point: Array  # (n,)
     best_point: Array  # (n,)
@@ -65,10 +65,10 @@ class NewtonState:
 
 
 def by_products(objective: Objective) -> Curved:
-    """Return the derivatives of any objective; each product is a tangent of its gradient."""
+    """Return the derivatives of an objective; Hessian products use automatic differentiation."""
 
     def preconditioner(damping: Array) -> Callable[[Array], Array]:
-        return lambda right: right / damping  # only the damping is known
+        return lambda right: right / damping  # nothing but the damping of the Hessian is known
 
     def expand(point: Array) -> Curvature:
         def slope(at: Array) -> tuple[Array, Evaluation]:
@@ -102,19 +102,19 @@ def init(point: Array, config: NewtonConfig) -> NewtonState:
 
 
 def is_unfinished(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
-    """Return whether a lane has iterations left and is not stationary, () bool."""
+    """Return whether a problem has iterations left and is not stationary, () bool."""
     return (numbers.iteration < config.max_steps) & ~is_stationary(numbers, config)
 
 
 def is_stationary(numbers: NewtonNumbers, config: NewtonConfig) -> Array:
-    """Return whether little decrease is expected or progress has stalled, () bool."""
+    """Return whether the predicted decrease is small, or progress has stalled, () bool."""
     return (numbers.expected <= config.tolerance) | (numbers.stalled >= config.patience)
 
 
 def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Array:
-    """Return the lanes (num,) of a batch with the greatest predicted decreases.
+    """Return the indices (num,) of the problems with the greatest predicted decreases of the cost.
 
-    Unfinished lanes come before finished lanes.
+    Unfinished problems come before finished problems.
     """
     expected = jnp.where(jnp.isnan(numbers.expected), jnp.inf, numbers.expected)
     return jnp.argsort(jnp.where(is_unfinished(numbers, config), -expected, 1.0))[:num]
@@ -125,7 +125,7 @@ def step(
 ) -> NewtonState:
     """Return the state after one iteration: gradient, subspace, and the best of all damped steps.
 
-    A finished lane stands still.
+    A finished problem of a batch keeps its point.
     """
     here = curved(state.point)
     steps, decrease = solve_damped(here, state.numbers.damping, config)
@@ -143,9 +143,9 @@ def step(
 def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
     """Return Newton steps (k, n) within the subspace, one for each of k trial dampings.
 
-    `damping`, the lane's own, is > 0 and added to the Hessian's diagonal. No step is longer than
-    the step cap. The second result is the decrease of the cost () that the step without trial
-    damping predicts.
+    `damping` > 0 is the problem's own damping, which is added to the Hessian's diagonal. No step is
+    longer than `config.step_cap`. The second result () is the decrease of the cost that the
+    quadratic model predicts for the step without trial damping.
     """
     gradient = here.gradient
     solve_about = here.preconditioner(damping)
@@ -159,7 +159,7 @@ def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple
             return found, solve_about(found)
 
         directions, diagonal, beside = _lanczos(gradient, turned, size, multiply, config.subspace)
-    else:  # as if the preconditioner were the whole inverse
+    else:  # the preconditioner is taken for the complete inverse of the Hessian
         directions = turned[None] / jnp.maximum(size, 1e-30)
         diagonal, beside = [jnp.ones_like(size)], []
     shift = jnp.maximum(-_lowest(diagonal, beside), 0.0)
@@ -185,7 +185,7 @@ def _lanczos(
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # Rows M d and rows d, for each direction d.
+    # `images` has a row M d, and `directions` the row d, for each direction d.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []
@@ -194,12 +194,12 @@ def _lanczos(
         diagonal.append(jnp.sum(directions[k] * product))
         if k + 1 == num:
             break
-        # Orthogonal to all previous directions, which rounding would bring back.
+        # Remove the parts along all previous directions, which rounding errors would bring back.
         shares = jnp.matmul(directions, product, precision=_HIGHEST)
         product = product - jnp.matmul(shares, images, precision=_HIGHEST)
         turned = turned - jnp.matmul(shares, directions, precision=_HIGHEST)
         length = jnp.sqrt(jnp.maximum(jnp.sum(product * turned), 0.0))
-        # At the end of an invariant subspace the next direction is zero.
+        # If the subspace is invariant under the Hessian, the next direction is zero.
         is_new = length > 1e-5 * jnp.abs(diagonal[-1])
         scale = jnp.where(is_new, 1.0 / jnp.where(is_new, length, 1.0), 0.0)
         beside.append(jnp.where(is_new, length, 0.0))
@@ -209,7 +209,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return the pivots of the shifted tridiagonal matrix; none is zero."""
+    """Return the pivots of the shifted tridiagonal matrix, each bounded away from zero."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -224,7 +224,7 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
 def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
     """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if none is negative.
 
-    By bisection, with the signs of pivots (Sturm).
+    The interval is bisected; the signs of the pivots count eigenvalues (Sturm).
     """
     around = [jnp.abs(each) for each in beside]
     zero = jnp.zeros_like(diagonal[0])
@@ -250,7 +250,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Return the solution (m,) of the shifted tridiagonal system for the first unit vector."""
+    """Solve the shifted tridiagonal system with the first unit vector as right side, (m,)."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):
@@ -268,14 +268,14 @@ def _choose(
     trials: Evaluation,
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
-    """Return new numbers, shares of the trials in the step, and bools: best point, unfinished."""
+    """Choose a trial: new numbers, weights of the trials in the step, is best, is unfinished."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)
     places = jnp.arange(costs.size)
-    # Among trials with equal costs up to rounding, the one with the least damping.
+    # Among the trials whose costs are equal up to rounding, the least damped one is chosen.
     is_chosen = places == jnp.argmin(jnp.where(costs <= jnp.min(costs) + slack, places, costs.size))
 
-    def of_chosen(values: Array) -> Array:  # a gather would need a loop of its own
+    def of_chosen(values: Array) -> Array:  # a masked sum; a gather would need its own loop
         return jnp.sum(jnp.where(is_chosen, values, 0.0))
 
     moved = of_chosen(costs) < here.cost + slack
@@ -287,7 +287,7 @@ def _choose(
     factors = jnp.maximum(jnp.asarray(config.trial_dampings, costs.dtype), config.ease)
     damping = numbers.damping * jnp.where(moved, of_chosen(factors), config.tighten)
     predicted = decrease / jnp.maximum(jnp.abs(here.cost), 1e-30)
-    # The prediction of a strongly damped step is too small.
+    # A strongly damped step is short, so its predicted decrease is too small.
     is_short = numbers.damping > config.trusted
     expected = jnp.where(is_short, jnp.maximum(predicted, numbers.expected), predicted)
     is_nearer = (there.cost < here.cost - slack) | (moved & (expected < 0.5 * numbers.expected))

@@ -1,4 +1,4 @@
-"""Planners that minimise: the methods that a subclass defines, and the methods that it inherits."""
+"""The base class of planners that minimise a cost, with the methods that subclasses define."""
 
 import abc
 import dataclasses
@@ -23,7 +23,7 @@ from planner_jax.optimise.settings import (
     Stage,
 )
 
-# Newton's method from the end of the first search.
+# Newton's method from the end of the first search to the optimum.
 _POLISH = NewtonConfig(
     max_steps=8,
     damping=1e-6,
@@ -35,7 +35,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Newton's method after the first round, by effort.
+# Newton's method after the first round (attempt), for each effort.
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(
@@ -45,7 +45,7 @@ _EFFORTS = {
 
 
 def pending(violation: Array) -> dict[str, PyTree]:
-    """Return the fields of a `Plan` before the solver sets all of them but the violation."""
+    """Return the fields of a new `Plan`: its violation, and zeros that the solver replaces."""
     zero = jnp.zeros((), jnp.int32)
     return {
         "cost": jnp.zeros_like(violation),
@@ -56,22 +56,22 @@ def pending(violation: Array) -> dict[str, PyTree]:
 
 
 class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
-    """A planner by batched L-BFGS: a problem of one case and rounds of attempts at it.
+    """Base class of planners that minimise by L-BFGS or Newton's method, in rounds.
 
-    A subclass is a frozen dataclass and a pytree (`jax.tree_util.register_static` if it holds no
-    arrays) with a field `rounds`. Its functions `prepare`, `guesses`, `objective` and `decode` are
-    pure and for one case. They use scaled decision variables, in which the objective has curvature
-    of order one.
+    A round is one attempt at the cases that earlier rounds left unsolved. A subclass is a frozen
+    dataclass and a pytree (`jax.tree_util.register_static` if it holds no arrays) with a field
+    `rounds`. Its functions `prepare`, `guesses`, `objective` and `decode` are pure and take one
+    case. Their decision variables are scaled, so that second derivatives are of order one.
     """
 
     rounds: tuple[Round, ...]  # attempts, in order
-    # Vectors of Newton's method; 0 if the preconditioner is nearly the inverse of the Hessian.
+    # Subspace vectors of Newton's method; 0 if the preconditioner is nearly the inverse Hessian.
     subspace: ClassVar[int] = 4
     adjoint: ClassVar[str] = "products"  # the `curvature` of `pj.gradient` by default
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
-        """Return data that every evaluation reads, such as a table of the ball's path."""
+        """Return data that all evaluations of a case share, such as a table of the ball's path."""
 
     @abc.abstractmethod
     def guesses(self, context: PyTree, num: int) -> Array:
@@ -79,7 +79,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @abc.abstractmethod
     def objective(self, point: Array, context: PyTree) -> Evaluation:
-        """Return cost and largest violation at a point (n,)."""
+        """Return the cost and the largest violation of a limit at a point (n,)."""
 
     def curvature_at(self, point: Array, context: PyTree) -> Curvature:
         """Return the derivatives for Newton's method at a point (n,).
@@ -95,54 +95,54 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def decode(self, point: Array, context: PyTree) -> PyTree:
         """Return the plan at a point (n,), with its violation computed more exactly.
 
-        `cost`, `iterations` and `status` are `pending` until the solver sets them.
+        The solver sets the plan's `cost`, `iterations` and `status` afterwards; see `pending`.
         """
 
     def rules_out(self, context: PyTree) -> Array:
-        """Return whether a bound proves that no plan exists, () bool; false by default.
+        """Return whether it is proven that the case has no plan, () bool; false by default.
 
-        Such a case has the status `TOO_FAR` unless it is solved, and no further attempt is made.
+        Such a case, if unsolved, has the status `TOO_FAR`, and no further attempt is made.
         """
         return jnp.zeros((), bool)
 
     def convert_point(self, point: Array, before: "OptimisedPlanner") -> Array:
-        """Return a point (n,) of the same planner with other settings in this planner's variables.
+        """Convert a point (n,) of the same planner with other settings to this planner's variables.
 
-        The point is the same unless the settings change the variables.
+        The point is returned unchanged unless the settings change the variables.
         """
         return point
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds."""
+        """The rounds of the planner, in order."""
         return self.rounds
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
-        """Return the plan of one case by one round."""
+        """Return the plan that one round (attempt) finds for one case."""
         return solve_round(self, attempt, case)
 
     def solve_lanes(self, cases: PyTree, attempt: Round) -> PyTree:
-        """Return the plans of a batch by one round."""
+        """Return the plans that one round (attempt) finds for a batch."""
         return solve_batch(self, attempt, cases)
 
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[Self, PyTree]:
-        """Return the planner and the cases: nothing is decided before it minimises."""
+        """Return the planner and the cases unchanged: nothing is decided before the search."""
         return self, cases
 
     def with_settings(self, settings: Settings) -> Self:
-        """Return the planner with other values of some fields; its plans keep their shapes."""
+        """Return a copy of the planner with other values of some fields."""
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
     def with_solver(self, solver: Solver = _LONG) -> Self:
-        """Return the planner with one long search from the first guess in place of its rounds."""
+        """Return a copy of the planner that makes one long search from the first guess."""
         return self.with_settings((("rounds", (Round(solver=solver),)),))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> Self:
-        """Return the planner whose first round continues by Newton's method.
+        """Return a copy of the planner whose first round continues with Newton's method.
 
-        `solver` are settings of the method; by default it continues to the optimum.
+        `solver` has the settings of the method; by default it continues to the optimum.
         """
         first, *others = self.rounds
         stages = (*first.stages, Stage(first.solver, first.settings))
@@ -152,14 +152,14 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.with_settings((("rounds", (first, *others)),))
 
     def with_effort(self, effort: str) -> Self:
-        """Return the planner with a first round that continues after every limit holds.
+        """Return a copy of the planner that lowers the cost further after every limit holds.
 
-        The rounds after the first one, for the cases that it leaves unsolved, stay as they are.
+        Only the first round is longer. The later rounds, for unsolved cases, are unchanged.
 
         Args:
-            effort: "good" adds one iteration of Newton's method, "best" adds 8. Some of the cases
-                get more while they expect a decrease of the cost by more than 2 % ("good") or
-                1e-7 ("best"). "feasible" returns the planner itself.
+            effort: "good" adds one iteration of Newton's method, "best" adds 8. Cases get more
+                iterations while the predicted relative decrease of the cost exceeds 2e-2 ("good")
+                or 1e-7 ("best"). "feasible" returns the planner itself.
         """
         require_one_of(EFFORTS, "effort", effort)
         return (
@@ -167,5 +167,5 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         )
 
     def _fit_subspace(self, solver: NewtonConfig) -> NewtonConfig:
-        """Return the settings with the number of vectors that the preconditioner needs."""
+        """Return the settings with as many subspace vectors as the preconditioner needs."""
         return dataclasses.replace(solver, subspace=self.subspace)

@@ -1,4 +1,4 @@
-"""Approximate inverses of Hessians with strong blocks and a strong diagonal."""
+"""Preconditioners for Newton's method: inverses of dense blocks and of a diagonal."""
 
 from collections.abc import Callable
 
@@ -12,13 +12,13 @@ from planner_jax.optimise.settings import Preconditioner
 
 
 def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Preconditioner:
-    """Return the preconditioner of dense blocks and of a diagonal for the other variables.
+    """Return a preconditioner that inverts dense blocks, and a diagonal for other variables.
 
-    `blocks` are indices (K, k) of the variables that couple, and `within` the second derivatives
-    (K, k, k) among them. `others` is the diagonal (n,) of the Hessian; its entries for the blocks
-    are ignored. The result takes a damping (), which is added to the diagonal, and returns the
-    solver. Its matrix is symmetric; pivots of blocks that are not positive definite are made
-    positive.
+    `blocks` are indices (K, k) of coupled variables, and `within` the second derivatives (K, k, k)
+    among them. `others` is the diagonal (n,) of the Hessian; its entries for the blocks are
+    ignored. The result takes a damping (), which is added to the diagonal, and returns the solver.
+    The solver's matrix is symmetric and positive: blocks that are not positive definite get
+    positive pivots.
     """
     size, num = others.shape[0], blocks.shape[1]
     inside = np.zeros(size, bool)
@@ -46,10 +46,10 @@ def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Pr
 
 
 def _gauss_jordan(matrix: Array) -> Array:
-    """Return the inverse of a symmetric matrix (k, k), with pivots made positive.
+    """Return the inverse of a symmetric matrix (k, k), with its pivots made positive.
 
-    Gauss-Jordan elimination in k steps, in place, without exchange of pivots. If the matrix is
-    positive definite, no pivot is changed, and the result is its inverse.
+    Gauss-Jordan elimination in k steps, in place, without pivoting. For a positive definite matrix
+    no pivot is changed, and the result is the exact inverse.
     """
     size = matrix.shape[0]
     least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20

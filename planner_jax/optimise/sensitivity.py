@@ -4,10 +4,10 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta),
 
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
-the adjoint form of the implicit function theorem. Conjugate gradients [Hestenes1952]
-solve for lambda in a few steps, with the planner's products with the Hessian
-(`OptimisedPlanner.curvature_at`) or with the whole Hessian. The derivative of all slopes of the
-cost along lambda contains lambda^T cost_utheta.
+the adjoint form of the implicit function theorem. Conjugate gradients [Hestenes1952] solve for
+lambda in a few steps. They use the planner's products with the Hessian
+(`OptimisedPlanner.curvature_at`), or the whole Hessian. The product lambda^T cost_utheta is part of
+the derivative of the cost's gradient (by u and theta) along lambda.
 """
 
 import dataclasses
@@ -33,33 +33,33 @@ from planner_jax.optimise.settings import Curvature, Evaluation, Round, Settings
 Quantity = str | Callable[[PyTree], Array]
 Product = Callable[[Array], Array]  # product of a matrix with a vector (n,)
 _CURVATURES = ("products", "whole")
-# Default iterations of conjugate gradients, for about 40 scaled unknowns.
+# Default number of iterations of conjugate gradients, chosen for about 40 scaled unknowns.
 _STEPS = {"products": 40, "whole": 1}
-_DAMPING = 1e-9  # damping of the preconditioner for products: negligible
-_SMALL = 1e-11  # squared residual at convergence, relative to the right side's square
+_DAMPING = 1e-9  # damping of the preconditioner for products; negligible beside the Hessian
+_SMALL = 1e-11  # squared relative residual at which conjugate gradients stop
 
 
 @struct.dataclass
 class Gradient:
-    """A number of a plan, and its gradient by parts of the case."""
+    """The value of one number of a plan, and its gradient by parts of the case."""
 
     value: Array  # ()
     by: dict[str, PyTree]  # name -> part of the case with d value / d leaf as leaves
-    # () relative residual of the equation for lambda in the preconditioner's norm: 0 if lambda is
-    # exact. It does not measure the distance to the optimum. It and `by` are NaN if the Hessian is
-    # not positive along the first direction: then the point is no minimum.
+    # () Relative residual of the equation for lambda, in the preconditioner's norm; 0 if lambda is
+    # exact. It does not measure the distance to the optimum. The residual and `by` are NaN if the
+    # Hessian is not positive along the first direction, because the point is then no minimum.
     residual: Array
 
 
 @struct.dataclass
 class DifferentiatedPlan(Plan):
-    """A planner's plan with a gradient."""
+    """A planner's plan, together with the gradient of one of its numbers."""
 
     plan: PyTree
     gradient: Gradient
 
     def whole_plan(self) -> PyTree:
-        """Return the plan with the fields that the solver set."""
+        """Return the inner plan with the cost, iterations and status that the solver found."""
         return self.plan.replace(cost=self.cost, iterations=self.iterations, status=self.status)
 
 
@@ -73,14 +73,14 @@ class _Context:
 class Differentiated(OptimisedPlanner):
     """A planner whose plans contain the gradient of one of their numbers.
 
-    It solves the same problem; the gradient is computed at the result of the solver.
+    It solves the problem of the inner planner, and computes the gradient at the result.
     """
 
     planner: OptimisedPlanner
-    # Dotted name in the plan such as "stroke.time", or a function of the plan.
+    # The number: a dotted name in the plan, such as "stroke.time", or a function of the plan.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
-    # Iterations of conjugate gradients; None for the default of the curvature.
+    # Iterations of conjugate gradients; None for the default of the field `curvature`.
     steps: int | None = struct.field(pytree_node=False, default=None)
     curvature: str = struct.field(pytree_node=False, default="products")  # see `gradient_at`
 
@@ -105,7 +105,7 @@ class Differentiated(OptimisedPlanner):
         return dataclasses.replace(self, planner=self.planner.with_settings(settings))
 
     def prepare(self, case: PyTree) -> _Context:
-        """Return the context of the inner planner, with the case."""
+        """Return the context of the inner planner together with the case."""
         return _Context(case=case, inner=self.planner.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
@@ -113,7 +113,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Return the point that the inner planner converts."""
+        """Convert a point of the inner planner with other settings to its present variables."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
@@ -155,21 +155,21 @@ def gradient_at(
     steps: int | None = None,
     curvature: str = "products",
 ) -> Gradient:
-    """Return the gradient of a number of one lane's plan at a point by parts of the case; pure.
+    """Return the gradient of one number of a plan by parts of its case, at a point; pure.
 
     Args:
-        planner: sizes and switches, static.
+        planner: the planner whose objective the point minimises.
         case: one case.
         point: (n,) minimiser of the planner's objective. At another point the result is the
-            derivative of the points of equal gradient of the cost, not of the optimum.
+            derivative along points at which the cost has the same gradient, not of the optimum.
         quantity: dotted name of a number in the plan, or a function of the plan.
         by: dotted names in the case.
-        steps: iterations of conjugate gradients, each with one product with the Hessian. A lane
-            stops early if the Hessian is not positive. 0 leaves the adjoint out, which is
-            correct for "cost": its gradient at an optimum is the gradient at a fixed point
-            (envelope theorem). None for the default of the curvature.
+        steps: iterations of conjugate gradients, each with one product with the Hessian. They stop
+            early if the Hessian is not positive. 0 leaves the adjoint out, which is correct for
+            "cost": its derivative at an optimum is the derivative at a fixed point (envelope
+            theorem). None stands for the default of `curvature`.
         curvature: "products" uses products and preconditioner of the planner's `curvature_at`;
-            "whole" preconditions by the Hessian itself, which takes n more products.
+            "whole" uses the inverse of the full Hessian as preconditioner: n more products.
 
     Raises:
         ValueError: a name does not exist, or is not of floating-point numbers.
@@ -205,7 +205,7 @@ def gradient_at(
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
     def products(direction: Array) -> tuple[Array, list]:
-        """Return (p^T cost_uu, p^T cost_uc), the derivative of the slopes along p."""
+        """Return (p^T cost_uu, p^T cost_uc): the derivative of both gradients along p."""
         slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
         return jax.jvp(slopes, (point,), (direction,))[1]
 
@@ -234,7 +234,7 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    """Return the inverse of the Hessian, its pivots made positive, and the Hessian, as products."""
+    """Return products with the Hessian's inverse, its pivots made positive, and the Hessian."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
     return lambda right: jnp.sum(inverse * right, axis=1), product
@@ -272,7 +272,7 @@ def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[
 
 
 def part_of(tree: PyTree, name: str) -> PyTree:
-    """Return the part of a case with a dotted name; entries of tuples are named by index.
+    """Return the part of a case that a dotted name selects; tuple entries are named by index.
 
     Raises:
         ValueError: there is no such part, or it is not of floating-point numbers.
@@ -302,14 +302,14 @@ def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
 
 
 def _members(tree: PyTree) -> dict[str, PyTree]:
-    """Return the members of a tuple by index, or of a dataclass by name."""
+    """Return the entries of a tuple by index, or the fields of a dataclass by name."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return vars(tree) if dataclasses.is_dataclass(tree) else {}
 
 
 def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
-    """Return the tree with another part at a dotted name."""
+    """Return a copy of the tree in which the part with a dotted name is replaced."""
     first, _, rest = name.partition(".")
     inner = _with_part(_members(tree)[first], rest, part) if rest else part
     if isinstance(tree, tuple):

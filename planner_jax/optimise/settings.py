@@ -1,4 +1,4 @@
-"""Objectives of the solvers, and the settings of a search: methods, stages and rounds."""
+"""Types of objectives, and settings of searches: solvers, preliminary stages and rounds."""
 
 import dataclasses
 from collections.abc import Callable
@@ -14,20 +14,20 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
-MOST_DAMPING = 1e4  # greatest damping of a lane in Newton's method
+MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
 
 @struct.dataclass
 class Evaluation:
-    """An objective at one point."""
+    """The value of an objective at one point: the cost, and the largest violation of a limit."""
 
     cost: Array  # (), to be minimised
     violation: Array  # (), largest relative excess over a limit; feasible if <= 0
 
 
 Objective = Callable[[Array], Evaluation]
-# Takes a positive damping (). Returns an approximate solver of the damped Hessian's system, which
-# multiplies a right side (n,) by a symmetric positive definite matrix.
+# A function of a positive damping (). It returns a function that approximately solves the damped
+# Hessian's system: it multiplies a right side (n,) by a symmetric positive definite matrix.
 Preconditioner = Callable[[Array], Callable[[Array], Array]]
 
 
@@ -46,14 +46,14 @@ Curved = Callable[[Array], Curvature]
 
 @dataclasses.dataclass(frozen=True)
 class LbfgsConfig:
-    """Sizes and switches of the solver: hashable, so static under jit."""
+    """Settings of the L-BFGS solver; hashable, so static under jit."""
 
     max_steps: int = 10  # 0 returns the start itself
-    memory: int = 6
-    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)
-    step_cap: float = 2.0  # largest Euclidean length of a unit step
+    memory: int = 6  # number of stored pairs of a step and the change of the gradient
+    trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)  # lengths tried at once in each iteration
+    step_cap: float = 2.0  # greatest Euclidean length of a step with trial length 1
     tolerance: float = 1e-4  # relative decrease of the cost below which progress stalls
-    patience: int = 2  # stalled iterations after which a lane is stationary
+    patience: int = 2  # stalled iterations after which a problem counts as stationary
 
     def __post_init__(self) -> None:
         for name, least in (("max_steps", 0), ("memory", 1), ("patience", 0)):
@@ -71,25 +71,27 @@ _SHARE = Rule("in (0, 1]", lambda value, part: (value > 0.0) & (value <= 1.0))
 
 @dataclasses.dataclass(frozen=True)
 class NewtonConfig:
-    """Sizes and switches of the solver: hashable, so static under jit."""
+    """Settings of Newton's method; hashable, so static under jit."""
 
     max_steps: int = 6
-    subspace: int = 4  # number of vectors; 0 uses the preconditioner alone, without products
+    subspace: int = 4  # number of subspace vectors; 0 uses the preconditioner alone
     damping: float = 1e-4  # initial damping
     # Multiples of the preconditioner's curvature that are tried at once. The damping is multiplied
-    # by the best one or by `ease`, whichever is greater, or by `tighten` if none lowers the cost.
+    # by the best multiple, but at least by `ease`; or by `tighten` if no trial lowers the cost.
     trial_dampings: tuple[float, ...] = (0.0, 0.3, 3.0, 30.0)
     ease: float = 0.03
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
-    tolerance: float = 1e-4  # predicted relative decrease below which a lane is stationary
+    tolerance: float = 1e-4  # predicted relative decrease below which a problem is stationary
     trusted: float = MOST_DAMPING  # greatest damping at which the predicted decrease is reliable
-    patience: int = 3  # iterations without progress after which a lane is stationary
-    # Relative difference between costs, in roundings of their type, that is insignificant. Steps
-    # that cost no more are accepted, and count as progress if the predicted decrease halves.
+    patience: int = 3  # iterations without progress after which a problem is stationary
+    # Relative difference of costs, in units of machine epsilon, that counts as rounding error.
+    # Steps that raise the cost by no more are accepted; they are progress if the predicted decrease
+    # halves.
     slack: float = 0.0
-    # Groups of lanes that continue while any is unfinished, greatest predicted decrease first: a
-    # group's share of the batch, its iterations, and the greatest number of groups.
+    # After the iterations, groups of unfinished problems continue, those with the greatest
+    # predicted decreases first: a group's fraction of the batch, its iterations, and the most
+    # groups.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -118,11 +120,11 @@ Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their valu
 
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """An easier problem; the next one starts at its result."""
+    """A preliminary search on an easier problem; the round's next search starts at its result."""
 
     solver: Solver
     settings: Settings = ()
-    keep: int | None = None  # number of cheapest starts of a case that continue; None for all
+    keep: int | None = None  # number of a case's cheapest starts that continue; None for all
 
     def __post_init__(self) -> None:
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
@@ -132,11 +134,11 @@ class Stage:
 
 @dataclasses.dataclass(frozen=True)
 class Round(Attempt):
-    """An attempt of a planner that minimises: its starts, iterations and settings."""
+    """One attempt of a planner that minimises: its solver, settings and preliminary searches."""
 
     solver: Solver = LbfgsConfig()
-    settings: Settings = ()  # of the planner, for this round
-    stages: tuple[Stage, ...] = ()  # searches before it, from easy to hard
+    settings: Settings = ()  # fields of the planner that this round changes
+    stages: tuple[Stage, ...] = ()  # searches before the round's own search, from easy to hard
 
     def __post_init__(self) -> None:
         super().__post_init__()

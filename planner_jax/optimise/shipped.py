@@ -1,10 +1,10 @@
-"""Measured scales and trained starting points that are shipped beside a task's modules.
+"""Measured units of variables, and trained networks for starting points, stored with each task.
 
-A quasi-Newton step is only as good as its coordinates, so each planner solves in units that
-`python -m benchmarks.measure_scales` measures. The networks for starting points are trained by
-`python -m benchmarks.learn_starts --train MINUTES` on the planner's own objective (amortised
-optimisation), without solved examples. A search starts at the network's point only if that costs
-less than the guess without it, so a poor output far from the training data does no harm.
+A quasi-Newton method depends on the units of its variables. Each planner therefore uses units that
+`python -m benchmarks.measure_scales` measured. The networks predict starting points. They are
+trained by `python -m benchmarks.learn_starts --train MINUTES` to lower the planner's own objective
+(amortised optimisation), without solved examples. A search starts at the network's point only if
+its cost is lower than the cost of the guess without it, so a poor output does no harm.
 """
 
 import functools
@@ -19,12 +19,12 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-REACH = 4.0  # standard deviations at which features are clipped
+REACH = 4.0  # number of standard deviations at which features are clipped
 
 
 @struct.dataclass
 class StartNetwork:
-    """A network: weights and biases of its layers, mean and standard deviation of its features."""
+    """A network that corrects a guess: its weights, and the statistics of its input features."""
 
     mean: Array | np.ndarray  # (F,), of the features
     deviation: Array | np.ndarray  # (F,)
@@ -32,7 +32,7 @@ class StartNetwork:
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 
     def __call__(self, features: Array) -> Array:
-        """Return the correction (n,) of a guess, from features (F,)."""
+        """Return the correction (n,) of a guess, given the features (F,) of a case."""
         cast = functools.partial(jnp.asarray, dtype=features.dtype)
         values = (features - cast(self.mean)) / cast(self.deviation)
         values = jnp.clip(values, -REACH, REACH)
@@ -44,14 +44,14 @@ class StartNetwork:
 
 
 def select_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
-    """Return the cheaper of a learned starting point (n,) and a guess."""
+    """Return the starting point (n,) of lower cost: the network's point or the guess."""
     costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # at once, in one program
     return jnp.where(costs[1] < costs[0], learned, guess)
 
 
 @functools.cache
 def load_scale(package: str, name: str) -> tuple[float, ...]:
-    """Return a measured scale from the `measured_scales.json` of a task's package."""
+    """Load measured units of variables from the `measured_scales.json` of a task's package."""
     path = importlib.resources.files(package) / "measured_scales.json"
     scales = json.loads(path.read_text("utf-8"))
     if name not in scales:
@@ -63,7 +63,7 @@ def load_scale(package: str, name: str) -> tuple[float, ...]:
 
 @functools.cache
 def load_network(package: str, name: str) -> StartNetwork:
-    """Return the network `name` of a task's package."""
+    """Load the network `name` for starting points from a task's package."""
     path = importlib.resources.files(package) / f"start_{name}.npz"
     with np.load(io.BytesIO(path.read_bytes()), allow_pickle=False) as file:
         arrays = {key: file[key].astype(np.float32) for key in file.files}

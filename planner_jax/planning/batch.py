@@ -1,8 +1,8 @@
-"""Batches of plans: chunks of a few fixed sizes, spread over the devices, attempt after attempt.
+"""Plans of batches, for `plan`: chunks of a few fixed sizes, spread over the devices.
 
-A lane is one case of a batch. After each attempt the lanes that are still unsolved are packed
-together for the next attempt. Every device solves its lanes in a loop of its own and waits for no
-other. A `Watch` reports progress to the caller, and ends the attempts at the time limit.
+A lane is one case of a batch. The cases that an attempt leaves unsolved are gathered into a smaller
+batch for the planner's next attempt. Each device solves its lanes in its own loop and waits for no
+other device. A `Watch` reports progress to the caller and ends the attempts at the time limit.
 """
 
 import dataclasses
@@ -48,18 +48,18 @@ from planner_jax.planning.programs import (
     with_unsolved,
 )
 
-_QUIET = 1.0  # [s], least time between two reports of one round
+_QUIET = 1.0  # [s] least time between two progress reports of one round
 
 
 @dataclasses.dataclass(frozen=True)
 class Progress:
-    """Progress of one round of `plan`; as text it is one line."""
+    """Progress of one round, that is of one attempt, of `plan`; `str` formats it as one line."""
 
-    round: int  # counted from 1
-    rounds: int  # greatest number of rounds
-    tried: int  # of this round, tried so far
-    cases: int  # of this round: all that earlier rounds left unsolved
-    seconds: float  # since the start of planning
+    round: int  # number of this round, counted from 1
+    rounds: int  # greatest number of rounds that the planner makes
+    tried: int  # number of cases that this round has tried so far
+    cases: int  # number of cases of this round: all that earlier rounds left unsolved
+    seconds: float  # [s] time since the start of planning
 
     def __str__(self) -> str:
         return (
@@ -69,14 +69,14 @@ class Progress:
 
 
 class Watch:
-    """The clock of one call of `plan`.
+    """The clock of one call of `plan`: it reports progress and knows when the time limit passes.
 
     Args:
-        time_limit: [s] from the construction, after which no further attempt starts; None for none.
-        progress: receives a `Progress` for each report; None for no reports.
+        time_limit: [s] time after the construction at which attempts end; None: no limit.
+        progress: function that receives a `Progress` for each report; None: no reports.
 
     Raises:
-        TypeError: an argument is no number, or not callable.
+        TypeError: the time limit is not a number, or `progress` is not callable.
         ValueError: the time limit is negative or NaN.
     """
 
@@ -95,7 +95,7 @@ class Watch:
 
     @property
     def waits(self) -> bool:
-        """True if the planner must wait for each step, because its end time matters."""
+        """True if each step must be awaited, because its end time is compared or reported."""
         return self._limit is not None or self._progress is not None
 
     @property
@@ -104,7 +104,7 @@ class Watch:
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
     def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
-        """Report on a round: always at its start and end, in between once a second."""
+        """Report progress at the start and end of a round, and in between at most once a second."""
         if self._progress is None:
             return
         seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)
@@ -116,7 +116,7 @@ class Watch:
         self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
-# The lanes of one call, padded with the first lane, and their number before padding
+# Indices of the lanes of one compiled call, padded with the first index; number before padding.
 _Call = tuple[np.ndarray, int]
 
 
@@ -128,25 +128,25 @@ def plan_batch(
     devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch,
 ) -> tuple[PyTree, PyTree]:
-    """Return plans of a batch by attempts, each at the lanes that are still unsolved.
+    """Return plans of a batch. Each attempt is made at the cases that are still unsolved.
 
     Args:
-        planner: makes the attempts.
-        attempts: in order, one or more.
-        cases: a leading axis of B on every leaf.
-        chunk: lanes that a device solves in one call; None for a number that suits the device.
-        devices: share the work; None for all local ones.
-        watch: ends the attempts; the first one always starts.
+        planner: planner that makes the attempts.
+        attempts: one or more attempts, in order.
+        cases: batch of B cases, with a leading axis of length B on every leaf.
+        chunk: cases that a device solves in one call; None for a number that suits the device.
+        devices: devices that share the batch; None for all local devices.
+        watch: ends the attempts at the time limit; the first attempt always starts.
 
     Returns:
         The plans, with NumPy leaves, or with jax arrays if all leaves of the cases are jax arrays;
-        and numbers that are all zero if no lane is unsolved.
+        and an array of numbers that are all zero if every case is solved.
     """
     planner, mesh = on_devices(planner, devices)
     batch = _Batch(planner, chunk, mesh, watch)
     resident, num = is_resident(cases), count_lanes(cases)
-    # One CPU shares its memory with the host: there a thread for each core plans chunks, and NumPy
-    # cuts and joins them, because programs for that would be compiled for every new size.
+    # One CPU shares its memory with the host. There the chunks are planned by one thread for each
+    # core, and NumPy cuts and joins them: a JAX program would be compiled for every new size.
     if resident and (num == batch.sizes(attempts[0]).next(num) or not is_one_cpu(mesh)):
         return batch.plan_resident(attempts, cases)
     cases = jax.tree.map(np.asarray, cases)
@@ -157,7 +157,7 @@ def plan_batch(
 def plan_on_host(
     planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: Watch
 ) -> tuple[PyTree, int]:
-    """Do the work of `plan_batch` for a planner on the host, with NumPy leaves or one case."""
+    """Return plans with NumPy leaves, and the number unsolved, for a planner on the host."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
@@ -178,10 +178,10 @@ def _try_in_turn(
     watch: Watch,
     try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
-    """Return plans (num, ...) by one attempt after another, and the number that is unsolved.
+    """Return plans (num, ...) after all attempts in order, and the number of unsolved plans.
 
-    `try_lanes` makes an attempt at some lanes. It takes the plans so far, None at first, and
-    returns them with better plans at these lanes.
+    `try_lanes` makes one attempt at the cases with given indices. It takes the plans so far (None
+    before the first attempt), and returns them with improvements at those indices.
     """
     first, *others = attempts
     plans = try_lanes(first, np.arange(num), None)
@@ -199,7 +199,7 @@ def _try_in_turn(
 
 @dataclasses.dataclass(frozen=True)
 class _Batch:
-    """One planner on the devices of a mesh."""
+    """A planner with the settings of one call of `plan`: chunk size, devices and watch."""
 
     planner: Planner
     chunk: int | None
@@ -207,13 +207,13 @@ class _Batch:
     watch: Watch
 
     def sizes(self, attempt: Attempt) -> Sizes:
-        """Return the sizes of the calls of an attempt."""
+        """Return the numbers of lanes (cases) that the compiled calls of an attempt may have."""
         return sizes_of(self.planner, attempt, self.chunk, self.mesh)
 
     def try_lanes(
         self, cases: PyTree, attempt: Attempt, lanes: np.ndarray, plans: PyTree
     ) -> PyTree:
-        """Return the plans after one attempt at some lanes of cases in NumPy arrays."""
+        """Return all plans after one attempt at the cases with indices `lanes`; NumPy leaves."""
         calls = self._calls(attempt, lanes)
         found, tried = [], 0
         self.watch.report(self.planner, attempt, 0, lanes.size)
@@ -239,7 +239,7 @@ class _Batch:
         return mark_out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
-        """Return the calls for some lanes."""
+        """Split the indices `lanes` into compiled calls, each padded to an allowed size."""
         calls, devices = [], self.mesh.size
         for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
             part = lanes[first * devices :][: size * devices]
@@ -250,10 +250,10 @@ class _Batch:
     def _results(
         self, attempt: Attempt, cases: PyTree, calls: list[_Call], may_end: bool
     ) -> Iterator[PyTree]:
-        """Yield the plans of every call; on one CPU device with a thread for each core.
+        """Yield the plans of every call, in order. A single CPU uses one thread for each core.
 
-        One more thread prepares the next call while the others compute. If `may_end`, calls that
-        did not start before the time limit yield None.
+        One more thread prepares the next call while the others compute. With `may_end`, a call that
+        did not start before the time limit yields None.
         """
         watch, spec = self.watch, lane_sharding(self.mesh)
         threads = min(len(calls), usable_cores() + 1) if is_one_cpu(self.mesh) else 1
@@ -265,10 +265,10 @@ class _Batch:
             found, _ = solve_on_devices(self.planner, attempt, self.mesh, part)
             return jax.block_until_ready(found) if threads > 1 or watch.waits else found
 
-        if threads == 1:  # JAX returns before a call is done, so that the next one is prepared
+        if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
-        # The first call compiles, once for all threads.
+        # The first call compiles the program before other threads use it: it is compiled only once.
         key = program_key(self.planner, attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
         compiled.add(key)
@@ -278,12 +278,12 @@ class _Batch:
             yield from later
 
     def plan_resident(self, attempts: Sequence[Attempt], cases: PyTree) -> tuple[PyTree, Array]:
-        """Return plans of cases in jax arrays; only the number of unsolved ones reaches the host.
+        """Return plans of cases in jax arrays; only numbers of unsolved cases reach the host.
 
-        Every device plans its own share, and takes no lanes of other shares.
+        Each device plans an equal part of the batch, and never takes over cases of another device.
         """
         planner, mesh, watch, num = self.planner, self.mesh, self.watch, count_lanes(cases)
-        if num % mesh.size:  # the last lane is repeated until all shares are equal
+        if num % mesh.size:  # repeat the last case until all devices have equally many cases
             cases = _take(cases, np.arange(-(-num // mesh.size) * mesh.size))
         cases = place_lanes(cases, mesh)
         first, *others = attempts
@@ -293,8 +293,8 @@ class _Batch:
             before, due = plans.status, unsolved
             if attempt.within is not None:
                 before, due = _mark_due(mesh, attempt.within, plans)
-            due.copy_to_host_async()  # starts as soon as it is known
-            most = np.asarray(due).max()  # among the devices
+            due.copy_to_host_async()  # the copy starts as soon as the number is computed
+            most = np.asarray(due).max()  # greatest number of due cases on one device
             if most == 0:
                 continue
             if watch.is_over:
@@ -305,12 +305,12 @@ class _Batch:
                 part, lanes = _cut_unsolved(mesh, size, cases, before, put_number(mesh, begin))
                 later, _ = solve_on_devices(planner, attempt, mesh, part)
                 plans, unsolved = _select_locally(mesh, plans, later, lanes)
-        if num % mesh.size:  # JAX has no arrays of unequal shares
+        if num % mesh.size:  # JAX cannot shard an axis into unequal parts
             plans = _take(jax.device_put(plans, mesh.devices[0]), np.arange(num))
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Return the results of `solve_on_devices` for all lanes of each device, chunk by chunk."""
+        """Return the first attempt's plans, by chunks, and each device's number unsolved."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)
@@ -323,7 +323,7 @@ class _Batch:
         firsts = {size: begin for begin, size in reversed(cuts)}
         keys = {program_key(self.planner, attempt, size, cases) for size in firsts}
         found: dict[int, PyTree] = {}
-        if len(keys - compiled) > 1:  # compile at the same time
+        if len(keys - compiled) > 1:  # compile several programs at the same time
             with ThreadPoolExecutor(len(firsts)) as pool:
                 plans = pool.map(as_here(solve), firsts.values(), firsts)
                 found = dict(zip(firsts.values(), plans, strict=True))
@@ -334,13 +334,13 @@ class _Batch:
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return some lanes; the last one instead of indices beyond it."""
+    """Return the entries `lanes` of every leaf; an index beyond the end selects the last entry."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
 def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
-    """Return the next lanes of every device's share, padded with its last one."""
+    """Return `size` lanes (cases) from index `begin` of each device, padded with its last lane."""
 
     def cut(tree: PyTree, begin: Array) -> PyTree:
         return _take(tree, begin + jnp.arange(size))
@@ -352,9 +352,9 @@ def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
 def _cut_unsolved(
     mesh: Mesh, size: int, tree: PyTree, status: Array, begin: PyTree
 ) -> tuple[PyTree, Array]:
-    """Return the next unsolved lanes of every device's share, and their indices.
+    """Return the next unsolved lanes (cases) of each device, and their indices on that device.
 
-    They are padded with the last lane, whose index in the padding is beyond the share.
+    Padding repeats the device's last lane, with an index beyond its number of lanes.
     """
 
     def cut(tree: PyTree, status: Array, begin: Array) -> tuple[PyTree, Array]:
@@ -368,9 +368,9 @@ def _cut_unsolved(
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
 def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
-    """Return statuses, and the number of unsolved ones, (devices,).
+    """Return statuses for an attempt with the limit `within`, and the number due, (devices,).
 
-    Plans with a violation above `within` count as solved.
+    Plans with a violation above `within` are marked as solved, so that the attempt skips them.
     """
 
     def due(plans: PyTree) -> tuple[Array, Array]:
@@ -383,7 +383,7 @@ def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
 def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, Array]:
-    """Return each device's parts joined to its share, and the number that it leaves unsolved."""
+    """Join the chunks of plans of each device, and count its unsolved plans."""
 
     def join(*parts: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))
@@ -393,7 +393,7 @@ def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, 
 
 @functools.partial(jax.jit, static_argnames="mesh")
 def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Return the results of `select_into` for each device, and its number of unsolved plans."""
+    """Replace plans by later plans that are better, on each device; count its unsolved plans."""
 
     def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
         kept = select(later, _take(plans, lanes))

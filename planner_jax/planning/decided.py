@@ -1,4 +1,4 @@
-"""A planner behind a decision on what cases leave open, such as an order."""
+"""The composite planner that first decides what a case leaves open, such as a catching order."""
 
 from collections.abc import Callable
 
@@ -17,11 +17,12 @@ from planner_jax.planning.programs import call_packed
 
 @struct.dataclass
 class DecidedPlanner(PlannerAround[CaseT, PlanT]):
-    """A composite planner: a decision proposes choices, and a planner plans every choice.
+    """A planner that first decides what cases leave open, such as an order of the targets.
 
-    Of several choices the solved one with the least `decision.rank` is selected, or the one with
-    the least violation if none is solved. The planner's last and longest attempt is made only for
-    cases without a solved choice. If the planner `starts_long`, so are all attempts but the first.
+    `decision` proposes several choices for each case, and `planner` plans the case with every
+    choice. The solved plan with the least `decision.rank` is selected, or the plan with the least
+    violation if none is solved. The planner's last and longest attempt is made only for cases
+    without a solved choice. If its first attempt is long already, this holds for all later ones.
     """
 
     decision: PyTree  # a `Decision`
@@ -29,9 +30,10 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return the planner that minimises, and the cases with the choice of their plans.
+        """Return the planner that minimises, and the cases with their choices filled in.
 
-        Without `plan_of` that is the first choice of the decision.
+        The choices are those of the plans that `plan_of` makes. Without `plan_of` they are the
+        first proposals of the decision, and nothing is planned.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))
@@ -42,7 +44,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the plans of one case or of a batch, which hold their choices."""
+        """Return the plans of one case or of a batch; a plan also stores the choice it realises."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)
@@ -67,7 +69,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return plans.replace(status=status if on_devices else np.asarray(status))
 
     def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan all choices together; return the decided cases (B,) and their best plans."""
+        """Plan every case with every choice; return the decided cases (B,) and their best plans."""
         xp = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
@@ -94,7 +96,7 @@ def _propose(_: None, decision: Decision, case: PyTree) -> PyTree:
 
 
 def _split(choices: PyTree, axis: int) -> list[PyTree]:
-    """Return choices, stacked along an axis, one by one."""
+    """Split choices that are stacked along an axis into a list with one entry for each choice."""
     num = jax.tree.leaves(choices)[0].shape[axis]
     before = (slice(None),) * axis
     return [jax.tree.map(lambda leaf: leaf[*before, k], choices) for k in range(num)]  # noqa: B023
@@ -102,7 +104,7 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 @jax.jit
 def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return a list of choices, first to last, each of one case or of each case of a batch."""
+    """Return the proposed choices, best first; each entry is for one case or for a whole batch."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
     return _split(jax.vmap(decision.propose)(cases), 1)
@@ -110,14 +112,14 @@ def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
 
 @jax.jit
 def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
-    """Return statuses of one case or of a batch, with the explanations of the decision."""
+    """Return statuses in which the decision has replaced vague reasons by more exact ones."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 
 
 def first_choice(decision: Decision, cases: PyTree) -> PyTree:
-    """Return one case or a batch with the first choice of a decision, without planning.
+    """Return one case or a batch with the first choice of a decision; nothing is planned.
 
-    The function is pure, and its result constant to derivatives.
+    The function is pure. Derivatives treat the choice as a constant.
     """
     return cases.with_choice(_propose_all(decision, lax.stop_gradient(cases))[0])

@@ -1,4 +1,4 @@
-"""The driver of attempts: it runs planners of every kind, on the host or inside a program."""
+"""The driver, which runs the attempts of planners of every kind for `plan` and `solve`."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from planner_jax.planning.programs import solve_cases, solve_one
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """The `Drive` of `plan`, and the pure `Drive` of `solve`."""
+    """The implementation of `Drive`, with settings for `plan`, and pure for `solve`."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
@@ -39,7 +39,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return plans of one case or of a batch; see `Drive`."""
+        """Return plans of one case or a batch, and numbers that are zero if all are solved."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
@@ -57,7 +57,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after another try at some of the cases; see `Drive`."""
+        """Return plans (B,) after another try at the cases where `left` is true; see `Drive`."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
@@ -70,7 +70,7 @@ class Driver:
 
 
 def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch: Watch) -> PyTree:
-    """Return the plan of one case: attempts until one solves it, or the time is over."""
+    """Return the plan of one case: make attempts until one solves the case or the time is over."""
     best: PyTree = None
     for attempt in attempts:
         if best is not None and not attempt.is_due(best):
@@ -88,7 +88,7 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
 
 
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
-    """Return plans as jax arrays; each further attempt is made if it is due for some case."""
+    """Return plans as jax arrays. An attempt is made at all cases if it is due for at least one."""
     require_pure(planner)
     first, *others = attempts
     plans = solve_cases(planner, cases, first)
@@ -102,7 +102,7 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
 
 
 def require_pure(planner: Planner) -> None:
-    """Raise `TypeError` for a planner that works on the host."""
+    """Raise `TypeError` for a planner that runs on the host, outside of compiled programs."""
     if planner.kind is Kind.HOST:
         raise TypeError(
             f"{type(planner).__name__} works on the host: call pj.plan outside compiled functions"

@@ -1,4 +1,4 @@
-"""`gradient`: plans, and the derivatives of one of their numbers by parts of the cases."""
+"""`pj.gradient`: it plans cases and differentiates one number of each plan by parts of its case."""
 
 import functools
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from planner_jax.planning.plan import plan, require_fit
 
 @struct.dataclass
 class PlanGradient(Gradient, Generic[PlanT]):
-    """Plans, a number of each, and its gradient; leaves with the batch shape of the cases."""
+    """Plans, and the value and gradient of one number of each plan, for one case or a batch."""
 
     plans: PlanT
 
@@ -39,18 +39,20 @@ def gradient(
 ) -> PlanGradient:
     """Plan cases, and differentiate one number of every plan by parts of its case.
 
-    The implicit function theorem gives the gradient of the optimum. Newton's method therefore
-    continues from the planner's first search, so that plans are better than the plans of `plan`.
-    Where the solver stops short of the optimum, the result is the theorem's formula at that point,
-    which may have the wrong sign, or NaN where the Hessian of the cost is not positive there.
+    The gradient follows from the implicit function theorem, which holds at an optimum. Newton's
+    method therefore continues from the planner's first search, and the plans cost less than the
+    plans of `plan`. If the solver stops before the optimum, the theorem's formula is evaluated
+    where it stopped: the result may have the wrong sign, or be NaN if the cost's Hessian is not
+    positive.
 
-    Relative error in float32, against the gradient at the optimum in float64, of the contact times
-    of 1,024 serves: 0.01 % (median) and at most 0.7 % for 99 of 100; of catches: 0.02 and 3.1 %.
-    `optimal_plan` in float64 is exact and slow.
+    In float32 the gradients of the contact times of 1,024 serves have a median relative error of
+    0.01 %, and at most 0.7 % in 99 of 100 cases. For catches these errors are 0.02 % and 3.1 %. The
+    reference is the gradient at the optimum in float64. `optimal_plan` in float64 is exact and
+    slow.
 
     Args:
-        planner: a planner that minimises, such as `pj.hit.planner("exact")`. Its earlier decisions,
-            such as an order or a side of an obstacle, are kept fixed.
+        planner: a planner that minimises, such as `pj.hit.planner("exact")`. Decisions that it
+            takes before, such as an order or a side of an obstacle, are kept fixed.
         cases: one case or a batch.
         of: the number: a dotted name in the plan, such as "stroke.time", "cost" or "violation", or
             a function of one plan. Every new function object compiles a new program.
@@ -58,9 +60,9 @@ def gradient(
             or "extras.0.radius".
         steps: iterations of conjugate gradients for the adjoint; the default depends on
             `curvature`. 0 is exact for "cost", by the envelope theorem.
-        curvature: "products", the default, uses products with the whole Hessian, exact at active
-            limits too. "whole" preconditions by the Hessian itself, which costs about n solver
-            iterations; planners that search for a path first, such as
+        curvature: "products", the default, solves with products of the Hessian, which are exact
+            even where limits are active. "whole" uses the inverse Hessian as preconditioner, which
+            costs about n solver iterations; planners that search for a path first, such as
             `pj.intercept.planner("spacetime")`, use it by default.
         solver: settings of one search that replaces the planner's rounds.
         polish: whether the first round continues to the optimum; ignored if there is a `solver`.
@@ -69,8 +71,8 @@ def gradient(
         devices: as for `plan`.
 
     Raises:
-        TypeError: the planner does not minimise, the cases are of another task, or an argument is
-            of another kind.
+        TypeError: the planner does not minimise, the cases are of another task, or an argument has
+            the wrong type.
         ValueError: a name is not in the plan or the case, `steps` < 0, or `curvature` is unknown.
     """
     require_fit(planner, cases)

@@ -1,4 +1,4 @@
-"""`plan`: one call for one case or a million, on one device or all of them; and `solve`, pure."""
+"""`plan`, for one case or a large batch on any devices, and `solve`, its pure counterpart."""
 
 from collections.abc import Callable, Sequence
 
@@ -27,40 +27,41 @@ def plan(
     time_limit: float | None = None,
     progress: Callable[[Progress], PyTree] | None = None,
 ) -> PlanT:
-    """Plan one case, or a batch of them with a leading axis on every leaf.
+    """Plan one case, or a batch of cases with a leading axis on every leaf.
 
-    Inside a compiled function of the caller this is `solve`. The same call gives the same bits.
-    With other cases in the batch, other chunks or other devices, a case's arithmetic is rounded
-    differently; a search that ends short of the optimum may then end elsewhere, rarely with another
-    status.
+    Inside a compiled function of the caller this is `solve`. Equal calls return equal bits. If
+    other cases of the batch, the chunks or the devices change, a case's arithmetic is rounded
+    differently. A search that ends before the optimum may then end at another point, rarely with
+    another status.
 
     Args:
-        planner: such as `pj.hit.planner("exact")`; its attempts are made in order, each at the
-            cases that are still unsolved.
-        cases: a pytree; a batch has one more axis than a single case.
+        planner: a planner such as `pj.hit.planner("exact")`; its attempts are made in order, each
+            at the cases that are still unsolved.
+        cases: one case of the planner's task, or a batch, which has one more leading axis.
         chunk: cases that a device solves in one compiled call. The default suits the device.
         devices: devices that share a batch. By default all local ones, `jax.local_devices()`.
-        time_limit: [s], compilation included, after which no attempt starts except the first;
+        time_limit: [s] time, compilation included, after which no attempt but the first starts;
             running computations are finished. Unsolved cases that have not been through all
-            attempts have the status `OUT_OF_TIME`; other cases keep their bits.
-        progress: receives a `Progress` at the start and end of every attempt and after its chunks;
-            `print` writes one line for each.
+            attempts have the status `OUT_OF_TIME`; a limit does not change the plans of other
+            cases.
+        progress: function that receives a `Progress` at the start and end of every attempt and
+            after its chunks; `print` writes one line for each.
 
     Returns:
         The planner's plans with the batch shape of the cases; see their `status`. An unsolved case
-        holds the best plan that was found. The leaves are NumPy arrays, or jax arrays for a batch
-        in jax arrays. Then nothing leaves the devices except the number of unsolved cases, and each
-        device holds its share, or the first one all if the batch cannot be shared evenly.
+        has the best plan that was found. The leaves are NumPy arrays, or jax arrays if the batch is
+        in jax arrays. Then only the number of unsolved cases is copied to the host, and each device
+        holds its part of the plans; the first device holds all if they cannot be divided equally.
 
     Raises:
         CaseError: a number of a case in NumPy arrays breaks its rule, such as NaN or a negative
-            limit; one line with the field, the rule, the value and the first such case. In jax
+            limit. The error names the field, the rule, the value and the first such case. In jax
             arrays, and inside compiled functions, such a case has the status `BAD_INPUT` instead.
         ValueError: the leaves do not all have one batch axis of the same length, or none; a leaf
             has another shape; the batch is empty; `chunk` < 1; the `devices` are none or not
             distinct; or the `time_limit` is negative.
-        TypeError: the cases are of another task than the planner, or their numbers of another
-            kind; or `solve` cannot be used inside this transformation of JAX.
+        TypeError: the cases belong to another task than the planner, an array has the wrong type,
+            or `solve` cannot be used inside this transformation of JAX.
     """
     watch, leaves = Watch(time_limit, progress), jax.tree.leaves(cases)
     kinds = {type(leaf) for leaf in (*leaves, *jax.tree.leaves(planner))}
@@ -80,7 +81,7 @@ def plan(
         if not resident:
             require_sound(cases)
     plans, _ = Driver(chunk, devices, watch)(planner, cases)
-    # One case is checked after planning, which costs nothing if its status is good.
+    # A single case is checked only if its plan is marked as bad input, so good cases lose no time.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):
@@ -89,7 +90,7 @@ def plan(
 
 
 def _require_layout(chunk: object, devices: object) -> None:
-    """Raise unless a chunk is a number of cases, and devices are distinct."""
+    """Raise unless `chunk` is a whole number >= 1 and `devices` are distinct devices of JAX."""
     if chunk is not None:
         require_size("chunk", chunk)
     if devices is not None:
@@ -104,9 +105,9 @@ def _require_layout(chunk: object, devices: object) -> None:
 
 
 def _require_own_precision(leaves: list[PyTree]) -> None:
-    """Raise `TypeError` for cases in float64 while JAX computes in float32.
+    """Raise `TypeError` if all floating-point arrays are float64 while JAX computes in float32.
 
-    Cases with some arrays in float64, as NumPy makes them, are accepted.
+    Cases that mix float32 with float64, the default type of NumPy, are accepted.
     """
     if jax.config.jax_enable_x64:  # type: ignore[attr-defined]
         return
@@ -116,7 +117,7 @@ def _require_own_precision(leaves: list[PyTree]) -> None:
 
 
 def require_batch(cases: Case) -> int:
-    """Return the length of a batch; raise `ValueError` unless all leaves have it."""
+    """Return the number of cases of a batch; raise `ValueError` unless all leaves agree on it."""
     batch = cases.batch_shape
     if len(batch) != 1 or batch[0] == 0:
         raise ArgumentError("cases", "a batch of at least one", shown=f"batch shape {batch}")
@@ -134,15 +135,15 @@ def require_batch(cases: Case) -> int:
 def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
     """Plan cases as a pure function, for compiled functions, `vmap` and `scan`.
 
-    Each attempt after the first is made if some case is unsolved by then, but at all cases of the
-    batch. `plan`, which removes solved cases, is faster where few are left.
+    Each attempt after the first is made at all cases of the batch if at least one is unsolved.
+    `plan` removes solved cases from the batch, and is faster where few cases are left.
 
     Args:
         planner: as for `plan`.
         cases: one case or a batch, as for `plan`.
 
     Returns:
-        The plans, jax arrays.
+        The plans, with jax arrays as leaves.
 
     Raises:
         TypeError: the planner works on the host, or the result is differentiated: the derivative of
@@ -159,13 +160,13 @@ def solve(planner: Planner[CaseT, PlanT], cases: CaseT) -> PlanT:
 
 @jax.custom_jvp
 def _solve(planner: PyTree, cases: PyTree) -> PyTree:
-    """Return plans, without derivatives."""
+    """Return plans; a derivative of this function raises `TypeError`."""
     return Driver(is_pure=True)(planner, cases)[0]
 
 
 @_solve.defjvp
 def _raise(primals: tuple, tangents: tuple) -> tuple:
-    """Raise `TypeError` on differentiation."""
+    """Raise `TypeError` when `_solve` is differentiated."""
     raise TypeError(
         "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
         "and pj.optimal_plan inside a loss"

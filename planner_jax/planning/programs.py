@@ -1,10 +1,10 @@
-"""The compiled programs: one attempt at one case, or at the lanes of all devices.
+"""Compiled programs that make one attempt at one case, or at a batch spread over all devices.
 
-A lane is one case of a batch. Batches are spread over the devices in equal shares of lanes, and cut
-into chunks of a few fixed sizes, so that a new batch size does not compile the solver again.
+A lane is one case of a batch. A batch is divided equally among the devices, and each device cuts
+its lanes into chunks of a few fixed sizes, so that a new batch size compiles no new program.
 
-One case is sent to a program as one vector, and its plan is returned as one vector: each array that
-enters or leaves a program costs some microseconds, a large part of the time of one plan.
+A single case is packed into one vector for its program, which returns the plan as one vector: each
+array that enters or leaves a program costs some microseconds, a large part of the time of one plan.
 """
 
 import dataclasses
@@ -24,28 +24,28 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 
-# Lanes of a device in one call. The sizes are few, because each needs a program of its own.
+# Lanes (cases) of a device in one call. The sizes are few, because each needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
-_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # fits the cache of a core; fills a GPU
-_GPU_BUSY = 8192  # starts in one call that keep a GPU busy
-_GPU_LEAST = 128  # lanes of a call: fewer take as long, and one more program
-_SPARED = 8  # one more program is compiled if it saves one lane in so many
+_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # starts in one call: they fit a core's cache, and fill a GPU
+_GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
+_GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
+_SPARED = 8  # a smaller last call is compiled if it saves more than 1/8 of the lanes before it
 LANES = PartitionSpec("lanes")
 
 
 @dataclasses.dataclass(frozen=True)
 class Sizes:
-    """The sizes of the calls of one attempt, in lanes of a device."""
+    """The numbers of lanes (cases) that the calls of one attempt may have on each device."""
 
-    most: int
-    busy: int  # lanes that keep a GPU busy
-    least: int = BUCKETS[0]
+    most: int  # greatest number of lanes of a call
+    busy: int  # least number of lanes that keeps a GPU busy
+    least: int = BUCKETS[0]  # least number of lanes of a call
 
     def next(self, num: int) -> int:
-        """Return the size of the call that takes the next of `num` lanes.
+        """Return the number of lanes of the next call, if `num` lanes are still to be solved.
 
-        If these fill at most half of a size, the next smaller size is used, provided that it keeps
-        a GPU busy.
+        It is the least size that holds all of them, or the greatest size. If they fill at most half
+        of it, the next smaller size is returned, provided that it keeps a GPU busy.
         """
         needed = max(num, self.least)
         fits = next((bucket for bucket in BUCKETS if needed <= bucket <= self.most), self.most)
@@ -53,10 +53,10 @@ class Sizes:
         return smaller if smaller >= self.busy and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
-        """Yield the first lane and the size of every call that `num` lanes take.
+        """Yield the first lane and the size of every call that is needed for `num` lanes.
 
-        The last lanes after many calls take another call of the same size, unless that is much more
-        work, because compiling a program of a smaller size would take longer.
+        The last call keeps the size of the calls before it, because a program of a smaller size
+        would have to be compiled. A smaller size is used only if it saves much work.
         """
         first = size = 0
         while first < num:
@@ -68,13 +68,13 @@ class Sizes:
 
 
 def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
-    """Return the sizes of an attempt's calls: `chunk` lanes, or a number that suits the device."""
+    """Return the call sizes of an attempt: `chunk` lanes, or numbers that suit the device."""
     busy = _GPU_BUSY // attempt.starts
     if chunk is not None:
         return Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
-    # Solved one after another, few lanes are as fast as many, and no core waits long at the end.
+    # Small chunks: sequential solving gains nothing from large ones, and no core waits at the end.
     if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # rounded up to a power of two
@@ -82,7 +82,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
 
 
 def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
-    """Return a planner with its arrays on the devices, by default all local ones, and a mesh."""
+    """Return the planner with its arrays on the devices, by default all local ones, and a mesh."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):
         planner = jax.device_put(planner, replicated_sharding(mesh))
@@ -90,51 +90,51 @@ def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[
 
 
 def count_lanes(tree: PyTree) -> int:
-    """Return the number of lanes of all leaves."""
+    """Return the number of lanes (cases) of a batch: the length of the leading axis."""
     return jax.tree.leaves(tree)[0].shape[0]
 
 
 def is_one_cpu(mesh: Mesh) -> bool:
-    """Return whether the only device is the host itself."""
+    """Return whether the mesh has one device, and this device is a CPU."""
     return mesh.size == 1 and mesh.devices[0].platform == "cpu"
 
 
 def lane_sharding(mesh: Mesh) -> Sharding:
-    """Return the sharding into equal shares of lanes; for one device JAX's fastest form."""
+    """Return the sharding that divides the leading axis equally among the devices of a mesh."""
     return NamedSharding(mesh, LANES) if mesh.size > 1 else SingleDeviceSharding(mesh.devices[0])
 
 
 def replicated_sharding(mesh: Mesh) -> Sharding:
-    """Return the sharding of arrays that every device has in full."""
+    """Return the sharding of arrays that every device stores completely."""
     return NamedSharding(mesh, PartitionSpec()) if mesh.size > 1 else lane_sharding(mesh)
 
 
 @functools.lru_cache(maxsize=4096)
 def put_number(mesh: Mesh, value: int) -> Array:
-    """Return a number on every device, cached because each transfer takes time."""
+    """Return an integer as an array on every device; cached, because each transfer takes time."""
     return jax.device_put(np.int32(value), replicated_sharding(mesh))
 
 
 def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Callable:
-    """Return the function that every device computes for its own share of the lanes.
+    """Return a function that applies `function` on every device to the lanes of that device.
 
-    `function` takes arrays with the lanes first. `specs` are the shardings of its arguments; by
-    default all are split by lanes.
+    The arrays have the lanes (cases) on their first axis. `specs` are the shardings of the
+    arguments; by default all arguments are divided by lanes.
     """
     if mesh.size == 1:
         return function
-    # The check of replication is off: lanes of different devices share nothing.
+    # Lanes of different devices are independent: JAX need not check for replicated values.
     return jax.shard_map(
         function, mesh=mesh, in_specs=specs or LANES, out_specs=LANES, check_vma=False
     )
 
 
 def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
-    """Return the tree with equal shares of its lanes on every device."""
+    """Return the tree with its lanes (cases) divided equally among the devices of a mesh."""
     target = lane_sharding(mesh)
 
     def is_there(leaf: Array) -> bool:
-        own = leaf.sharding  # == is the faster comparison
+        own = leaf.sharding  # the fast test by == comes first
         return own == target or own.is_equivalent_to(target, leaf.ndim)
 
     if all(map(is_there, jax.tree.leaves(tree))):
@@ -142,8 +142,8 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
     return jax.device_put(tree, target)
 
 
-# XLA would try its own kernels for every matrix product, a third of the compile time on a GPU;
-# cuBLAS is as fast for products of these shapes. No effect on a CPU.
+# XLA would try its own kernels for every matrix product, which takes a third of the compile time
+# on a GPU, while cuBLAS is as fast for products of these shapes. No effect on a CPU.
 _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
@@ -151,8 +151,8 @@ _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a
 def solve_cases(planner: Planner, cases: PyTree, attempt: Attempt) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
-    Every compiled plan is made here, so that every case that breaks a rule of its class has the
-    status `BAD_INPUT`.
+    All compiled programs call this function. It gives the status `BAD_INPUT` to every case that
+    breaks a rule of its class.
     """
     require_shapes(cases)
     alone = cases.batch_shape == ()
@@ -164,7 +164,7 @@ def solve_cases(planner: Planner, cases: PyTree, attempt: Attempt) -> PyTree:
 def solve_on_devices(
     planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree
 ) -> tuple[PyTree, Array]:
-    """Return plans of each device's lanes, and the number that it leaves unsolved, (devices,)."""
+    """Return plans of each device's lanes (cases), and its number of unsolved ones, (devices,)."""
 
     def solve(planner: Planner, cases: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(solve_cases(planner, cases, attempt))
@@ -173,7 +173,7 @@ def solve_on_devices(
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
-    """Return the plans, and the number of unsolved ones, (1,)."""
+    """Return the plans, and the number of unsolved plans as an array (1,)."""
     return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
 
 
@@ -182,14 +182,14 @@ compiled: set[Hashable] = set()
 
 
 def program_key(planner: Planner, attempt: Attempt, num: int, cases: PyTree) -> Hashable:
-    """Return the key of the `solve_on_devices` that takes `num` lanes of a device."""
+    """Return the key in `compiled` of the program that solves `num` lanes (cases) of a device."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
     return jax.tree.structure((planner, cases)), own, lanes, attempt, num
 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
-    """Return the plan of one case, with NumPy leaves."""
+    """Return the plan of one case, with NumPy leaves; the case is sent as one vector."""
     return call_packed(_solve_one, attempt, planner, case)
 
 
@@ -198,11 +198,11 @@ def _solve_one(attempt: Attempt, planner: Planner, case: PyTree) -> PyTree:
 
 
 def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree) -> PyTree:
-    """Return `function(static, own, case)` with NumPy leaves.
+    """Return `function(static, own, case)` with NumPy leaves; the case is sent as one vector.
 
     The pure function is compiled once for each hashable `static` and each layout of the other
     arguments. `own` is a pytree that stays on the device, such as a planner. `case` has NumPy
-    leaves, at least one of them floating.
+    leaves, at least one of them of a floating-point type.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
@@ -219,23 +219,23 @@ def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree)
 
 
 def _layout(leaves: Sequence[PyTree]) -> _Layout:
-    """Return shapes and dtypes of arrays."""
+    """Return the shape and dtype of each array."""
     return tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
 
 
 @dataclasses.dataclass
 class _Result:
-    """Positions of a tree's leaves in a vector; known once the function has been traced."""
+    """Positions of a tree's leaves in the result vector; set when JAX traces the function."""
 
     tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)
-    # Indices and dtypes of leaves with another dtype than the vector.
+    # Indices and dtypes of the leaves whose dtype differs from the vector's dtype.
     others: list[tuple[int, np.dtype]] = dataclasses.field(default_factory=list)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """A compiled function of the leaves of `own` and a vector, which returns a vector."""
+    """A compiled function that takes the leaves of `own` and a vector, and returns a vector."""
 
     run: Callable[[list[PyTree], np.ndarray], Array]
     dtype: np.dtype  # of both vectors
@@ -251,7 +251,7 @@ def _program(
     tree: PyTree,
     layout: _Layout,
 ) -> _Program:
-    """Return the program for trees of these shapes and dtypes."""
+    """Compile a function for trees with the given structures, shapes and dtypes."""
     canonical = jax.dtypes.canonicalize_dtype
     dtype = canonical(np.result_type(*[d for _, d in layout if np.issubdtype(d, np.floating)]))
     ends = np.cumsum([math.prod(shape) for shape, _ in layout])

@@ -1,4 +1,4 @@
-"""`replan`: a new plan from the plan that is being executed, for changed circumstances."""
+"""`pj.replan`: it plans again while an earlier plan is executed, for changed circumstances."""
 
 from typing import Any, Generic
 
@@ -17,29 +17,29 @@ from planner_jax.planning.plan import plan
 
 @struct.dataclass
 class Replanning(Generic[CaseT, PlanT]):
-    """One case for a re-planner, or a batch. Times of `case` count from the present."""
+    """The input of a re-planner, for one case or a batch: the present case and the earlier plan."""
 
-    case: CaseT  # as known at present
-    previous: PlanT  # being executed; its time 0 is `elapsed` ago
+    case: CaseT  # the case as known at present; its times count from the present
+    previous: PlanT  # the plan being executed, which started `elapsed` seconds ago
     elapsed: Array | np.ndarray  # () [s]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch."""
         return self.case.batch_shape
 
 
 def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
-    """Return the time since plans started, () or (B,) [s], in the cases' floating type.
+    """Check and return the time since the plans started, () or (B,) [s], in the cases' float type.
 
     Raises:
-        TypeError: `elapsed` is no number.
+        TypeError: `elapsed` is not a number.
         ValueError: `elapsed` is negative, not finite, or of another shape.
     """
     dtypes = (np.asarray(leaf).dtype for leaf in jax.tree.leaves(cases))
     dtype = next(dtype for dtype in dtypes if dtype.kind == "f")
     elapsed = numbers_of("elapsed", elapsed, cases.batch_shape, ()).astype(dtype)
-    # For one number these reductions take a third of the time of `all`.
+    # For a single number these two reductions take a third of the time that `all` takes.
     least = np.minimum.reduce(elapsed, axis=None, initial=np.inf)
     most = np.maximum.reduce(elapsed, axis=None, initial=0.0)
     if not least >= 0.0:
@@ -50,9 +50,10 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
 
 
 def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
-    """Return the numbers that the caller passed for an argument, or else a plan's own.
+    """Return the value of an argument that the caller passed, or else the value in a plan.
 
-    Both are for each case or for one case. The result has the batch shape and type of `elapsed`.
+    Both values are for one case, or for each case of a batch. The result has the batch shape and
+    the type of `elapsed`.
 
     Raises:
         TypeError: the argument does not hold numbers.
@@ -68,7 +69,7 @@ def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray)
 
 
 def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **news: Any) -> PlanT:
-    """Plan again some time into a plan; a few iterations from the remainder of the plan.
+    """Plan again while a plan is executed, by a few iterations from the remainder of that plan.
 
     Args:
         planner: a planner with a `replanner`, such as `pj.catch.planner("exact")`, or a re-planner
@@ -77,15 +78,15 @@ def replan(planner: PyTree, cases: PyTree, previous: PlanT, elapsed: PyTree, **n
         previous: the plan that is being executed.
         elapsed: () or (B,) [s], time since the plan's start, >= 0.
         **news: changed quantities, with times that count from the present. Catches take `targets`
-            and `head_state`, hits `ball`, `drag` and `head_state`. Without a `head_state` the
-            robot is where the plan has it.
+            and `head_state`, hits `ball`, `drag` and `head_state`. The default of `head_state` is
+            the robot's state in the plan at this time.
 
     Returns:
         The plans; their times count from the present.
 
     Raises:
-        TypeError: the planner has no re-planner, or cases, plans or news are of another task.
-        ValueError: `elapsed` is negative, or plans or news are not one for each case.
+        TypeError: the planner has no re-planner, or cases, plans or changes are of another task.
+        ValueError: `elapsed` is negative, or there is not one plan and one change for each case.
     """
     require_planner(planner)
     again = planner.replanner()

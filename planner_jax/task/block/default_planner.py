@@ -1,11 +1,11 @@
-"""The default planner: a straight motion of the joints if one is free, else least squares.
+"""The default planner of blocks: a straight joint motion if one is free, else least squares.
 
-The shield may meet a ball anywhere between the boxes, with the wrist and the elbow on either side.
-A straight motion turns all joints in proportion to one of these end poses. The planner returns the
-first straight motion that is in time and free of collisions. If there is none, Levenberg-Marquardt
-optimises end pose, time of contact and motion together. It starts from straight motions with an
-added bump, until one start leads to a plan that keeps every limit. [Natarajan2024] takes its
-motions from a library; this planner stores only the bumps.
+The shield may meet a ball anywhere between the two boxes, with the wrist and the elbow on either
+side. A straight motion turns all joints in proportion to one of these end poses. The planner
+returns the first straight motion that is in time and free of collisions. If there is none,
+Levenberg-Marquardt optimises end pose, time of contact and motion together. It starts from straight
+motions with an added bump (a detour of the joints), until one start leads to a plan that keeps
+every limit. [Natarajan2024] takes its motions from a library; this planner stores only the bumps.
 """
 
 import dataclasses
@@ -74,17 +74,17 @@ Refine = Callable[[BlockCase, Flight, Array, "Search", BlockPlan], BlockPlan]
 class Search(Attempt):
     """An attempt: a number of straight motions, then least squares from some starts; static.
 
-    Two cases in three have a straight motion, nearly always among the first few.
+    Two cases in three have a straight motion that is free; it is nearly always among the first.
     """
 
     starts: int = 8
     straight: int = 48  # number of straight motions
-    tries: int = 15  # number of starts of least squares
-    first: int = 0  # index of the first of these starts
-    kept: int = 5  # number of starts that are continued after the solver's trial
-    # Whether a single case refines each start to its end before the next start, without a trial.
+    tries: int = 15  # number of starts from which least squares are tried
+    first: int = 0  # index of the first start of least squares
+    kept: int = 5  # number of starts that continue after the solver's trial steps
+    # Whether a single case refines each start to its end before the next one, without trial steps.
     in_turn: bool = True
-    # `hope` exceeds the cost of nearly all starts that led to a plan.
+    # `hope` is above the cost that nearly all successful starts have at that step.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -100,26 +100,26 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read the starts of least squares: ranks (N,) of end poses, and bumps (N, 6) [rad]."""
+    """Read the stored starts of least squares: ranks (N,) of end poses, bumps (N, 6) [rad]."""
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
     return ranks, np.array([start["bump"] for start in starts], np.float32)
 
 
 def _combine_excess(joints: Array, contact: Array, too_near: Array) -> Array:
-    """Return the largest relative excess over a limit; 1 cm below the margin counts as 1."""
+    """Return the largest relative excess over a limit; a distance 1 cm too small counts as 1."""
     return jnp.maximum(jnp.maximum(joints, contact), 100.0 * too_near)
 
 
 def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
-    """Return the cost that ranks searches after their trial; -1 for searches that settled."""
+    """Return the cost that ranks searches after their trial steps; -1 if a search is finished."""
     return jnp.where(tried.stalled >= solver.settled, -1.0, tried.model.cost)
 
 
 def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
-    """Return the indices (num,) of end poses by rising effort, with noise that adds variety.
+    """Return the indices (num,) of end poses in order of rising effort, with noise for variety.
 
-    A pose with an effort above `most` is not reached in time, and ranks far behind.
+    A pose whose effort exceeds `most` cannot be reached in time, and is ranked far behind.
     """
     rng = np.random.default_rng(0)
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -165,21 +165,21 @@ def _lift_to_unknowns(
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class OnlineBlock(Planner):
-    """Planner of motions that meet a ball between the boxes; its cost is the duration [s]."""
+    """Planner of arm motions that block a ball between two boxes; the cost is the duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
-    pieces: int = 10  # pieces of the joints' rates
-    points: int = 48  # points of the ball's path with end poses
+    pieces: int = 10  # number of pieces of each joint's rate
+    points: int = 48  # number of points of the ball's path for which end poses are computed
     samples: int = 32  # samples of a motion at which least squares compute distances
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
     margin: float = 0.003  # [m], least distance from everything
     pole_margin: float = 0.012  # [m], least distance from the pole; covers gaps between samples
-    slack: float = 0.004  # share of every limit that plans do not use
-    # Whether motions from rest to rest are as fast as limits allow, and the fastest straight motion
-    # is selected: the arm then waits for the ball at standstill. Otherwise the arm moves until the
-    # contact, which needs less torque.
+    slack: float = 0.004  # fraction of every limit that plans leave unused
+    # Whether motions from standstill to standstill are as fast as the limits allow, and the fastest
+    # straight motion is selected: the arm then waits for the ball. Otherwise the arm moves until
+    # the contact, which needs less torque.
     brisk: bool = False
     weights: Weights = Weights()
     searches: tuple[Search, ...] = _SEARCHES
@@ -189,7 +189,7 @@ class OnlineBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """Searches in their order."""
+        """The searches (attempts), in order."""
         return self.searches
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -198,7 +198,7 @@ class OnlineBlock(Planner):
         return self._solve_by(refine, case, attempt)
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; all starts of all cases are refined in step."""
+        """Return the plans of a batch; the starts of all cases are refined together, in step."""
         return jax.vmap(lambda case: self._solve_by(self.refine_in_step, case, attempt))(cases)
 
     def _solve_by(self, refine: Refine, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -216,7 +216,7 @@ class OnlineBlock(Planner):
             flight: times at which the ball can be met.
             poses: end poses at which the shield meets the ball.
             plan: the best straight motion, solved or not.
-            starts: (N, n), unknowns; a row for each of the attempt's tries.
+            starts: (N, n), unknowns of least squares; a row for each of the attempt's tries.
         """
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
@@ -257,7 +257,7 @@ class OnlineBlock(Planner):
     def refine_in_turn(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Refine the starts (N, n) one by one until one leads to a plan."""
+        """Refine the starts (N, n) one by one until one of them leads to a solved plan."""
         tries = jnp.where(flight.comes, attempt.tries, 0)
         refine = lambda k: self.refine(case, flight, starts[k], attempt.solver)  # noqa: E731
         return select_first_solved(refine, tries, best)
@@ -265,7 +265,7 @@ class OnlineBlock(Planner):
     def refine_cheapest_first(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Try each start (N, n) for a few steps, then refine the cheapest until one is solved."""
+        """Try each start (N, n) for a few steps; refine the cheapest, until one is solved."""
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, attempt.tries
         total = jnp.where(flight.comes, tries + min(attempt.kept, tries), 0)
@@ -297,7 +297,7 @@ class OnlineBlock(Planner):
     def refine_in_step(
         self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
     ) -> BlockPlan:
-        """Try all starts (N, n) for a few steps, then refine the cheapest, all in step."""
+        """Try all starts (N, n) for a few steps at once, then refine the cheapest at once."""
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver = attempt.solver
         begin = lambda point: start_search(point, solver)  # noqa: E731
@@ -312,7 +312,7 @@ class OnlineBlock(Planner):
         return select(plan, best, ~is_solved(best.status))
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
-        """Return the unknowns (n,) of the straight motion to a pose."""
+        """Return the unknowns (n,) of the straight motion to the end pose with this index."""
         time = poses.time[index]
         duration = jnp.maximum(time - case.delay, 1e-3)
         turned = poses.angles[index] - coast(case, duration, self.pieces)
@@ -321,16 +321,21 @@ class OnlineBlock(Planner):
         return jnp.append(steps.reshape(-1), time)
 
     def decode(self, case: BlockCase, point: Array) -> tuple[Array, Array, Array]:
-        """Return the steps (K, 6), the first rates times the duration (6,), and the duration ()."""
+        """Split the unknowns (n,) into joint rates and a duration.
+
+        Returns:
+            The rates after each piece (K, 6) and at the start (6,), both multiplied by the
+            duration [rad], and the duration () [s].
+        """
         steps = point[:-1].reshape(self.pieces, 6)
         duration = jnp.maximum(point[-1] - case.delay, 1e-3)
         last = jnp.where(case.ends_at_rest, 0.0, steps[-1])
         return steps.at[-1].set(last), case.rates * duration, duration
 
     def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return the local model of the cost, the sum of the squared residuals.
+        """Return the cost, a sum of squared residuals, at a point (n,), and its quadratic model.
 
-        Residuals: contact, limits of the joints, distances below their margins, and effort.
+        The residuals are contact, joint limits, distances below their margins, and effort.
         """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
@@ -345,7 +350,8 @@ class OnlineBlock(Planner):
         slopes = clearance_slopes(case.arm, case.scene, angles[worst])  # (R, 6, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
-        # Barrier: without it the compiler repeats this computation in each term of the products.
+        # The barrier keeps the compiler from repeating this computation in each term of the
+        # products.
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
@@ -375,7 +381,7 @@ class OnlineBlock(Planner):
         )
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
-        """Return the plan of the unknowns (n,), with its limits checked at more samples.
+        """Return the plan of the unknowns (n,), with the limits checked at `checked` samples.
 
         `steps` is the number of steps of least squares that led to the unknowns.
         """
@@ -384,7 +390,7 @@ class OnlineBlock(Planner):
         shares = tuple(np.arange(1, self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
-        # Between knots, where a joint may exceed its position limit and turn back.
+        # A joint may exceed its position limit between two knots and turn back: check all samples.
         middle = 0.5 * (case.arm.upper + case.arm.lower)
         half = 0.5 * (case.arm.upper - case.arm.lower)
         joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0)
@@ -409,5 +415,5 @@ class OnlineBlock(Planner):
 
 
 def brisk(**fields: object) -> OnlineBlock:
-    """Return an `OnlineBlock` whose motions end as early as possible; the arm then waits."""
+    """Make an `OnlineBlock` whose motions end as early as possible; the arm waits for the ball."""
     return OnlineBlock(**{"searches": _BRISK, "brisk": True, **fields})

@@ -1,8 +1,8 @@
-"""Re-planning of blocks: from the motion under way, for a new estimate of the ball.
+"""Re-planning of blocks for a new estimate of the ball, while a motion is being executed.
 
 Between two observations the estimated flight changes by centimetres, and so does the best motion.
 The remainder of the previous motion, with its contact moved along with the ball, is a start from
-which a few steps of least squares suffice. Cases that these do not solve are planned from scratch.
+which a few steps of least squares suffice. Cases that remain unsolved are planned from scratch.
 """
 
 import dataclasses
@@ -29,12 +29,12 @@ from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import evaluate
 
-_SHORTEST = 0.02  # [s], least duration of the start from a motion that has nearly ended
+_SHORTEST = 0.02  # [s] least duration of a start, for previous motions that have nearly ended
 
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """An attempt: least squares from the remainder of the previous motion; static."""
+    """An attempt of least squares from the remainder of the previous motion; static."""
 
     solver: LevenbergConfig = LevenbergConfig(*(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0)
 
@@ -42,7 +42,7 @@ class Warm(Attempt):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class WarmBlock(Planner):
-    """Planner that refines the motion under way; its cases are results of `ReplanBlock.begin`."""
+    """Planner that refines the motion being executed; it takes results of `ReplanBlock.begin`."""
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
@@ -50,7 +50,7 @@ class WarmBlock(Planner):
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
-        """Return the plan of one case."""
+        """Return the plan of one case, refined from the remainder of the previous motion."""
         case, planner = task.case, self.planner
         return planner.refine(case, flight_of(case), self.encode_remainder(task), attempt.solver)
 
@@ -78,10 +78,10 @@ class WarmBlock(Planner):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanBlock(Planner):
-    """Planner for `pj.replan` that starts from the motion under way.
+    """Planner for `pj.replan` that starts from the motion being executed.
 
-    Times of cases and plans count from the first observation of the ball in every round. The new
-    motion starts at the case's `delay`, which grows from round to round.
+    In every re-plan, times of cases and plans count from the first observation of the ball. The new
+    motion starts at the case's `delay`, which grows from one re-plan to the next.
     """
 
     case_type: ClassVar[type] = Replanning
@@ -104,12 +104,12 @@ class ReplanBlock(Planner):
         angles: ArrayLike | None = None,
         rates: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remainder of a case, or of a batch, `elapsed` seconds into its motion.
+        """Return the case, or the batch, as it remains `elapsed` seconds into its motion.
 
         See `pj.replan` for cases, the previous plan, the elapsed time and the errors. `ball` is the
         estimated ball at time 0 of the cases, by default the ball of the cases. `angles` [rad] and
-        `rates` [rad/s] at the start of the new motion are (6,) or (B, 6). By default they are the
-        states of the previous plan, which brakes after its end.
+        `rates` [rad/s] at the start of the new motion are (6,) or (B, 6). By default they are taken
+        from the previous plan, in which the arm brakes after the end of the motion.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         if ball is not None:
@@ -130,7 +130,7 @@ class ReplanBlock(Planner):
         return Replanning(case=left, previous=previous, elapsed=host_leaf(elapsed))
 
     def plan_by(self, drive: Drive, tasks: Replanning) -> BlockPlan:
-        """Return the plans of one case or of a batch, from scratch where the warm start fails."""
+        """Return plans of one case or a batch, from scratch where the previous motion fails."""
         plans, _ = drive(self.warm, tasks)
         unsolved, cases = is_unsolved(plans.status), tasks.case
         if not tasks.batch_shape:

@@ -1,8 +1,8 @@
-"""The `exact` catch planner, whose decision variables satisfy every catch.
+"""The `exact` catch planner: its decision variables are such that every plan meets the balls.
 
 [Yu2023catch, eqs 22-24] moves the net to the ball by a penalty and accepts a small error. Here the
-net's centre is the ball's position less an offset inside the hoop, so that every plan catches the
-ball. Attitude and limits remain inequalities.
+position of the net's centre is the ball's position minus an offset inside the hoop, so every plan
+catches the ball. Attitude and limits remain inequalities, which are met by penalties.
 """
 
 import dataclasses
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
     from planner_jax.task.catch.replan import ReplanCatch
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_FEATURE_TIMES = (-0.1, 0.1)  # [s], relative to the decided time, of the ball in the features
+_FEATURE_TIMES = (-0.1, 0.1)  # [s] the features' times of the ball, from the decided time
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
-_LEARNED_SIZE = 2.0  # greatest length of the variables of a learned catch point: 0.89 of `_RIM`
+_LEARNED_SIZE = 2.0  # greatest norm of a learned catch point's variables: 0.89 of `_RIM`
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
-# Starting points, best first. Columns: factor on the decided times; velocity, relative to the mean
-# velocity of the segment, at catches before the last one and at the last one; thrust at the same
-# two, where -1 is the least, 0 hover and 1 the greatest. Optimal plans sink through their catches
-# and brake at the last one.
+# Starting points, best first. Column 1 is a factor on the decided times. Columns 2 and 3 are the
+# velocity, relative to the mean velocity of the segment, at catches before the last one and at the
+# last one. Columns 4 and 5 are the thrust at these catches: -1 is the least, 0 hover, 1 the
+# greatest thrust. Optimal plans sink through their catches and brake at the last one.
 _GUESSES = np.array(
     [
         (1.0, 0.5, 0.8, -5.0 / 7.0, 0.1),
@@ -60,21 +60,21 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # replaces `_FIRST` with a network
-# Before Newton's method with several targets, in place of `_FIRST`, which ends too far away.
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # for `_FIRST`, with a network
+# With several targets this search precedes Newton's method; `_FIRST` ends too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
 # If more than `_FEW` targets must all be caught, the first two rounds are longer.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))
-_LEAN = 0.95  # angle between net and ball in a guess, relative to the greatest allowed angle
+_LEAN = 0.95  # angle between net and ball in a guess, as a fraction of the greatest allowed angle
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
-    """Plans minimum-snap catches whose decision variables put the ball into the net.
+    """A planner of minimum-snap catches whose decision variables put the ball into the net.
 
     Each of N segments has 3 (M - 1) + 12 variables in units of `scale`: whitened waypoint offsets,
     log duration, catch point in the net, and velocity, acceleration and jerk at the catch. The
@@ -91,27 +91,27 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     num_end_variables = 12
     guess_table = _GUESSES
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
-    catch_weight: float = 0.3  # [s], of the hinges at a catch
+    catch_weight: float = 0.3  # [s] weight of the penalties at a catch
     rounds: tuple[Round, ...] = _ROUNDS
-    # Thrust at catches before the last one in the first guess, as in `_GUESSES`. Near -1 catches
-    # are earliest; larger values leave a margin for feedback control in flight.
+    # Thrust at catches before the last one in the first guess, from -1 to 1 as in `_GUESSES`. Near
+    # -1 catches are earliest; larger values leave a margin for feedback control in flight.
     lift: float = _GUESSES[0, 3].item()
     learned: bool = True  # whether a network improves the first guess of a single catch
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the hinges at a catch."""
+        """Weight [s] of the penalties at a catch."""
         return self.catch_weight
 
     def active(self, context: CatchContext) -> Array:
-        """Return which catches, in their order, are of present targets, (N,) bool."""
+        """Return which catches, in their order, belong to targets that are present, (N,) bool."""
         return context.active
 
     def start_network(self, case: CatchCase) -> StartNetwork | None:
         """Return the network for the first guess of a single catch, or None.
 
-        There is none for several targets, unusual sizes or `lift`, and around obstacles, because
-        the side on which a search starts decides where it can end.
+        It exists for one target, usual sizes and `lift`, and no obstacles: around obstacles the
+        side on which a search starts decides on which side it ends.
         """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
         is_usual &= case.num_targets == 1 and not case.extras
@@ -120,7 +120,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return load_network(self.package, "exact-6")
 
     def start_features(self, context: CatchContext) -> Array:
-        """Return the inputs of the network, (F,): ball, quadrotor and limits."""
+        """Return the inputs of the network, (F,): states of ball and quadrotor, and the limits."""
         case, net = context.case, context.case.net
         head, limits, time = case.head_state, case.limits, context.times[0]
         balls = [targets_at(context.targets, context.times[:1] + late) for late in _FEATURE_TIMES]
@@ -145,22 +145,22 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jnp.concatenate(numbers)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """Return the case with its targets in the order of catching."""
+        """Return the context of a case, with the targets in the order of catching."""
         return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
-        """Return the end variables of the first rows of `guess_table`, (num, N, 12)."""
+        """Return the end variables that the first rows of `guess_table` describe, (num, N, 12)."""
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def solve(self, case: CatchCase, attempt: Round) -> CatchPlan:
-        """Return the plan of one case by one round."""
+        """Return the plan that one round (attempt) finds for one case."""
         return super().solve(case, self._for_start(attempt, case))
 
     def solve_lanes(self, cases: CatchCase, attempt: Round) -> CatchPlan:
-        """Return the plans of a batch by one round."""
+        """Return the plans that one round (attempt) finds for a batch."""
         return super().solve_lanes(cases, self._for_start(attempt, cases))
 
     def starts_long(self, cases: CatchCase) -> bool:
@@ -168,13 +168,13 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """Return a round adapted to the distance of its starting point from the optimum."""
+        """Return a round with as many iterations as its start's distance to the optimum needs."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
-            # Far from the optimum the gain of one iteration is no measure of convergence.
+            # Far from the optimum a small gain of one iteration does not show convergence.
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
             solver = dataclasses.replace(attempt.solver, tolerance=slow)
             return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
@@ -182,10 +182,10 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return _FROM_LEARNED if is_near else attempt
 
     def limit_learned(self, point: Array) -> Array:
-        """Return a point (n,) with bounded variables of the catch points.
+        """Limit the catch points in a learned starting point (n,), so that searches can move them.
 
-        Least time moves a catch point to the rim, where its variables grow without bound and the
-        catch point hardly moves with them. A later re-plan could not leave such a point.
+        Catches are earliest with catch points at the hoop's rim. There the variables of a catch
+        point grow without bound while the point hardly moves, and a re-plan could not move it back.
         """
         offsets, natural = self.split(point)
         place = natural[:, 1:3]
@@ -194,7 +194,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """Return the end variables (N, 12) of a row of `guess_table`."""
+        """Return the end variables (N, 12) that one row of `guess_table` describes."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
@@ -222,7 +222,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
         """Return the catches that the end variables (N, 12) describe, as ends of the segments.
 
-        The excess (2, N) consists of the net's angle and the time after the horizon.
+        The excess (2, N) has two rows: the net's angle, and the time after the horizon.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
@@ -236,12 +236,12 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         place = place * inside
         pos = ball.pos - net.height * axis - place[:, :1] * across_x - place[:, 1:] * across_y
         facing, moving = facing_cosine(axis, ball.vel)
-        # Relative excess of the angle to first order, which needs no arc cosine.
+        # Relative excess of the angle, linearised at the limit, which needs no arc cosine.
         angle = jnp.maximum(net.max_angle, 1e-3)
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
-        # A feasible plan may not use its tolerance to catch after the horizon.
+        # Subtract the tolerance of feasible plans, so that no catch is later than the horizon.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return ChainEnds(
             durations=durations,
@@ -268,7 +268,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
         squared = jnp.sum(share**2, axis=1, keepdims=True)
-        # Nearer to the rim the catch point hardly moves with its variables.
+        # Even nearer to the rim, the catch point would hardly move with its variables.
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(

@@ -1,8 +1,8 @@
-"""Re-planning of catches: from the plan that is being flown, for new estimates of the targets.
+"""Re-planning of catches for new estimates of the targets, while a plan is being flown.
 
 Between two observations the estimated path of a ball moves by millimetres, and so does the best
-plan. From the remainder of the previous plan a few iterations suffice. Planning from scratch
-remains for the first observation and for large changes.
+plan. A few iterations from the remainder of the previous plan suffice. The first observation, and
+large changes, still need planning from scratch.
 """
 
 import dataclasses
@@ -33,41 +33,41 @@ from planner_jax.trajectory.polynomial import (
 )
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
-_ORDERS = 4  # position to jerk
+_ORDERS = 4  # number of derivatives in a state, from position to jerk
 _LATEST = 0.05  # [s], greatest change of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
 _CLOSING = 0.1  # [m/s], least speed towards the net's plane for a change of a catch's time
 _BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
-_TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction ignores curvature and is too long
+_TRIALS = (1.0, 0.2, 0.04)  # some are short: the first direction ignores curvature and is too long
 
 
 @struct.dataclass
 class ReplanContext:
-    """The context of the remaining catches, the previous plan, and the starting point."""
+    """Data of a re-plan: context of the remaining catches, previous plan, starting point."""
 
     catch: CatchContext
     task: Replanning
-    start: Array  # (n,), the previous plan for the new targets
-    keep: Array  # () bool, whether too little time is left, so that the previous plan is returned
+    start: Array  # (n,), the previous plan, fitted to the new targets
+    keep: Array  # () bool, whether the previous plan is returned because too little time is left
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanCatch(OptimisedPlanner):
-    """Re-plans catches from the previous plan, for `pj.replan`.
+    """A planner that re-plans catches from the previous plan, for `pj.replan`.
 
     The search starts at the remainder of the previous trajectory, sampled at the new waypoints. Its
     catches are moved to the times at which the targets are expected to pass the net's plane. For
-    unchanged targets and no elapsed time that is the previous plan up to rounding. A target that
-    has moved is caught at another point in the net, and beyond the hoop by the smoothest change of
-    the trajectory.
+    unchanged targets and no elapsed time the starting point is the previous plan up to rounding. A
+    target that has moved is caught at another point of the net. If it would miss the net, the
+    starting trajectory is changed as smoothly as possible to reach it.
 
-    With less than `shortest` until the next catch, the remainder of the previous plan is returned,
-    in the same number of pieces and with the same violation. After the last catch the remainder is
-    empty and stays at the position of that catch.
+    If less than `shortest` is left until the next catch, the remainder of the previous plan is
+    returned, in the same number of pieces and with the same violation. After the last catch the
+    remainder is empty and stays at the position of that catch.
 
     The first round makes one iteration, and the next re-plan continues from its result: the
-    real-time iteration of [Diehl2005]. It usually suffices to keep all limits.
+    real-time iteration of [Diehl2005]. One iteration usually suffices to keep all limits.
     """
 
     case_type = Replanning
@@ -82,7 +82,7 @@ class ReplanCatch(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactCatch:
-        """The planner of the remaining cases."""
+        """The planner of the remaining cases, which also plans from scratch."""
         return self.planner
 
     def begin(
@@ -94,12 +94,12 @@ class ReplanCatch(OptimisedPlanner):
         targets: TargetPath,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remaining case, or batch, some time into its plan.
+        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
 
         Caught targets become absent; the others keep their order. `pj.replan` describes `cases`,
         `previous`, `elapsed` and the errors. The estimated `targets` have the shapes of the cases'
         targets, and their time 0 is the present. The quadrotor's `head_state`, (4, 3) or (B, 4, 3),
-        is by default the state in the plan.
+        is by default the state that the plan has at this time.
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)
@@ -129,7 +129,7 @@ class ReplanCatch(OptimisedPlanner):
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the context of the remaining catches, and the previous plan as a point."""
+        """Return the context of the remaining catches, and the previous plan as a start."""
         context = self.planner.prepare(task.case)
         left = _segments(task)[1][0]
         return ReplanContext(
@@ -140,14 +140,14 @@ class ReplanCatch(OptimisedPlanner):
         )
 
     def _start(self, task: Replanning, context: CatchContext) -> Array:
-        """Return the remainder of the previous plan for the new targets as a point (n,)."""
+        """Return the starting point (n,): the rest of the previous plan, fitted to new targets."""
         planner, net = self.planner, task.case.net
         trajectory = task.previous.trajectory
         segments, times = _segments(task)
         last = (segments + 1) * planner.num_pieces - 1
         coeffs, ends = trajectory.coeffs[last], trajectory.durations[last]
         tails = _states(coeffs, ends)
-        # Times at which the targets pass the net's plane, to first order.
+        # Times at which the targets pass the net's plane, linearised at the previous catches.
         axis = body_z(tails[:, 2], task.case.gravity)
         ball = targets_at(context.targets, times)
         above = jnp.sum((ball.pos - tails[:, 0]) * axis, axis=1) - net.height
@@ -159,7 +159,7 @@ class ReplanCatch(OptimisedPlanner):
         times = times + later
         begins = jnp.concatenate([jnp.zeros_like(times[:1]), times[:-1]])
         durations = jnp.maximum(times - begins, _SHORTEST)
-        # The previous trajectory at the new waypoints, and at the starts of the segments.
+        # States of the previous trajectory at the new waypoints and at the starts of the segments.
         proportions = planner.maps.proportions
         shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
         knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)
@@ -173,7 +173,7 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return the previous plan, followed by guesses of the planner at its times, (num, n)."""
+        """Return the previous plan, followed by guesses of the planner from scratch, (num, n)."""
         first = context.start[None]
         if num == 1:
             return first
@@ -192,7 +192,7 @@ class ReplanCatch(OptimisedPlanner):
 
 
 def _states(coeffs: Array, time: Numbers) -> Array:
-    """Return states (K, 4, 3) on K pieces (K, D + 1, 3), each at a time (K,) after its start."""
+    """Evaluate K polynomial pieces (K, D + 1, 3) at times (K,) in them; return states (K, 4, 3)."""
     factors, powers = state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)
     basis *= jnp.asarray(factors, time.dtype)
@@ -200,7 +200,7 @@ def _states(coeffs: Array, time: Numbers) -> Array:
 
 
 def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
-    """Return states (K, 4, 3) at times (K,) of a trajectory."""
+    """Return the states (K, 4, 3), position to jerk, of a trajectory at times (K,) [s]."""
     ends = jnp.cumsum(trajectory.durations)
     piece = jnp.sum(times[:, None] >= ends[:-1], axis=1)
     return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])
@@ -217,8 +217,8 @@ def _segments(task: Replanning) -> tuple[Array, Array]:
 def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
     """Return the remainder of the previous plan in the same number of pieces.
 
-    The remainder of the current piece is split into equal parts, one for itself and one for each
-    earlier piece of its segment.
+    The remainder of the current piece is split into equal parts: one takes the place of the piece
+    itself, and the others take the places of the earlier pieces of its segment.
     """
     previous, num = task.previous, context.times.size
     segments, times = _segments(task)

@@ -1,9 +1,10 @@
-"""The default planner of groups: it plans leg after leg, each as early as possible.
+"""The default planner of groups of targets: it plans leg after leg, each as early as possible.
 
-A leg is an interception that starts at the end of the previous leg, with targets and movers moved
-to that time. `SpacetimeIntercept` plans it as early as possible. If that fails, because the car
-cannot drive the early paths of the reach set, it plans the leg of least effort. The first legs of
-all groups of a batch, and of all their proposed orders, are planned together, then the second legs.
+A leg is an interception that starts at the end of the previous leg, with targets and moving
+obstacles moved to that time. `SpacetimeIntercept` plans it as early as possible. If the car cannot
+drive the early paths of the reach set, it plans the leg with the least effort instead. The first
+legs of all groups of a batch, in all their proposed orders, are planned together, then all second
+legs, and so on.
 """
 
 import dataclasses
@@ -23,21 +24,21 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# Fewer paths than for a single target, because there are many legs.
+# A leg has fewer paths than an interception of a single target, because there are many legs.
 _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class GroupIntercept(Planner):
-    """Composite planner of groups whose order is decided.
+    """Composite planner of groups of targets whose order is decided.
 
-    For the sake of speed every leg ends as early as possible, even if that delays the next leg.
+    To save computing time, every leg ends as early as possible, even if that delays the next leg.
     """
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    # A single search: the others take long.
+    # Only one search, because the other searches of this planner take long.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
@@ -67,14 +68,14 @@ class GroupIntercept(Planner):
         return jax.device_get(_join(cases, begins, legs))
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
-        """Plan the legs that are needed, (B,) bool; the plans of other legs have no meaning."""
+        """Plan the legs where `needed` (B,) is true; the plans of other legs have no meaning."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
             return drive.plan_again(patiently, case, plans, needed & _is_open(plans.status))
         case, needed = jax.tree.map(np.asarray, (case, needed))
-        # Plan equal legs once: orders with the same first targets share legs. Plan one leg if none
-        # is needed.
+        # Equal legs are planned once, because orders with the same first targets have equal legs.
+        # If no leg is needed, one leg is planned, so that the arrays are not empty.
         some = np.flatnonzero(needed) if np.any(needed) else np.zeros(1, int)
         leaves = [leaf[some].reshape(some.size, -1) for leaf in jax.tree.leaves(case)]
         rows = np.concatenate(leaves, axis=1)
@@ -88,9 +89,9 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return whether another planner may solve a leg.
+    """Return whether the planner `patient` may solve a leg that has this status.
 
-    It may solve legs without a path, too, since its searches end at other times and scale the body.
+    Legs without a path count too, since that planner ends at other times and scales the body.
     """
     return is_unsolved(status) | (status == Status.NO_PATH)
 
@@ -99,9 +100,9 @@ def _is_open(status: Array) -> Array:
 def _make_legs(
     cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, solved: Array
 ) -> tuple[InterceptCase, Array]:
-    """Return the legs to the k-th targets of the orders, and whether each is needed.
+    """Return the legs to the k-th targets of the orders, and whether each leg is needed, (B,).
 
-    They start at the times `begin` (B,) [s] from the states `car`. `solved` (B,) bool is true if
+    The legs start at the times `begin` (B,) [s] in the states `car`. `solved` (B,) bool is true if
     all previous legs are solved.
     """
 
@@ -140,7 +141,7 @@ def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -
 def _advance(
     plans: InterceptPlan, begin: Array, solved: Array, needed: Array
 ) -> tuple[CarState, Array, Array]:
-    """Return the cars' states and times (B,) [s] after legs, and whether all legs are solved."""
+    """Return the cars' states and times (B,) [s] after their legs, and whether all are solved."""
 
     def end(plan: InterceptPlan) -> CarState:
         duration = jnp.where(plan.time > 0.0, plan.time, 1.0)
@@ -152,7 +153,7 @@ def _advance(
 
 @jax.jit
 def _join(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
-    """Join legs (N, B, ...), which start at times (N, B) [s], to plans of groups."""
+    """Join legs (N, B, ...), which start at the times `begins` (N, B) [s], to plans of groups."""
     begins, legs = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
     # The status of a plan is the status of its first unsolved leg.
     first = jnp.argmax(~is_solved(legs.status), axis=1)

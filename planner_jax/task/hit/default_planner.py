@@ -1,8 +1,8 @@
-"""The `exact` hit planner, whose decision variables satisfy contact, impact and landing.
+"""The `exact` hit planner: its decision variables satisfy contact, impact and landing exactly.
 
-Every plan meets the ball and returns it to the target; penalties treat the inequalities alone. As
-in [Yu2023bat, eqs 11-12] the impact determines normal and normal speed of the racket. The choice of
-variables avoids the singular divisions of [Yu2023bat, eqs 13-14].
+Every plan meets the ball and returns it to the target; only inequalities are treated by penalties.
+As in [Yu2023bat, eqs 11-12] the impact determines the racket's normal and its speed along the
+normal. The choice of variables avoids the singular divisions of [Yu2023bat, eqs 13-14].
 """
 
 import dataclasses
@@ -40,10 +40,10 @@ if TYPE_CHECKING:
     from planner_jax.task.hit.replan import ReplanHit
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
-_FEATURE_TIMES = (0.5, 0.75, 0.95)  # relative to the landing time, of the ball in the features
-# Settings of searches for any feasible plan. A search with the waypoints' velocities as variables
-# needs a starting point near a feasible one. Where limits bind along the whole trajectory, the
-# margin is reduced to what peaks between the nodes need.
+_FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball's states in the features / landing time
+# Settings of searches for any feasible plan, whatever its cost. A search with the waypoints'
+# velocities as variables needs a starting point near a feasible one. If limits are active along the
+# whole trajectory, the margin is only as large as peaks between the nodes require.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 _FROM_GUESSES = (*_ANY_FEASIBLE, ("learned", False))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
@@ -54,10 +54,10 @@ _SMALL_MARGIN = (
     ("nodes", 12),
     ("velocities", True),
 )
-_VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units are from 0.6 to 7
-_PASSING = 0.9  # greatest speed of a guess at the ball, relative to the speed limit
-# Starting points, best first: impact time over landing time, flight time after the impact [s],
-# thrust over g. The first one suits easy cases; the others hit earlier, flatter or harder.
+_VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units range from 0.6 to 7
+_PASSING = 0.9  # greatest speed at the ball in a guess, as a fraction of the speed limit
+# Starting points, best first. Columns: impact time / landing time, flight time after the impact
+# [s], thrust / g. The first row suits easy cases; the others hit earlier, flatter or harder.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -80,10 +80,10 @@ def _hard(steps: int) -> LbfgsConfig:
     return LbfgsConfig(max_steps=steps, memory=12, tolerance=1e-6, patience=5)
 
 
-# The first two rounds solve easy cases. The others search for any feasible plan, almost without
-# the energy. Rounds three and four start at a network's point; round four is longer and only
-# for violations below 0.1. The last two start at all fixed guesses and continue the best of
-# them; the last one is for violations below 0.04.
+# The first two rounds solve easy cases. The later rounds search for any feasible plan, with hardly
+# any energy in the cost. Rounds 3 and 4 start at a network's point; round 4 is longer and only for
+# violations below 0.1. Rounds 5 and 6 start at all rows of `_GUESSES` and continue the best of
+# these starts; round 6 is only for violations below 0.04.
 _ROUNDS = (
     Round(1, LbfgsConfig(max_steps=3)),
     Round(1, LbfgsConfig(max_steps=60)),
@@ -107,16 +107,16 @@ _ROUNDS = (
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ExactHit(ChainPlanner[HitCase, HitPlan]):
-    """Plans minimum-snap hits whose decision variables satisfy the equations of the impact.
+    """A planner of minimum-snap hits whose decision variables satisfy the equations of the impact.
 
-    The n = 3 (M - 1) + 8 variables are the whitened waypoint offsets, the logarithms of the impact
-    time, of the ball's flight time after the impact and of the thrust at the impact, two velocities
-    of the racket across its normal, and the jerk at the impact, each in units of `scale`. With
-    `velocities` the velocities at the waypoints are 3 (M - 1) further variables behind the offsets.
+    The n = 3 (M - 1) + 8 variables, in units of `scale`, are the whitened waypoint offsets; the
+    logarithms of the impact time, of the ball's flight time after the impact and of the thrust at
+    the impact; two velocities of the racket across its normal; and the jerk at the impact. With
+    `velocities` the velocities at the waypoints are 3 (M - 1) further variables after the offsets.
 
     The two times determine the ball's velocities before and after the impact, such that the ball
-    reaches the target. These determine the racket's normal and normal speed [Yu2023bat, eqs 11-12],
-    and with the other variables the position, velocity and acceleration at the impact.
+    reaches the target. The ball's velocities determine the racket's normal and its speed along the
+    normal [Yu2023bat, eqs 11-12]. The other variables then determine the racket's state.
 
     The cost is energy_weight * integral |snap|^2, plus the integral of the smoothed hinges of the
     limits [Yu2023bat, eq. 18a] and extras, plus impact_weight * the hinges of apex and hitting
@@ -136,7 +136,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     energy_weight: float = 1e-8
     num_table_nodes: int = 36
     drag_after_impact: bool = False
-    impact_weight: float = 0.3  # [s], of the hinges of apex and hitting speed
+    impact_weight: float = 0.3  # [s] weight of the penalties for apex and hitting speed
     rounds: tuple[Round, ...] = _ROUNDS
     velocities: bool = False  # whether the velocities at the waypoints are variables
     learned: bool = True  # whether a network improves the first guess of usual cases
@@ -147,17 +147,17 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the hinges at the impact."""
+        """Weight [s] of the penalties at the impact."""
         return self.impact_weight
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant maps from boundary and offsets to the trajectory."""
+        """Constant linear maps from boundary states and offsets to the trajectory."""
         return proportional_minco(4, self.proportions, self.velocities)
 
     @property
     def num_offsets(self) -> int:
-        """Number of waypoint variables."""
+        """Number of waypoint variables: positions, and velocities if these are variables."""
         return self._num_places * (2 if self.velocities else 1)
 
     @property
@@ -166,18 +166,18 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return 3 * (self.num_pieces - 1)
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return a scale, with units for the waypoints' velocities inserted if they are missing."""
+        """Return units of all variables; missing units of waypoint velocities are inserted."""
         places = self._num_places
         if not self.velocities or len(scale) != places + self.num_end_variables:
             return scale
         return scale[:places] + (_VELOCITY_SCALE,) * places + scale[places:]
 
     def start_network(self, case: HitCase) -> StartNetwork | None:
-        """Return the network for the first guess, or None for unusual sizes or cases with extras.
+        """Return the network for the first guess; None for unusual sizes or cases with extras.
 
         The network without velocities was trained for feasible points of little energy, the network
-        with velocities for limits that bind along the whole trajectory. There is none around
-        obstacles, because the side on which a search starts decides where it can end.
+        with velocities for limits that are active along the whole trajectory. With obstacles there
+        is no network: the side on which a search starts decides on which side it ends.
         """
         is_usual = self.proportions == _PROPORTIONS and not case.extras
         if not self.learned or not is_usual:
@@ -187,12 +187,12 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return load_network(self.package, "exact-12" + "-supple" * self.velocities)
 
     def start_features(self, context: HitContext) -> Array:
-        """Return the inputs of the network, (F,): ball, target, quadrotor and limits."""
+        """Return the inputs of the network, (F,): ball, target, state of the quadrotor, limits."""
         case, landing = context.case, context.landing_time
         head, limits, stroke = case.head_state, case.limits, case.hit_limits
         balls = [target_at(context.path, share * landing) for share in _FEATURE_TIMES]
         acceleration = limits.acceleration
-        if acceleration is None:  # roughly the thrust less the weight
+        if acceleration is None:  # approximately the thrust minus the weight
             thrust = 2.5 * case.gravity if limits.max_thrust is None else limits.max_thrust
             acceleration = jnp.maximum(thrust - case.gravity, 0.1 * case.gravity)
         numbers = (
@@ -218,11 +218,11 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return jnp.concatenate(numbers)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """Return the case with the table of its incoming ball."""
+        """Return the context of a case: the case, and a table of the incoming ball's path."""
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
-        """Return the end variables of the first rows of `guess_table`, (num, 1, 8)."""
+        """Return the end variables that the first rows of `guess_table` describe, (num, 1, 8)."""
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         times = jnp.stack(
             [
@@ -233,16 +233,16 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
             axis=1,
         )
         natural = jnp.pad(times, ((0, 0), (0, 5)))
-        if num > 1:  # hard cases need speed across the racket's normal
+        if num > 1:  # in hard cases the racket must also move across its normal
             moving = jax.vmap(lambda each: self._set_passing_speed(each, context))(natural[1:])
             natural = jnp.concatenate([natural[:1], moving])
         return natural[:, None]
 
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
-        """Return a guess (8,) with the racket's velocity across its normal set.
+        """Return a guess (8,) in which the racket's velocity across its normal is set.
 
-        It is the velocity at the impact of a constant acceleration from the start to the impact, at
-        most `_PASSING` times the speed limit.
+        A constant acceleration from the start to the impact would reach this velocity. Its length
+        is at most `_PASSING` times the speed limit.
         """
         impact, case = self.impact(natural, context), context.case
         start, time = case.head_state, impact.stroke.time
@@ -253,7 +253,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Return a point (n,) with zero offsets of velocities for one without velocities."""
+        """Convert a point (n,) of a search without velocities by adding zero velocity offsets."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
@@ -262,7 +262,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
         """Return the impact that the end variables (1, 8) describe, as the end of the segment.
 
-        The excess (5,) consists of `apex_excess` and `hitting_speed_excess`.
+        The excess (5,) is `apex_excess` (2,) followed by `hitting_speed_excess`.
         """
         impact, limits = self.impact(natural[0], context), context.case.hit_limits
         apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)
@@ -276,13 +276,14 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         )
 
     def relative_excess(self, excess: Array) -> Array:
-        """Return the excess (5,) with ratios of speeds in place of ratios of their squares."""
+        """Return the excess (5,) with ratios of squared speeds converted to ratios of speeds."""
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
         """Return the impact that the end variables (8,) describe.
 
-        The variables are log T, log t_post, log thrust, two tangential speeds and the jerk.
+        The variables are the logarithms of the impact time, of the ball's flight time after the
+        impact and of the thrust, two speeds of the racket across its normal, and the jerk.
         """
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])

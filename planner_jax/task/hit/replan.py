@@ -1,9 +1,9 @@
-"""Re-planning of hits: from the plan that is being flown, for a new estimate of the ball.
+"""Re-planning of hits for a new estimate of the ball, while a plan is being flown.
 
-The search starts at the stroke of the previous plan and the smoothest trajectory to it from the
+The search starts at the previous plan's impact and the smoothest trajectory to it from the
 quadrotor's state. A few iterations suffice. [Yu2023bat, Section VI-C] plans once, because "even
-minor updates in the terminal state could lead to drastic deformations"; here the stroke changes as
-little as the estimate of the ball does.
+minor updates in the terminal state could lead to drastic deformations". In this planner the impact
+is part of the search, and it changes as little as the estimate of the ball does.
 """
 
 import dataclasses
@@ -26,22 +26,22 @@ from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
-_SHORTEST = 0.01  # [s], least time to the impact in a starting point
-_TRIALS = (1.0, 0.2, 0.04)  # step lengths: the first direction ignores curvature and is too long
+_SHORTEST = 0.01  # [s] least time to the impact in a starting point
+_TRIALS = (1.0, 0.2, 0.04)  # some are short: the first direction ignores curvature and is too long
 
 
 @struct.dataclass
 class ReplanHitContext:
-    """The context of the remaining hit, and the starting point."""
+    """The context of the remaining hit, and the starting point made from the previous plan."""
 
     hit: HitContext
-    start: Array  # (n,), the previous stroke
+    start: Array  # (n,), the previous plan's impact as a point of the search
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanHit(OptimisedPlanner):
-    """Re-plans hits from plans of any hit planner, for `pj.replan`. New plans are by `planner`."""
+    """Re-plans hits for `pj.replan` from plans of any hit planner; `planner` makes new plans."""
 
     case_type = Replanning
     plan_type = HitPlan
@@ -53,7 +53,7 @@ class ReplanHit(OptimisedPlanner):
 
     @property
     def inner(self) -> ExactHit:
-        """The planner of the remaining cases."""
+        """The planner of the remaining cases, which makes the new plans."""
         return self.planner
 
     def begin(
@@ -66,11 +66,11 @@ class ReplanHit(OptimisedPlanner):
         drag: ArrayLike | None = None,
         head_state: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remaining case, or batch, some time into its plan.
+        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
 
         `pj.replan` describes `cases`, `previous`, `elapsed` and the errors. The estimated `ball`
         has leaves (3,) or (B, 3). The `drag` K_D [1/m], () or (B,), is by default the drag of the
-        cases, and the quadrotor's `head_state`, (4, 3) or (B, 4, 3), the state in the plan.
+        cases. The quadrotor's `head_state`, (4, 3) or (B, 4, 3), is by default its planned state.
         """
         elapsed = check_elapsed(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)
@@ -82,11 +82,11 @@ class ReplanHit(OptimisedPlanner):
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanHitContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the context of the remaining hit, and the previous stroke as a point."""
+        """Return the context of the remaining hit, and the previous impact as a starting point."""
         return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
 
     def _start(self, task: Replanning) -> Array:
-        """Return the previous stroke with zero waypoint offsets, (n,)."""
+        """Return the point (n,) of the previous plan's impact, with zero waypoint offsets."""
         planner, stroke = self.planner, task.previous.stroke
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
@@ -104,16 +104,16 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return the previous stroke, followed by guesses of the planner, (num, n)."""
+        """Return the previous impact as the first start, then guesses of the planner, (num, n)."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Return the planner's objective at a point."""
+        """Return the objective of the inner planner at a point (n,)."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:
-        """Return the plan at a point."""
+        """Return the plan of the inner planner at a point (n,)."""
         return self.planner.decode(point, context.hit)

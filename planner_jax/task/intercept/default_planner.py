@@ -1,11 +1,11 @@
-"""The default planner: a reach set in space and time, random paths through it, least squares.
+"""The default planner of interceptions: a reach set in space and time, then least squares.
 
-[Qu2022] plans a path among the walls, and then a speed along it among the movers. If a mover stays
-on the path, no speed helps. Here path and speed are planned together. A reach set of cells
-(`plane.reach`) contains what the car can reach and when. Levenberg-Marquardt on speed and curvature
-at knots (`problem`) starts from random paths through the set, and runs in three stages:
+[Qu2022] plans a path among the walls, and then a speed along it among the moving obstacles. If such
+an obstacle stays on the path, no speed avoids it. Here path and speed are planned together. A reach
+set of cells (`plane.reach`) contains where the car can be at which time. Random paths through the
+set are the starts of Levenberg-Marquardt on speed and curvature at knots (`problem`), in 3 stages:
 
-1. follow the positions of the cells, since their speeds and turns alone drift through walls;
+1. follow the positions of the cells, since speeds and turns alone would drift through walls;
 2. meet every limit;
 3. once every limit holds, reduce the effort, or meet the target earlier.
 """
@@ -50,7 +50,7 @@ from planner_jax.task.intercept.searches import (
     search_reach,
 )
 
-_SPREAD = 2  # number of earliest layers at which paths to an early meeting end
+_SPREAD = 2  # number of the earliest reaching time layers at which early paths may end
 
 
 @jax.tree_util.register_static
@@ -58,19 +58,20 @@ _SPREAD = 2  # number of earliest layers at which paths to an early meeting end
 class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     """Planner of interceptions by a reach set and least squares.
 
-    `meet` selects the time of the meeting: the "given" time of the case, as "early" as possible
-    before it, or the earlier time of the "least" effort. The effort is the integral of the squared
-    acceleration. The cost of a plan is its time [s] for "early", else its effort [m^2/s^3].
+    `meet` selects the time of the meeting: "given" is the time of the case, "early" is as early as
+    possible before it, and "least" is the time until then that needs the least effort, which is the
+    integral of the squared acceleration. A plan's cost is its time [s] for "early", else its effort
+    [m^2/s^3].
     """
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     meet: Literal["given", "early", "least"] = "given"
-    pieces: int = 32  # of speed and curvature
-    samples: int = 3  # of each piece, at which least squares check obstacles
-    checked: int = 10  # samples of each piece, at which the final check of a plan is made
-    # Whether all paths of a search are tried and the best plan is selected, as is always done if
-    # the time is free.
+    pieces: int = 32  # number of pieces of speed and curvature
+    samples: int = 3  # samples of each piece at which least squares check obstacles
+    checked: int = 10  # samples of each piece at which the finished plan is checked
+    # Whether all paths of a search are tried and the best plan is selected. If the meeting time is
+    # free, this is always so.
     tries_all: bool = False
     searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
 
@@ -98,9 +99,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return the planner that minimises the cost from plans, and the cases with these plans.
+        """Return a planner that minimises the cost from plans, and the cases with these plans.
 
-        `pj.gradient` and `pj.optimal_plan` use both.
+        `pj.gradient` and `pj.optimal_plan` use both results.
         """
         problem = self.problem
         start = problem.pack(plans.speed[..., 1:], plans.curvature[..., 1:], plans.time)
@@ -111,7 +112,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return `smooth_near` for the plans of `plan_of`, by default of the first search."""
+        """Return `smooth_near` for the plans of `plan_of`, by default of the first attempt."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
@@ -119,9 +120,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.smooth_near(cases, plans)
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plan of one case: try path after path until one meets every limit.
+        """Return the plan of one case: try path after path until one leads to a solved plan.
 
-        With `tries_all`, or if the meeting time is free, try all and select the best plan.
+        With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free)
@@ -144,7 +145,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
-        # All cases compute the largest number of layers of the batch, so that they stay in step.
+        # All cases compute as many time layers as the case that needs most, to stay in step.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
 
@@ -175,10 +176,10 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
     ) -> Guess:
-        """Draw a random path that meets the target, and return the guess along it.
+        """Draw a random path of cells that meets the target, and return the guess along it.
 
-        It ends at the case's time, at one of the first layers that meet the target ("early"), or
-        at any layer that does ("least").
+        The path ends at the case's time, at one of the first time layers that meet the target
+        ("early"), or at any layer that meets it ("least").
         """
         layer = found.grid.num
         if self.problem.is_time_free:

@@ -1,8 +1,8 @@
-"""Re-planning from the plan that is being driven, for a new expected path of the target.
+"""Re-planning of interceptions for a new expected path of the target, while a plan is driven.
 
-Between two observations of a target its expected path moves by centimetres, and so does the best
+Between two observations the expected path of a target moves by centimetres, and so does the best
 trajectory. From the remainder of the previous plan a few steps of least squares suffice. Cases that
-they do not solve are planned from scratch.
+remain unsolved are planned from scratch.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from planner_jax.task.intercept.searches import Search, Warm, make_field, make_g
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanIntercept(Planner[Replanning, InterceptPlan]):
-    """Planner of the remainder of interceptions; made by `SpacetimeIntercept.replanner`.
+    """Planner of the remainders of interceptions; `SpacetimeIntercept.replanner` makes it.
 
     If less than `shortest` remains until the meeting, the remainder of the previous plan is
     returned.
@@ -40,19 +40,19 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
     is_sequential: ClassVar[bool] = True
     plan_type: ClassVar[type] = InterceptPlan
     planner: Planner[InterceptCase, InterceptPlan]  # plans from scratch, by a `Search`
-    search: Search  # of `planner`
-    problem: MotionProblem  # of `planner`
+    search: Search  # the attempt of `planner` from scratch
+    problem: MotionProblem  # the least-squares problem of `planner`
     warm: Warm = Warm()
-    shortest: float = 0.1  # [s]
+    shortest: float = 0.1  # [s] least time to the meeting for which a new plan is made
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One from the previous plan, then the first search from scratch: others take too long."""
+        """A re-plan of the previous plan, then one search from scratch; more take too long."""
         return (self.warm, self.search)
 
     @property
     def inner(self) -> Planner[InterceptCase, InterceptPlan]:
-        """The planner from scratch."""
+        """The planner that plans from scratch."""
         return self.planner
 
     def begin(
@@ -67,18 +67,19 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         speed: ArrayLike | None = None,
         curvature: ArrayLike | None = None,
     ) -> Replanning:
-        """Return the remainder of a case, or of a batch, some time into its plan.
+        """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
 
         Args:
-            cases: as for `pj.replan`, which also describes the errors.
-            previous: as for `pj.replan`.
-            elapsed: as for `pj.replan`.
+            cases: one case or a batch, as for `pj.replan`, which also describes the errors.
+            previous: the plans that are being driven.
+            elapsed: () or (B,) [s], time since the start of the plans.
             target: the expected path; its times count from this moment.
-            movers: the moving obstacles at this moment; by default moved at their velocities.
-            start: (3,) or (B, 3) x, y [m] and heading [rad] of the rear axle; by default the
-                plan's.
-            speed: () or (B,) [m/s]; by default the plan's; clipped to the car's limits.
-            curvature: () or (B,) [1/m]; by default the plan's; clipped to the car's limits.
+            movers: the moving obstacles at this moment; by default the obstacles of the cases,
+                moved at their velocities.
+            start: (3,) or (B, 3) x, y [m] and heading [rad] of the rear axle; by default as
+                planned.
+            speed: () or (B,) [m/s]; by default as planned; clipped to the car's limits.
+            curvature: () or (B,) [1/m]; by default as planned; clipped to the car's limits.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         require_path("target", target, batch, 2)
@@ -98,7 +99,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         if movers is None:
             moved = cases.movers.velocity * elapsed[..., None, None]
             movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + moved)
-        # A planner that is free to choose the time may choose a later time than before.
+        # A planner that is free to choose the meeting time may choose a later time than it did.
         until = cases.time if self.problem.is_time_free else previous.time
         remainder = dataclasses.replace(
             cases,
@@ -112,7 +113,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
-        """Return the plan of one case."""
+        """Return the plan of one case, from the previous plan or from scratch by a `Search`."""
         if isinstance(attempt, Search):
             return self.planner.solve(task.case, attempt)
         case, problem = task.case, self.problem
@@ -127,13 +128,13 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return problem.refine(case, field, guess, attempt, stages)
 
     def solve_at_once(self, tasks: Replanning, attempt: Search | Warm) -> InterceptPlan:
-        """Return the plans of a batch, all at once."""
+        """Return the plans of a batch, computed all at once."""
         if isinstance(attempt, Search):
             return self.planner.solve_at_once(tasks.case, attempt)
         return super().solve_at_once(tasks, attempt)
 
     def _sample_previous(self, task: Replanning, time: Array) -> tuple[Array, Array]:
-        """Sample speed and curvature of the previous plan at the new knots 1..K, (K,) each."""
+        """Sample the previous plan's speed and curvature at the K new knots after the start."""
         previous, num = task.previous, self.problem.pieces
         at = task.elapsed + time * (jnp.arange(1, num + 1) / num)
         old = previous.time * jnp.linspace(0.0, 1.0, previous.speed.shape[0])
@@ -145,7 +146,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
 
 @jax.jit
 def _state(plan: InterceptPlan, time: Array) -> tuple[Array, Array, Array]:
-    """Return pose (3,), speed and curvature at one time of a plan."""
+    """Return pose (3,), speed [m/s] and curvature [1/m] of a plan at one time [s]."""
     time = jnp.minimum(time, plan.time)
     old = plan.time * jnp.linspace(0.0, 1.0, plan.speed.shape[0])
     return (
