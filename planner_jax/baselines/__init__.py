@@ -1,1 +1,1 @@
-"""Published methods that the planners are compared with, loaded by name only."""
+"""Published planning methods that this library's planners are compared with (baselines)."""

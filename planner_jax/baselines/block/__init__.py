@@ -1,1 +1,1 @@
-"""Published methods for blocks."""
+"""Published methods for blocks: a robot arm stops a thrown ball with a shield."""

@@ -1,4 +1,4 @@
-"""Clamped uniform B-splines of any degree: smooth curves between control points.
+"""Clamped uniform B-splines of any degree: smooth curves that the baseline `insat` optimises.
 
 With m control points p_i and a degree k, over positions s from 0 to 1 of the duration,
 
@@ -10,15 +10,16 @@ and the basis N by the recursion of Cox and de Boor (eq. 2) over knots s_0 .. s_
     N_{i,k}(s) = (s - s_i) / (s_{i+k} - s_i) N_{i,k-1}(s)
                  + (s_{i+k+1} - s) / (s_{i+k+1} - s_{i+1}) N_{i+1,k-1}(s),
 
-with 0 / 0 = 0. As printed, eq. 2 has s_{i+k-1} and s_{i+k} instead of s_{i+k} and s_{i+k+1}, which
-is right if k is the order, degree + 1, while the text calls k the degree; and eq. 3 sums m + 1 of m
-points. The paper does not list the knots. Clamped means that the first and the last knot have
-multiplicity k + 1, so that the curve starts and ends at its first and last control point. Uniform
-means that the m - k spans between distinct knots have equal lengths.
+with 0 / 0 = 0. The paper prints eq. 2 with s_{i+k-1} and s_{i+k} in place of s_{i+k} and
+s_{i+k+1}. The printed indices are right if k is the order, which is the degree + 1, but the paper's
+text calls k the degree. Eq. 3 is printed with m + 1 terms for m control points. The paper does not
+list the knots. Clamped means that the first and the last knot have multiplicity k + 1, so that the
+curve starts and ends at its first and last control point. Uniform means that the m - k spans
+between distinct knots have equal lengths.
 
-A curve lies in the convex hull of its control points, and so do its derivatives: a bound on the
-points of `hodograph` bounds the derivative everywhere. Everything that is linear in the points is a
-constant matrix, a NumPy array in double precision.
+A curve and its derivatives lie in the convex hulls of their own control points. A bound on the
+control points that `hodograph` computes therefore bounds the derivative everywhere. All maps that
+are linear in the control points are constant NumPy matrices in double precision.
 """
 
 import math
@@ -34,15 +35,15 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
-    """Return the matrix (..., num) from control points to the curve at positions (...).
+    """Return the basis matrix (..., num) that maps control points to curve points.
 
     Args:
         degree: k >= 0.
         num: number of control points, more than the degree.
-        shares: positions from 0 to 1 of the duration.
+        shares: (...) positions on the curve, as fractions of its duration from 0 to 1.
 
     Raises:
-        ArgumentError: there are too few control points, or a position is outside.
+        ArgumentError: there are too few control points, or a position is outside 0 to 1.
     """
     shares = np.asarray(shares, float)
     if not ((shares >= 0.0) & (shares <= 1.0)).all():
@@ -54,9 +55,9 @@ def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
 def hodograph(degree: int, order: int, num: int) -> np.ndarray:
     """Return the matrix (num - order, num) from control points to a derivative's control points.
 
-    A derivative is a B-spline over the same spans, with a degree reduced by the order. A control
-    point of the first derivative is degree (p_{i+1} - p_i) / (s_{i+k+1} - s_{i+1}). Divided by the
-    duration to the power of the order, the derivative by position becomes the derivative by time.
+    The derivative of a B-spline is a B-spline over the same knot spans. Its degree is lower by the
+    order. Control point i of the first derivative is k (p_{i+1} - p_i) / (s_{i+k+1} - s_{i+1}).
+    The result is a derivative by position s; divide by duration^order for a derivative by time.
 
     Args:
         degree: k.
@@ -76,7 +77,7 @@ def hodograph(degree: int, order: int, num: int) -> np.ndarray:
 
 
 def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePolynomial:
-    """Return the B-spline of control points as a piecewise polynomial, one piece per span.
+    """Return a B-spline with these control points as a polynomial with one piece per knot span.
 
     Args:
         degree: k.
@@ -113,12 +114,12 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """Return the knots (spans + 2 degree + 1,) in units of spans, whole numbers."""
+    """Return the clamped knots (spans + 2 degree + 1,), whole numbers in units of one knot span."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
 def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
-    """Return the basis (..., num) at positions `place` (...) in units of spans."""
+    """Evaluate the `num` basis functions, (..., num), at positions (...) in units of knot spans."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end

@@ -1,8 +1,8 @@
 """The baseline `direct`: bang-bang motions of all joints straight to an end pose, then standstill.
 
-The planner does not avoid obstacles. It evaluates end poses in the order of their arrival times,
-and the first motion that is in time and touches nothing is the plan. With `tries` of 1 it evaluates
-only the pose with the earliest arrival: no motion from rest to rest takes less time.
+The planner does not avoid obstacles. It evaluates end poses in the order in which the arm can
+reach them. The plan is the first motion that arrives before the ball and touches nothing. With
+`tries` of 1 the planner evaluates only the end pose that the arm reaches first.
 """
 
 import dataclasses
@@ -22,20 +22,21 @@ from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 from planner_jax.trajectory.polynomial import evaluate
 
-_BANG_BANG_PIECES = 13  # pieces of a motion of six joints
-_PIECES = 10  # pieces of the straight motions by which `end_poses` rejects poses
+_BANG_BANG_PIECES = 13  # number of polynomial pieces of a bang-bang motion of six joints
+_PIECES = 10  # number of pieces of the straight motions by which `end_poses` rejects poses
 
 
 def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
-    """Return end poses and the least times in which the joints reach them.
+    """Return the arm's possible end poses and the least times in which the joints reach them.
 
     Args:
         case: one case.
-        points: number of points of the ball's trajectory with eight poses each.
+        points: number of points of the ball's trajectory, each with eight end poses.
 
     Returns:
-        The poses, and times (C,) [s] counted from the delay, infinite if the arm would arrive after
-        the ball or the pose does not exist.
+        The C end poses, and the durations (C,) [s] of the quickest motions to them, which start at
+        the case's delay. A duration is infinite if the arm would arrive after the ball, or if the
+        pose does not exist.
     """
     poses = end_poses(case, flight_of(case), points, _PIECES)
     limits = case.limits
@@ -48,21 +49,21 @@ def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class DirectBlock(Planner):
-    """Bang-bang motions of the joints; the cost of a plan is its execution time [s]."""
+    """A planner with bang-bang joint motions; a plan's cost is the motion's duration [s]."""
 
     case_type: ClassVar[type] = BlockCase
     is_sequential: ClassVar[bool] = True
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    points: int = 48  # points of the ball's trajectory with end poses
+    points: int = 48  # number of points of the ball's trajectory, each with eight end poses
     tries: int = 384  # greatest number of evaluated end poses, earliest arrival first
-    samples: int = 96  # samples of a motion at which distances are computed
+    samples: int = 96  # number of samples of a motion at which obstacle distances are computed
     margin: float = 0.003  # [m], least distance from obstacles and from the arm itself
 
     def __post_init__(self) -> None:
         require_settings(self)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """Return the plan of one case."""
+        """Return the plan of one case: the first collision-free motion that arrives in time."""
         poses, times = poses_in_time(case, self.points)
         order = jnp.argsort(times)
         num = jnp.minimum(jnp.sum(jnp.isfinite(times)), self.tries)
@@ -75,13 +76,13 @@ class DirectBlock(Planner):
         return dataclasses.replace(best, status=explain_status(case, poses, best.status))
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
-        """Return the plan to one end pose.
+        """Return the bang-bang motion to one end pose as a plan, with its violation.
 
         Args:
             case: one case.
-            goal: (6,) [rad].
-            contact: () [s], when the ball arrives there.
-            duration: () [s], of the motion.
+            goal: (6,) [rad], joint angles of the end pose.
+            contact: () [s], when the ball arrives at the shield in this pose.
+            duration: () [s], duration of the motion.
         """
         turn = goal - case.angles
         motion = bang_bang(case.angles, case.rates, turn, duration, case.limits.acceleration)

@@ -1,13 +1,14 @@
 """The baseline `epase` of [Natarajan2024]: weighted A* over joint steps, timed by TOPP-RA.
 
-The steps follow the code behind the paper: 7 degrees of joints 1 to 4 and 4 degrees of each joint,
-in both directions, and a straight edge to the goal, which is tried first. States within a cell of
-0.05 rad count as one state. The heuristic is the distance to the goal in joint space, and the cost
-is the length of the path from the start.
+The steps follow the code that the paper's authors published: steps of 7 degrees of joints 1 to 4,
+and steps of 4 degrees of every joint, in both directions. A straight edge to the goal is tried
+first. States within a grid cell of 0.05 rad count as one state. The heuristic is the distance to
+the goal in joint space, and the cost is the length of the path from the start.
 
-ePA*SE [Mukherjee2022] evaluates edges in parallel, on 64 cores in the paper. Without its threads it
-is this search. Here all edges of a state are evaluated in one batch, by one thread. The paper's
-code stops within 0.1 rad of the goal; here a path ends at the goal.
+The paper uses ePA*SE [Mukherjee2022], which evaluates edges in parallel on 64 cores. With a single
+thread, ePA*SE is the weighted A* search of this module. Here one thread evaluates all edges of a
+state as one batch. The authors' code stops within 0.1 rad of the goal; here a path ends at the
+goal.
 """
 
 import dataclasses
@@ -20,7 +21,7 @@ from planner_jax.baselines.block.free_space import FreeSpace
 from planner_jax.baselines.block.pose_by_pose import Clock, Goal, PathThenTime
 from planner_jax.task.block.case import BlockCase
 
-CELL = 0.05  # [rad]
+CELL = 0.05  # [rad], edge length of the grid cells in which two states count as one
 STEPS = np.concatenate(
     [
         sign * np.deg2rad(size) * np.eye(6)[:num]
@@ -32,20 +33,20 @@ STEPS = np.concatenate(
 
 @dataclasses.dataclass
 class State:
-    """A state that a search has reached."""
+    """A state that the joint-space search has reached, with the path that leads to it."""
 
     angles: np.ndarray  # (6,) [rad]
-    length: float  # [rad], of the path from the start
+    length: float  # [rad], length of the path from the start in joint space
     parent: "State | None" = None
-    spline: np.ndarray | None = None  # (S, 6) [rad], samples from the start, if it has a spline
+    spline: np.ndarray | None = None  # (S, 6) [rad], samples of a spline from the start, or None
 
     def path(self) -> list["State"]:
-        """Return the states from this one back to the start."""
+        """Return all states on the path, from this state back to the start."""
         return [self, *(self.parent.path() if self.parent else ())]
 
 
 class OpenStates:
-    """The states that a search has not expanded, sorted by length + weight * distance to goal."""
+    """The unexpanded states of a search, sorted by path length + weight * distance to the goal."""
 
     def __init__(self, start: State, goal: np.ndarray, weight: float) -> None:
         self._goal, self._weight = goal, weight
@@ -54,7 +55,7 @@ class OpenStates:
         self._lengths, self._closed = {_cell_of(start.angles): 0.0}, set()
 
     def pop(self) -> State | None:
-        """Remove the most promising state of an open cell, close its cell, and return the state."""
+        """Remove the first state whose cell is not closed, close its cell, and return the state."""
         while self._states:
             state = heapq.heappop(self._states)[2]
             if (cell := _cell_of(state.angles)) not in self._closed:
@@ -63,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one step away in open cells, if no shorter path leads there."""
+        """Return the states one joint step away whose cells are open and not reached cheaper."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -74,7 +75,7 @@ class OpenStates:
         ]
 
     def push(self, state: State) -> None:
-        """Add a state."""
+        """Add a state, and record its path length for its grid cell."""
         self._lengths[_cell_of(state.angles)] = state.length
         ahead = float(np.linalg.norm(state.angles - self._goal))
         entry = state.length + self._weight * ahead, next(self._number), state
@@ -82,21 +83,22 @@ class OpenStates:
 
 
 def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
-    """Return the grid cell of angles (6,) as six indices."""
+    """Return the indices of the grid cell that contains six joint angles [rad]."""
     return tuple(np.round(angles / CELL).astype(int).tolist())
 
 
 @dataclasses.dataclass(frozen=True)
 class EpaseBlock(PathThenTime):
-    """A planner that tries end poses one after another; it needs the extra `arm-peers`."""
+    """The planner `epase`, which tries end poses one by one; it needs the extra `arm-peers`."""
 
-    longest: float = 0.05  # [s] per pose; few longer searches succeed
-    weight: float = 10.0  # weight of the heuristic
+    # [s], longest search for one pose. Few searches that take longer succeed.
+    longest: float = 0.05
+    weight: float = 10.0  # factor on the heuristic in weighted A*
 
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a collision-free path, or None."""
+        """Return points (N, 6) [rad] of a collision-free path to the goal, or None without one."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

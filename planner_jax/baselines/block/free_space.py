@@ -1,7 +1,7 @@
-"""Collision checks of arm angles in batches, called from the host.
+"""Collision checks of joint angles in batches, called by the search planners on the host.
 
-Searches on the host check a few angles at a time. Batches are padded to one of a few fixed sizes,
-each with one compiled program.
+A search checks few angles at a time. Batches are padded to one of a few fixed sizes, so that only
+one program for each size has to be compiled.
 """
 
 import functools
@@ -17,22 +17,22 @@ from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene
 
 RESOLUTION = 0.05 / 3.0  # [rad], joint-space distance between samples of an edge, as in [1]
-_BATCHES = (1, 64, 256, 1024)  # batch sizes of the compiled programs
+_BATCHES = (1, 64, 256, 1024)  # batch sizes for which programs are compiled
 
 # [1] The planners' code behind [Natarajan2024], github.com/sbpl/parallel_search.
 
 
 @jax.jit
 def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return least distances (N,) [m] at angles (N, 6)."""
+    """Return the arm's least distances (N,) [m] from obstacles and itself at angles (N, 6)."""
     return least_clearances(arm, scene, angles)
 
 
 @functools.cache
 def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
-    """Compile all programs, since compilation must not count as search time.
+    """Compile the programs of all batch sizes, since compilation must not count as search time.
 
-    `tree` is the structure of (arm, scene), `layout` the shape and type of each leaf.
+    `tree` is the pytree structure of (arm, scene), `layout` the shape and type of each leaf.
     """
     arm, scene = jax.tree.unflatten(tree, [np.zeros(*leaf) for leaf in layout])
     for size in _BATCHES:
@@ -40,10 +40,10 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
 
 
 class FreeSpace:
-    """The collision-free angles of one case's arm within its position limits."""
+    """The collision-free joint angles, within the position limits, of one case's arm."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
-        """Compile the programs for a case with NumPy leaves and a margin [m] from obstacles."""
+        """Compile the checks of a case with NumPy leaves; `margin` [m] is the least distance."""
         self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
         self._dtype = np.asarray(case.angles).dtype
         self._arm, self._scene = jax.device_put((case.arm, case.scene))
@@ -52,7 +52,7 @@ class FreeSpace:
         _compile(tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves), self._dtype)
 
     def is_free(self, angles: np.ndarray) -> np.ndarray:
-        """Return whether each of angles (N, 6) [rad] is collision-free, (N,) bool."""
+        """Return whether each of the joint angles (N, 6) [rad] is collision-free, (N,) bool."""
         num, begin, gaps = len(angles), 0, []
         while begin < num:
             size = next((size for size in _BATCHES if size >= num - begin), _BATCHES[-1])
@@ -67,7 +67,7 @@ class FreeSpace:
     def are_edges_free(self, begins: np.ndarray, ends: np.ndarray) -> np.ndarray:
         """Return which straight joint motions are collision-free, ends included, (N,) bool.
 
-        They lead from angles (N, 6), or (6,) for all, to angles (N, 6) [rad].
+        Motion k leads from `begins[k]`, or from `begins` if its shape is (6,), to `ends[k]` [rad].
         """
         begins = np.broadcast_to(begins, ends.shape)
         lengths = np.linalg.norm(ends - begins, axis=1)
@@ -76,7 +76,7 @@ class FreeSpace:
         number = np.arange(len(edge)) - np.repeat(np.cumsum(counts) - counts, counts) + 1
         share = (number / counts[edge])[:, None]
         angles = begins[edge] + share * (ends - begins)[edge]
-        # Ends and every eighth sample first: they reject most edges that collide.
+        # Ends and every eighth sample are checked first: they reject most colliding motions.
         is_first = (number % 8 == 0) | (number == counts[edge])
         found = np.ones(len(ends), bool)
         for some in (is_first, ~is_first):
@@ -86,9 +86,9 @@ class FreeSpace:
         return found
 
     def is_motion_free(self, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-        """Return whether a piecewise polynomial of the joints is collision-free.
+        """Return whether a piecewise polynomial of the joint angles is collision-free.
 
-        It is checked at samples at most `RESOLUTION` apart.
+        It is checked at samples that are at most `RESOLUTION` apart in joint space.
 
         Args:
             coeffs: (M, D + 1, 6), rising powers of the time [s] since the start of the piece.
@@ -101,7 +101,7 @@ class FreeSpace:
 
 
 def _sample_pieces(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sample angles (N, 6) of all pieces, each at both ends and at equal steps between."""
+    """Sample the joint angles (N, 6) of all pieces, `counts` equal steps and both ends of each."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]

@@ -1,26 +1,29 @@
 """The planner `insat` of [Natarajan2024]: a search over joint steps, interleaved with splines.
 
-Algorithm 2 of the paper. The search is the search of `epase`. An expanded state is lifted: the
-spline of each of its ancestors is extended straight to the state, control points are fitted to each
-extension, and all these splines are optimised at once. The cheapest collision-free one becomes the
-state's spline. The goal is tried from every state, first from the start.
+This is Algorithm 2 of the paper. The search is the search of `epase`. When it expands a state, it
+computes a spline from the start to that state, as follows. The spline of each ancestor is extended
+straight to the state. Control points are fitted to each extension, and all these splines are
+optimised at once. The cheapest collision-free spline becomes the state's spline. The goal is tried
+from every expanded state, first from the start.
 
-A spline is clamped, of degree 3 (order 4), with 7 control points. The paper's code has 4 to 7.
-With fewer control points the bounds on the derivatives' control points force longer motions: with
-4 of them a motion from rest to rest takes twice the necessary time. The objective is (4a),
+A spline is clamped, of degree 3 (order 4), with 7 control points; the authors' code has 4 to 7.
+With fewer control points the bounds on the derivatives' control points force longer motions. With
+4 of them a motion from standstill to standstill takes twice the necessary time. The objective is
 
-    w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
+    w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1    (eq. 4a)
 
-over the control points and t_f. (4d) and bounds on accelerations are imposed on the control points
-of the derivatives. The arm is at rest at the start, and at the goal if the case requires it. For
-given control points the least t_f that keeps these bounds is a maximum in closed form, so that
-every iterate keeps them; the maximum is smoothed for the gradient. Obstacles (4c) are not in the
-optimisation: every iterate is checked afterwards, and the last collision-free one is used.
+over the control points and t_f. The velocity bounds (4d) and bounds on accelerations are imposed on
+the control points of the derivatives. The arm stands still at the start, and at the goal if the
+case requires it. For given control points the least t_f that keeps these bounds is a maximum in
+closed form, so that every iterate keeps them. The maximum is smoothed for the gradient. The
+optimisation ignores obstacles (4c): every iterate is checked afterwards, and the last
+collision-free iterate is used.
 
-Parts of the published code that are not in the paper are left out: bounds on jerk, which it sets to
-the acceleration bounds, and attraction to the last control points. States are lifted when they are
-expanded; its edges are lifted when they are found. One thread does everything, while PINSAT has
-many threads; compiled programs may use more.
+Two parts of the authors' code that the paper does not mention are left out: bounds on jerk, which
+the code sets to the acceleration bounds, and attraction to the last control points. This module
+computes a state's spline when the state is expanded; the authors' code computes it when the edge
+to the state is found. The search uses one thread, while PINSAT has many; compiled programs may use
+more.
 """
 
 import dataclasses
@@ -42,20 +45,20 @@ from planner_jax.optimise import lbfgs
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan
 
-DEGREE = 3
+DEGREE = 3  # degree of the splines
 CONTROL_POINTS = 7  # number of control points of a spline
-ANCESTORS = 8  # ancestors optimised at once: the first one, and the nearest ones
-TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]
-LEAST_TIME = 0.1  # [s], of a spline; the greatest is the available time
-_SHARES = np.linspace(0.0, 1.0, 33)  # sample positions in a spline, from 0 to 1
-_OUTSIDE = 100.0  # [1/rad^2], weight of control points beyond the position limits
-_NORM = 16  # p of the p-norm that smooths the maximum
-_UNIT = 0.3  # [rad], unit of the optimiser's variables
+ANCESTORS = 8  # number of splines optimised at once: from the start and the nearest ancestors
+TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s] and [1/rad], w_1 and w_2 of eq. 4a
+LEAST_TIME = 0.1  # [s], least duration of a spline; the greatest is the available time
+_SHARES = np.linspace(0.0, 1.0, 33)  # sample positions, as fractions of a spline's duration
+_OUTSIDE = 100.0  # [1/rad^2], penalty weight of control points beyond the position limits
+_NORM = 16  # exponent p of the p-norm that replaces the maximum in the objective
+_UNIT = 0.3  # [rad], joint angle that one unit of the optimiser's variables stands for
 
 
 @struct.dataclass
 class Bounds:
-    """Limits of a spline."""
+    """Joint limits that a spline must keep."""
 
     lower: Array  # (6,) [rad]
     upper: Array  # (6,) [rad]
@@ -65,33 +68,34 @@ class Bounds:
 
 @struct.dataclass
 class Splines:
-    """Iterates of the optimisation, K of each of A splines with m control points."""
+    """Iterates of the spline optimisation: K iterates of each of A splines, m control points."""
 
     points: Array  # (A, K, m, 6) [rad], control points
-    time: Array  # (A, K) [s], t_f
-    length: Array  # (A, K) [rad], of the path in joint space
-    angles: Array  # (A, K, S, 6) [rad], samples
+    time: Array  # (A, K) [s], duration t_f
+    length: Array  # (A, K) [rad], length of the path in joint space
+    angles: Array  # (A, K, S, 6) [rad], samples of the joint angles
 
 
 @dataclasses.dataclass(frozen=True)
 class InsatBlock(PoseByPose):
-    """A planner that tries end poses; motions end at rest only if the case requires it."""
+    """The planner `insat`; its motions end at standstill only if the case requires it."""
 
-    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # one more piece to wait
+    pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # the spline's pieces and an initial wait
     degree: ClassVar[int] = DEGREE
-    longest: float = 0.05  # [s] per pose; few longer searches succeed
-    weight: float = 10.0  # weight of the heuristic
+    # [s], longest search for one pose. Few searches that take longer succeed.
+    longest: float = 0.05
+    weight: float = 10.0  # factor on the heuristic in weighted A*
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case with NumPy leaves."""
+        """Return the plan of one case with NumPy leaves; compile before the search is timed."""
         _compile(np.asarray(case.angles).dtype, self.solver)
         return super().plan_of(case)
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the motion along the first spline found, after a wait if it ends in motion."""
+        """Return the motion along the first valid spline to an end pose, or None without one."""
         start = np.asarray(case.angles, float)
         first = State(start, 0.0, spline=start[None])
         states = OpenStates(first, np.asarray(goal.angles, float), self.weight)
@@ -109,7 +113,7 @@ class InsatBlock(PoseByPose):
         return None
 
     def lift(self, case: BlockCase, free: FreeSpace, goal: Goal, state: State) -> bool:
-        """Compute the spline of a state, and return whether there is one."""
+        """Compute the spline from the start to a state; return whether a valid spline exists."""
         found = self.best_spline(case, free, goal, state, rests=False)
         if found is None:
             return False
@@ -119,10 +123,14 @@ class InsatBlock(PoseByPose):
     def best_spline(
         self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
-        """Return the cheapest spline from an ancestor to a state that is free and in time, or None.
+        """Return the cheapest collision-free spline to a state that is not too long, or None.
+
+        Each candidate extends the spline of one of the state's ancestors. `rests` requires that the
+        arm stands still at the end.
 
         Returns:
-            Its control points (m, 6), duration, length and samples (S, 6).
+            The spline's control points (m, 6) [rad], its duration [s], its length [rad] and its
+            samples (S, 6) [rad].
         """
         before = [each.spline for each in state.path()[1:] if each.spline is not None]
         dtype = case.angles.dtype
@@ -143,7 +151,7 @@ class InsatBlock(PoseByPose):
             ),
         )
         good = splines.time <= goal.available
-        # Every eighth sample first: these reject most iterates that collide.
+        # Every eighth sample is checked first: these few reject most iterates that collide.
         is_first = np.arange(len(_SHARES)) % 8 == 0
         for some in (is_first, ~is_first):
             if good.any():
@@ -163,7 +171,7 @@ class InsatBlock(PoseByPose):
 
 @functools.cache
 def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
-    """Compile the programs, since compilation must not count as search time."""
+    """Compile all programs, since compilation must not count as search time."""
     joints = host_leaf(np.zeros(6, dtype))
     guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
     bounds = Bounds(joints, joints, joints + 1, joints + 1)
@@ -172,7 +180,7 @@ def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
 
 
 def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Fit control points (m, 6) to a path (N, 6) and a straight extension to an end (6,)."""
+    """Fit control points (m, 6) to a path (N, 6) that is extended straight to an end (6,)."""
     straight = path[-1] + _SHARES[1:, None] * (end - path[-1])
     curve = np.concatenate([path, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
@@ -187,7 +195,7 @@ def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the basis (S, m), and the least-squares solver for its columns from 2 to `stop`."""
+    """Return the basis (S, m) and the pseudo-inverse of its free columns, 2 to `stop` - 1."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 
@@ -201,15 +209,15 @@ def _optimise(
     bounds: Bounds,
     config: lbfgs.LbfgsConfig,
 ) -> Splines:
-    """Optimise splines and return their iterates, starting with the guesses.
+    """Optimise A splines from the same start to the same end, and return all iterates.
 
     Args:
-        start: (6,) [rad].
-        end: (6,) [rad].
-        guesses: (A, m, 6) [rad], control points.
-        rests: () bool, whether the motion ends at rest.
-        bounds: of the joints.
-        config: of the optimiser.
+        start: (6,) [rad], joint angles at the start.
+        end: (6,) [rad], joint angles at the end.
+        guesses: (A, m, 6) [rad], control points; they are the first iterates.
+        rests: () bool, whether the arm stands still at the end.
+        bounds: limits of the joints.
+        config: settings of the optimiser.
     """
     num, dtype = guesses.shape[1], guesses.dtype
     first, second = (jnp.asarray(hodograph(DEGREE, k, num), dtype) for k in (1, 2))
@@ -224,7 +232,7 @@ def _optimise(
         return jnp.concatenate([start[None], start[None], moved[:-1], before[None], end[None]])
 
     def squares_of(points: Array) -> Array:
-        """Return the squared durations that each bound requires."""
+        """Return, for each bound, the square of the least duration [s] that keeps this bound."""
         rates = (product(first, points) / bounds.velocity) ** 2
         rises = jnp.abs(product(second, points)) / bounds.acceleration
         return jnp.maximum(jnp.concatenate([rates, rises]), LEAST_TIME**2)
@@ -264,13 +272,16 @@ _of_points = jax.jit(functools.partial(b_spline, DEGREE))
 
 
 def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (m - 3, 4, 6) and durations (m - 3,) of a spline."""
+    """Return the polynomial coefficients (m - 3, 4, 6) and durations (m - 3,) [s] of a spline."""
     spline = _of_points(points, time)
     return np.asarray(spline.coeffs, float), np.asarray(spline.durations, float)
 
 
 def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
-    """Return the motion along a spline; one that ends in motion starts as late as possible."""
+    """Return the motion along a spline, after a wait unless the case requires a final standstill.
+
+    The wait makes a moving arm reach the goal exactly when the ball arrives.
+    """
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:
         wait = np.zeros((1, DEGREE + 1, 6))

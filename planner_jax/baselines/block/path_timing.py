@@ -1,7 +1,8 @@
-"""Time-optimal motion of the joints along a path, by TOPP-RA.
+"""Time-optimal motion of the joints along a path, by TOPP-RA, for `rrt-connect` and `epase`.
 
-The method of [Pham2018], by the package `toppra`: [Natarajan2024] times the paths of its baselines
-with it. A cubic spline interpolates the points of the path, and the arm starts and ends at rest.
+TOPP-RA [Pham2018] is called through the package `toppra`. [Natarajan2024] times the paths of its
+baselines with this method. A cubic spline interpolates the points of the path, and the arm stands
+still at the start and at the end.
 """
 
 import importlib
@@ -12,16 +13,16 @@ import numpy as np
 from planner_jax.core.errors import MissingExtra
 
 PIECES = 128  # greatest number of pieces of a timed motion
-DEGREE = 6  # a cubic in a quadratic function of time
-_INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # where limits of a piece are evaluated
-_SPARE = 2e-4  # fraction of the limits that stays unused
+DEGREE = 6  # degree of a timed piece: a cubic spline in a quadratic function of time
+_INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # fractions of a piece at which limits are checked
+_SPARE = 2e-4  # relative slowdown beyond the necessary one, against rounding
 
 
 def import_extra(name: str) -> ModuleType:
-    """Import a module of the extra `arm-peers`.
+    """Import a module of a package that the optional extra `arm-peers` installs.
 
     Raises:
-        MissingExtra: its package is not installed.
+        MissingExtra: the package is not installed.
     """
     try:
         return importlib.import_module(name)
@@ -35,18 +36,19 @@ def import_extra(name: str) -> ModuleType:
 def time_path(
     points: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return the quickest motion from rest to rest along a spline through points, or None.
+    """Return the quickest motion along a spline through points, from standstill to standstill.
 
     TOPP-RA keeps the limits at the points of a grid. If a limit is exceeded between grid points,
     the whole motion is slowed down.
 
     Args:
-        points: (N, 6) [rad], two or more, neighbours differ, at most half of `PIECES`.
-        velocity: (6,) [rad/s], > 0.
-        acceleration: (6,) [rad/s^2], > 0.
+        points: (N, 6) [rad], 2 to `PIECES` / 2 points, of which neighbours differ.
+        velocity: (6,) [rad/s], > 0, limits of the joints.
+        acceleration: (6,) [rad/s^2], > 0, limits of the joints.
 
     Returns:
-        Coefficients (M, DEGREE + 1, 6) [rad/s^k] and durations (M,) [s] of M <= `PIECES` pieces.
+        Coefficients (M, DEGREE + 1, 6) [rad/s^k] and durations (M,) [s] of M <= `PIECES` pieces, or
+        None if TOPP-RA fails.
 
     Raises:
         MissingExtra: toppra is not installed.
@@ -87,7 +89,7 @@ def time_path(
 
 
 def _grid(knots: np.ndarray) -> np.ndarray:
-    """Return up to `PIECES` + 1 points along a path, knots included, about equally spaced.
+    """Return up to `PIECES` + 1 about equally spaced positions along a path, knots included.
 
     Each span between knots is divided into equal parts, in proportion to its length.
     """
@@ -98,7 +100,7 @@ def _grid(knots: np.ndarray) -> np.ndarray:
 
 
 def _compose(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return coefficients (M, 7, 6) in time of cubics (M, 4, 6) in p = speed t + rise t^2."""
+    """Return coefficients (M, 7, 6) in time t of cubics (M, 4, 6) in p = speed t + rise t^2."""
     none, one, two, three = np.moveaxis(cubic, 1, 0)
     return np.stack(
         [

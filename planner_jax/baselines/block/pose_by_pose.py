@@ -3,9 +3,10 @@
 The paper's goals are poses at equidistant points of a tunnel, tried "sequentially until it
 succeeds". Here the goals are at points of the ball's own trajectory, each with the eight branches
 of inverse kinematics. Poses that collide, or that no motion reaches in time, are left out. Poses
-are tried in the order of (duration of a bang-bang motion) / (available time). A motion that arrives
-too late ends the search only if the planner is not `patient`. The paper's planners must have
-stopped there: RRT-Connect takes 18 ms of 2 s, and less than half of its motions are in time.
+are tried in the order of (duration of a bang-bang motion) / (available time). If the planner is
+`patient`, the search continues after a motion that arrives too late. The paper's planners must have
+stopped at such a motion: the paper reports 18 ms for RRT-Connect, of 2 s that it may use, although
+less than half of its motions are in time.
 """
 
 import abc
@@ -32,20 +33,20 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.plan import BlockPlan, explain_status
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-Clock = Callable[[], float]  # returns the remaining seconds
+Clock = Callable[[], float]  # returns the remaining search time [s]
 
 
 @dataclasses.dataclass(frozen=True)
 class Goal:
-    """An end pose to plan a motion to."""
+    """An end pose of the arm to which a motion is planned."""
 
-    angles: np.ndarray  # (6,) [rad]
-    available: float  # [s], from the delay until the ball arrives
+    angles: np.ndarray  # (6,) [rad], joint angles of the end pose
+    available: float  # [s], time from the delay until the ball arrives at the shield
 
 
 @dataclasses.dataclass(frozen=True)
 class HostMotion:
-    """A motion of the joints that starts at the delay, with at most the pieces of its planner."""
+    """A joint motion with NumPy arrays; it starts when the case's delay has passed."""
 
     coeffs: np.ndarray  # (M, D + 1, 6) [rad/s^k]
     durations: np.ndarray  # (M,) [s]
@@ -56,16 +57,16 @@ class HostMotion:
 class PoseByPose(Planner, abc.ABC):
     """Base of planners that try end poses; the cost of a plan is the duration of its motion [s].
 
-    A plan's `violation` is (duration / available time) - 1, infinite if no motion was found;
-    `iterations` is the number of tried poses. Motions start at rest: an arm that moves at the start
-    gets no motion.
+    A plan's `violation` is (duration / available time) - 1, infinite if no motion was found. The
+    plan's `iterations` is the number of tried poses. These planners plan from standstill only: a
+    case whose arm moves at the start gets no motion.
     """
 
     case_type: ClassVar[type] = BlockCase
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     pieces: ClassVar[int]
     degree: ClassVar[int]
-    points: int = 12  # points of the ball's trajectory with end poses
+    points: int = 12  # number of points of the ball's trajectory, each with eight end poses
     budget: float = 2.0  # [s], search time of each case, as in the paper
     longest: float = 0.25  # [s], search time of one pose; doubled after each pass over all poses
     patient: bool = True  # whether the search continues after a motion that arrives too late
@@ -80,7 +81,7 @@ class PoseByPose(Planner, abc.ABC):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return a collision-free motion to one end pose, or None if time runs out."""
+        """Return a collision-free motion to one end pose, or None if none is found in time."""
 
     def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plans of a batch, one case after another."""
@@ -88,7 +89,7 @@ class PoseByPose(Planner, abc.ABC):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case with NumPy leaves."""
+        """Return the plan of one case with NumPy leaves: the motion that is least late."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -122,7 +123,7 @@ class PoseByPose(Planner, abc.ABC):
         contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """Return the plan of a motion to a contact [s]; without a motion, a plan to stay."""
+        """Return a motion that meets the ball at `contact` [s], or standstill, as a plan."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))
@@ -150,14 +151,14 @@ class PoseByPose(Planner, abc.ABC):
 
 @functools.partial(jax.jit, static_argnames="points")
 def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
-    """Return the status if no plan can exist, and the end poses.
+    """Return the end poses of a case, and the reason if no plan can exist.
 
     Returns:
-        status: () int32, NO_PATH unless the case itself excludes a plan.
-        angles: (C, 6) [rad].
-        contact: (C,) [s].
-        share: (C,), (duration of a bang-bang motion) / (available time); infinite if it is too
-            late.
+        status: () int32, NO_PATH if a plan is possible, else the reason why none exists.
+        angles: (C, 6) [rad], joint angles of the end poses.
+        contact: (C,) [s], when the ball arrives at each pose.
+        share: (C,), (duration of a bang-bang motion) / (available time); infinite if the motion is
+            too late.
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
@@ -167,9 +168,9 @@ def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Arra
 
 @dataclasses.dataclass(frozen=True)
 class PathThenTime(PoseByPose):
-    """A planner that finds a path of the joints, which TOPP-RA then times.
+    """A planner that searches a path of the joints, and then times the path by TOPP-RA.
 
-    Its constructor raises `MissingExtra` unless its packages are installed.
+    The constructor raises `MissingExtra` unless the packages that the planner needs are installed.
     """
 
     pieces: ClassVar[int] = PIECES
@@ -190,10 +191,10 @@ class PathThenTime(PoseByPose):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the timed path; a motion of zero duration if the arm is at the goal already.
+        """Return the timed path, or None; a motion of 0 s if the arm already is at the goal.
 
-        The spline through a path's points may leave the path. If it then collides, midpoints are
-        inserted between the points, so that it follows the path more closely.
+        The spline through the path's points deviates from the path and may collide. In this case
+        midpoints are inserted between the points, so that the spline follows the path more closely.
         """
         points = self.path_to(case, free, goal, left)
         if points is not None:

@@ -1,7 +1,8 @@
-"""The baseline `rrt-connect` of [Natarajan2024]: RRT-Connect by OMPL, timed by TOPP-RA; one thread.
+"""The baseline `rrt-connect` of [Natarajan2024]: RRT-Connect by OMPL, timed by TOPP-RA.
 
-The method of [Kuffner2000]. Two trees grow from start and goal by edges of up to `reach`, the
-length in the code behind the paper. Each edge is checked in one batch.
+RRT-Connect [Kuffner2000] grows two trees, from start and goal, by edges of at most `reach`, the
+value in the code that the paper's authors published. The search uses one thread and checks the
+samples of an edge as one batch.
 """
 
 import dataclasses
@@ -17,7 +18,7 @@ from planner_jax.baselines.block.path_timing import import_extra
 from planner_jax.baselines.block.pose_by_pose import Clock, Goal, PathThenTime
 from planner_jax.task.block.case import BlockCase
 
-_SEED = 1  # of OMPL's random numbers: one sequence per process
+_SEED = 1  # seed of OMPL's random generator, set once per process
 
 
 @functools.cache
@@ -31,16 +32,16 @@ def _ompl() -> tuple[ModuleType, ModuleType]:
 
 @dataclasses.dataclass(frozen=True)
 class RrtConnectBlock(PathThenTime):
-    """A planner that tries end poses one after another; it needs the extra `arm-peers`."""
+    """The planner `rrt-connect`, which tries end poses one by one; needs the extra `arm-peers`."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
-    reach: float = 1.0  # [rad], longest edge
+    reach: float = 1.0  # [rad], greatest length of a tree's edge in joint space
     shortcuts: bool = True  # whether a path is shortened before it is timed
 
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a collision-free path, or None."""
+        """Return points (N, 6) [rad] of a collision-free path to the goal, or None without one."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)
@@ -77,16 +78,16 @@ class RrtConnectBlock(PathThenTime):
 
 
 def _numbers(state: Sequence[float]) -> np.ndarray:
-    """Return the angles (6,) of an OMPL state."""
+    """Return the six joint angles [rad] of an OMPL state as an array."""
     return np.array([state[k] for k in range(6)])
 
 
 def _validator(base: ModuleType, information: object, free: FreeSpace) -> object:
-    """Create the object by which OMPL checks whether an edge is free."""
+    """Create the object that OMPL calls to check whether a straight edge is collision-free."""
 
     class Edges(base.MotionValidator):
         def checkMotion(self, begin: Sequence[float], end: Sequence[float]) -> bool:  # noqa: N802
-            """Return whether an edge is free; OMPL prescribes the name."""
+            """Return whether an edge is collision-free; OMPL prescribes the method's name."""
             return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
 
     return Edges(information)

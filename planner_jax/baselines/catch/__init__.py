@@ -1,1 +1,1 @@
-"""Published methods for catches."""
+"""Published methods for catches: a quadrotor catches thrown balls with a net."""

@@ -1,4 +1,4 @@
-"""The `mpp` baseline: sampled primitives to catches at a predetermined height."""
+"""The baseline `mpp`: sampled minimum-jerk primitives to catches at a predetermined height."""
 
 import dataclasses
 from typing import ClassVar
@@ -34,24 +34,25 @@ from planner_jax.trajectory.polynomial import (
     total_duration,
 )
 
-_BISECTIONS = 30
-_SHORTEST = 1e-2  # [s], of a segment
+_BISECTIONS = 30  # number of bisection steps for the time of a fall
+_SHORTEST = 1e-2  # [s], least duration of a segment, which leads from one catch to the next
 _SLOWEST = 1e-3  # [m/s], least speed of a target whose velocity defines the net's axis
 
 
 @struct.dataclass
 class Candidates:
-    """The K candidate primitives of one segment."""
+    """K candidate primitives of one segment, which leads from one catch to the next."""
 
     trajectory: PiecewisePolynomial  # leaves (K, 2, ...)
-    cost: Array  # (K,) mean squared jerk [m^2/s^6]
+    cost: Array  # (K,) [m^2/s^6], mean squared jerk
 
 
 def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Array, Array]:
     """Return the time () [s] at which a target first falls through a height, and whether it does.
 
-    The first of `nodes` equal intervals of the horizon that starts above and ends below the height
-    is bisected. The time is the horizon if there is none.
+    The horizon is divided into `nodes` equal intervals. The first interval in which the target
+    starts above and ends below the height is bisected. Without such an interval the time is the
+    horizon.
     """
 
     def above(time: Array) -> Array:
@@ -80,21 +81,27 @@ class MppCatch(Planner):
 
     Its parts come from these sources:
 
-    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of [Mueller2015] to a catch
-      whose height is fixed by hand, below 2 m, so that the target's fall gives time and position.
-      Velocity and acceleration at the catch are sampled, and the primitive of least mean squared
-      jerk is selected. Limits are checked only afterwards.
-    - Eq. 22: the net's centre is at the target. Eq. 25: the paper checks the end state of this
-      planner alone, so that every sampled acceleration turns the net towards the target.
-    - Assumed, since the paper does not say: the height, 1.2 m, about the height of the net in the
-      initial hover; the grids; the ramp of `minimum_jerk_after_ramp`, without which the body rate
-      would jump at time 0 and after every catch; several targets in the case's order, each where it
-      first falls through the height, with each segment selected by its own cost.
+    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of [Mueller2015] leads to a
+      catch whose height is fixed by hand, below 2 m. The target's fall through this height gives
+      time and position. Velocity and acceleration at the catch are sampled, and the primitive of
+      least mean squared jerk is selected. Limits are checked only afterwards.
+    - [Yu2023catch, eq. 22]: the net's centre is at the target.
+    - [Yu2023catch, eq. 25]: the net must face the target. For this planner the paper checks only
+      the end state, so that every sampled acceleration turns the net towards the target.
+    - Assumptions, since the paper does not say: the grids of samples; the height of 1.2 m, about
+      the height of the net in the initial hover; the ramp of `minimum_jerk_after_ramp`, without
+      which the body rate would jump at time 0 and after every catch. Several targets are caught in
+      the case's order, each where it first falls through the height. The primitive of each segment
+      is selected by its own cost.
 
-    With the limits of `pj.catch.case` the planner succeeds on four of five `throws` and two of five
-    `hard` cases. It succeeds on more at lower heights (0.8 m: 99 % and 51 %) and on fewer at
-    greater heights (1.9 m: 68 % and 27 %); the broken limit is the body rate. In the paper it plans
-    14 % of the throws, within limits and at a height that the paper does not report.
+    The success rates depend on the height. Cases are drawn with the limits of `pj.catch.case`:
+
+        height [m]     0.8    1.2    1.9
+        throws [%]      99   ~ 80     68
+        hard [%]        51   ~ 40     27
+
+    Failures exceed the body rate limit. In the paper this planner plans 14 % of the throws, within
+    limits and at a height that the paper does not report.
 
     If a target does not fall through the height before its horizon, or not after the previous
     target, the case stays unsolved, since this planner has no other catching time.
@@ -104,7 +111,7 @@ class MppCatch(Planner):
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = CatchCase
-    height: float = 1.2  # [m], of the targets at the catches
+    height: float = 1.2  # [m], height of the targets at the catches
     speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)  # [m/s], sampled on each axis at a catch
     thrusts: tuple[float, ...] = (0.5, 1.0, 1.5)  # sampled at a catch, in units of gravity
     ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
@@ -118,9 +125,10 @@ class MppCatch(Planner):
             raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 
     def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
-        """Return the cheapest primitives one after another, without free variables.
+        """Return the plan of the cheapest primitives, selected one segment after another.
 
-        Their cost is the mean squared jerk of the whole trajectory.
+        The planner optimises nothing. The plan's cost is the mean squared jerk of the whole
+        trajectory.
         """
         context = order_targets(case)
         times, missed = self.times(context)
@@ -132,7 +140,7 @@ class MppCatch(Planner):
             best = take(tried.trajectory, jnp.argmin(tried.cost))
             return _end_state(best), best
 
-        # Leaves (N, 2, ...): two pieces to each catch.
+        # Leaves have shape (N, 2, ...): two polynomial pieces lead to each of the N catches.
         _, joined = lax.scan(fly, case.head_state, (balls, durations))
         durations_flown = jnp.where(context.active[:, None], joined.durations, 0.0)
         last = jnp.maximum(jnp.sum(context.active) - 1, 0)
@@ -158,7 +166,7 @@ class MppCatch(Planner):
     def times(self, context: CatchContext) -> tuple[Array, Array]:
         """Return increasing catching times (N,) [s] and their excess (N,), <= 0 if they are valid.
 
-        Absent targets come last and have the time of the last catch.
+        Targets that are absent from the case come last and have the time of the last catch.
         """
         height = jnp.asarray(self.height, context.horizon.dtype)
         find = lambda target, end: falling_time(target, height, end, self.time_nodes)  # noqa: E731
@@ -173,10 +181,10 @@ class MppCatch(Planner):
     def candidates(
         self, head_state: Array, ball: BallState, duration: Array, case: CatchCase
     ) -> Candidates:
-        """Return the candidate primitives of one segment.
+        """Return the candidate primitives of the segment that ends with the catch of `ball`.
 
-        The segment starts at `head_state` (4, 3), position to jerk, and lasts `duration` () [s]
-        until it catches the ball.
+        The segment starts at `head_state` (4, 3), which has position, velocity, acceleration and
+        jerk, and lasts `duration` () [s].
         """
         ends = self.end_states(ball, case)
         tried = jax.vmap(minimum_jerk_after_ramp, in_axes=(None, 0, None, None))(
@@ -186,9 +194,9 @@ class MppCatch(Planner):
         return Candidates(trajectory=tried, cost=cost)
 
     def end_states(self, ball: BallState, case: CatchCase) -> Array:
-        """Return the sampled states (K, 3, 3), position to acceleration, at a catch.
+        """Return K sampled states at a catch, (K, 3, 3): position, velocity and acceleration.
 
-        The thrust points against the target's velocity, or upwards if the target is at rest. The
+        The thrust points against the target's velocity, or upwards if the target stands still. The
         net's centre is at the target.
         """
         dtype = ball.pos.dtype
@@ -203,7 +211,7 @@ class MppCatch(Planner):
         return jnp.stack([pos, jnp.stack([vx, vy, vz], axis=1), acc], axis=1)
 
     def _excess(self, segment: PiecewisePolynomial, case: CatchCase) -> Array:
-        """Return the largest excess of one segment, (); relative, but in metres for the ground."""
+        """Return the largest relative excess over a limit in a segment, (); [m] for the ground."""
         limits = case.limits
         motion = sample_pieces(segment, self.nodes)
         weak, strong = thrust_excess(motion.acc, case.gravity, *limits.thrust_bounds)
@@ -217,6 +225,6 @@ class MppCatch(Planner):
 
 
 def _end_state(segment: PiecewisePolynomial) -> Array:
-    """Return position to jerk (4, 3) at the end of a trajectory."""
+    """Return position, velocity, acceleration and jerk (4, 3) at the end of a trajectory."""
     end = total_duration(segment)
     return jnp.stack([evaluate(segment, end, order) for order in range(4)])

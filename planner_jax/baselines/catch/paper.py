@@ -1,4 +1,4 @@
-"""The `catch` planner of [Yu2023catch]: contact and attitude as penalties (its eqs 18-28)."""
+"""The baseline `catch`: the planner of [Yu2023catch], with penalties on contact and attitude."""
 
 import dataclasses
 
@@ -37,9 +37,10 @@ from planner_jax.trajectory.proportional_minco import (
     trajectory_energy,
 )
 
-_ORDER = 4  # minimum snap
-# Units of the offsets, and of the variables of a catch, log duration to jerk. They are tuned on the
-# cost gap of generated throws, since with stiff hinges the Hessian varies strongly between points.
+_ORDER = 4  # derivative whose square is minimised: snap
+# Units of the optimiser's variables: of the offsets, and of each catch's variables from the
+# logarithm of the duration to the jerk. They are tuned on the cost gap of drawn throws, since with
+# stiff hinges the Hessian varies strongly from point to point.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT = {
@@ -48,13 +49,14 @@ _PATIENT = {
     "tolerance": 1e-8,
     "patience": 10,
 }
-COST_UNIT = 1e3  # scales the Hessian to moderate entries
+COST_UNIT = 1e3  # divisor of the cost, so that the Hessian has moderate entries
 
 
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
-    """Return the excess of samples over speed, body rate, thrust and ground limits (eqs 26-28).
+    """Return by how much samples exceed speed, body rate, thrust and ground limits (eqs 26-28).
 
-    Squares are in their own units. `given` is a case's gravity and limits.
+    Each excess is a difference of squares in SI units, for the ground a height difference [m].
+    `given` is gravity and limits of a case.
     """
     gravity, limits = given
     return (
@@ -66,10 +68,10 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
 
 
 def steep_hinge(x: Array, width: float | Array) -> Array:
-    """Return L_eps(x) for eps = width: cubic up to eps, then far steeper [Yu2023catch, eq. 23].
+    """Return the penalty L_eps(x) for eps = width [Yu2023catch, eq. 23].
 
-    Above eps it is eps^3 + (x - eps)^2 x / eps^4, as printed. The value is continuous at eps, but
-    the slope drops from 3 eps^2 to 0.
+    L_eps is x^3 from 0 to eps. Above eps it is eps^3 + (x - eps)^2 x / eps^4, as printed, which
+    rises far more steeply. The value is continuous at eps, but the slope drops from 3 eps^2 to 0.
     """
     inside = jnp.clip(x, 0.0, width)
     beyond = jnp.maximum(x - width, 0.0)
@@ -79,8 +81,8 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
 def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
     """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f of accelerations (..., 3).
 
-    The code of [Yu2023catch] has this form. The thrust limits are per unit mass [m/s^2]; their
-    middle and half width are `middle` and `half`.
+    The published code of [Yu2023catch] has this form. `least` and `most` are the thrust limits per
+    unit mass [m/s^2]; `middle` is their mean and `half` is half of their difference.
     """
     x, y, z = components(acc)
     z = z + gravity
@@ -93,42 +95,42 @@ def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) ->
 class Catch:
     """The N catches that a point of the search space describes."""
 
-    times: Array  # (N,) [s]
-    durations: Array  # (N,) [s], of the segments
-    tail_states: Array  # (N, 4, 3) of the quadrotor
-    miss: Array  # (N,) [m], from the net's centre to the ball
-    angle_excess: Array  # (N,) cos(theta_safe) + z_d . v / |v|; <= 0 is good
+    times: Array  # (N,) [s], when the balls are caught
+    durations: Array  # (N,) [s], durations of the segments that end with a catch
+    tail_states: Array  # (N, 4, 3), position to jerk of the quadrotor at the catches
+    miss: Array  # (N,) [m], distance from the net's centre to the ball
+    angle_excess: Array  # (N,), cos(theta_safe) + z_d . v / |v|; <= 0 if the net faces the ball
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PaperCatch(OptimisedPlanner):
-    """The joint optimisation of catching time and state of [Yu2023catch].
+    """The planner of [Yu2023catch], which optimises catching times and states together.
 
-    Cost (eqs 18-28): integral |snap|^2 + rho T + the smoothed penalties of speed, body rate, thrust
-    and ground by the trapezoid rule + the penalties of the net's distance (eqs 22-24) and angle
-    (eq. 25). The paper reports neither weights nor thresholds; they come from the published C++
-    protocol, with squares in their own units. All pieces of a segment have the same duration, and
-    the jerk at the last catch is zero.
+    The cost (eqs 18-28) is a sum: the integral of |snap|^2; rho T; smoothed penalties of speed,
+    body rate, thrust and ground, integrated by the trapezoid rule; and penalties of the net's
+    distance (eqs 22-24) and angle (eq. 25). The paper reports neither weights nor thresholds. They
+    come from the authors' published C++ code, with squared quantities in SI units. All pieces of a
+    segment have the same duration, and the jerk at the last catch is zero.
 
     The variables are a change of coordinates of the paper's variables, so that the optima are the
-    same: waypoints are whitened offsets, and the position at the catch is the net's offset from the
-    ball. N segments have 3 (M - 1) + 13 decision variables each: offsets, log duration, miss,
-    velocity, acceleration and jerk (unused at the last catch).
+    same. Waypoints are whitened offsets from the smoothest trajectory, and the position at a catch
+    is the net's offset from the ball. Each of N segments has 3 (M - 1) + 13 variables: waypoint
+    offsets, log duration, miss, velocity, acceleration and jerk (unused at the last catch).
 
     This planner ignores a case's extras; the referee checks them.
     """
 
     case_type = CatchCase
-    num_pieces: int = 4  # M, of one segment
-    nodes: int = 16  # penalty intervals per piece
-    time_weight: float = 1000.0  # rho
+    num_pieces: int = 4  # M, number of pieces of one segment
+    nodes: int = 16  # number of intervals per piece in which penalties are integrated
+    time_weight: float = 1000.0  # rho, weight of the duration
     limit_weight: float = 1e5
     ground_weight: float = 1e7
     miss_weight: float = 1e4
     angle_weight: float = 1e2
-    hinge_width: float = 0.01  # mu, and eps of the angle
-    # The hinges are stiff, so that their weights increase in stages.
+    hinge_width: float = 0.01  # width mu of the limits' hinges and eps of the angle's hinge
+    # The penalty weights increase in stages, since the final penalties are too stiff to start with.
     rounds: tuple[Round, ...] = (
         Round(
             starts=1,
@@ -145,7 +147,7 @@ class PaperCatch(OptimisedPlanner):
             ),
         ),
     )
-    scale: tuple[float, ...] = ()  # units of one segment's variables; () for the tuned ones
+    scale: tuple[float, ...] = ()  # units of one segment's variables; () selects tuned units
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -155,20 +157,20 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices from boundary states and offsets to one segment."""
+        """The constant matrices that map boundary states and offsets to one segment."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
-        """The number of waypoint variables of a segment."""
+        """The number of waypoint variables of one segment."""
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """Order the targets by their catches."""
+        """Sort the case's targets by the order in which they are caught."""
         return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
-        """Return minimum-jerk primitives between standstills below every ball, (1, n)."""
+        """Return the initial guess (1, n): primitives from standstill to standstill below balls."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
@@ -226,7 +228,7 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Return segments and catches at a point."""
+        """Return the segments and the catches that a point of the search space describes."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale
         catch = self.catches(natural[:, self.num_offsets :], context)
@@ -236,7 +238,7 @@ class PaperCatch(OptimisedPlanner):
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
-        """Return the cost of energy, catches and time, ()."""
+        """Return the cost of energy, catches and total time, (); without the limits' penalties."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
@@ -246,7 +248,7 @@ class PaperCatch(OptimisedPlanner):
         return rest + self.time_weight * catch.times[-1]
 
     def _along(self) -> Along:
-        """Return the penalties on limits along the trajectory."""
+        """Return the settings that integrate the limits' penalties along the trajectory."""
         return Along(
             maps=self.maps,
             nodes=self.nodes,
@@ -257,9 +259,10 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def objective(self, point: Array, context: CatchContext) -> Evaluation:
-        """Return the paper's cost divided by 1000.
+        """Return the paper's cost divided by `COST_UNIT`.
 
-        The violation is zero, so that the solver returns its last iterate.
+        The reported violation is always zero, so that the solver does not prefer iterates that keep
+        the limits, and returns its last iterate.
         """
         chain, catch = self._unpack(point, context)
         given = (context.case.gravity, context.case.limits)
@@ -269,11 +272,11 @@ class PaperCatch(OptimisedPlanner):
         return Evaluation(cost=cost / COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: CatchContext) -> Array:
-        """Return whether a target is never within reach."""
+        """Return whether some target never comes within the quadrotor's reach, () bool."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """Return the plan at a point; its violation is evaluated at the protocol's samples."""
+        """Return the plan at a point; its violation is evaluated at `nodes` samples per piece."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
         motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(

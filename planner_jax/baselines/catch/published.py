@@ -1,4 +1,4 @@
-"""Comparison of runs of catches with the rates of [Yu2023catch, Tables I and III]."""
+"""Comparison of a run's success rates on catches with [Yu2023catch, Tables I and III]."""
 
 from typing import NamedTuple
 
@@ -8,9 +8,10 @@ from planner_jax.task.catch.spec import SUITES
 
 
 class PublishedRates(NamedTuple):
-    """Results of the paper: 50 real throws for `throws`, otherwise 1,000 simulated cases.
+    """Published results: 50 real throws for `throws`, 1,000 simulated cases for other suites.
 
-    The paper gives no ranges, so its cases are similar, not the same.
+    The paper does not publish the ranges of its cases, so that they are similar to this library's
+    cases, but not equal.
     """
 
     success: float | None = None  # [%], of the planner
@@ -33,7 +34,7 @@ SOURCE = (
 
 
 def make_table(manifest: Entries) -> RateTable:
-    """Return success and optimal time ratio of a run beside the paper's, a row a suite."""
+    """Return success and optimal time ratio of a run beside the paper's, one row per suite."""
     summary, settings = manifest["summary"], manifest["parameters"]
     planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
     header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]

@@ -1,1 +1,1 @@
-"""Published methods for hits."""
+"""Published methods for hits: a quadrotor with a racket returns a served ball."""

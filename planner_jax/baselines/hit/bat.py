@@ -1,4 +1,7 @@
-"""The baselines `bat` and `bat-lite`: the planner of [Yu2023bat] with and without transition."""
+"""The baselines `bat` and `bat-lite`: the planner of [Yu2023bat] with and without transition.
+
+The transition is a state before the hit at which the quadrotor starts its swing.
+"""
 
 import dataclasses
 import math
@@ -32,12 +35,12 @@ from planner_jax.trajectory.proportional_minco import (
     trajectory_energy,
 )
 
-_ORDER = 4  # minimum snap
-_COST_UNIT = 1e4  # scales the Hessian to moderate entries
-_DECODE_NODES = 24
+_ORDER = 4  # derivative whose square is minimised: snap
+_COST_UNIT = 1e4  # divisor of the cost, so that the Hessian has moderate entries
+_DECODE_NODES = 24  # number of samples per piece at which the plan's violation is evaluated
 
-# [Yu2023bat, Section VI-A]. The paper lists phi but does not define it; here it is the fraction at
-# which s_mid divides the segment from s_0 to s_t.
+# Constants of [Yu2023bat, Section VI-A]. The paper lists phi but does not define it; here it is the
+# fraction at which s_mid divides the segment from s_0 to s_t.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
 _SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # varpi, (velocity at transition) / (velocity at hit)
 _ACCELERATION_SHARE = 2.0 / 3.0  # (acceleration at transition) / (acceleration at hit)
@@ -48,9 +51,9 @@ _LEAST_RISE = 0.1  # [m/s], least vertical speed for extrapolation to the ground
 def serve_origin(case: HitCase) -> Array:
     """Return where the ball's flight, traced backwards, leaves the ground: s_0, (3,) [m].
 
-    The mirrored ball flies forward against drag of the opposite sign, for the drag-free flight
-    time; the remaining height is covered on a straight line. If drag of the opposite sign makes the
-    flight diverge, the drag-free flight is used.
+    A ball with the opposite velocity flies forward against drag of the opposite sign, for the
+    flight time without drag. A straight line covers the height that then remains. If drag of the
+    opposite sign makes the flight diverge, the flight without drag is used.
     """
     mirrored = BallState(pos=case.ball.pos, vel=-case.ball.vel)
     floor = jnp.zeros_like(case.gravity)
@@ -65,11 +68,11 @@ def serve_origin(case: HitCase) -> Array:
 
 
 def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> Array:
-    """Return p_t of [Yu2023bat, Section IV-A], where the quadrotor starts the swing.
+    """Return p_t of [Yu2023bat, Section IV-A], the point where the quadrotor starts the swing.
 
-    The ray of Fig. 4 is read as the ray from s_mid through p_h, along which the racket swings.
-    p_alpha lies halfway between p_0 and p_h, and p_perp is its projection onto the ray. p_t divides
-    the segment from p_perp to p_alpha at the fraction eta.
+    The paper's ray of Fig. 4 is taken as the ray from s_mid through p_h, along which the racket
+    swings. p_alpha lies halfway between p_0 and p_h, and p_perp is the projection of p_alpha onto
+    the ray. p_t divides the segment from p_perp to p_alpha at the fraction eta.
 
     Args:
         start: (3,) p_0 [m].
@@ -88,8 +91,8 @@ def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> 
     return foot + _ETA * (halfway - foot)
 
 
-# Units of a waypoint coordinate [m], log T, a racket speed [m/s], a thrust [m/s^2], chosen by hand
-# so that steps of one unit have a sensible size.
+# Units of the variables: waypoint coordinate [m], log T, racket speed [m/s], thrust [m/s^2]. They
+# are chosen by hand so that a step of one unit is of moderate size in every variable.
 _UNITS = (0.1, 0.05, 0.3, 0.5)
 
 
@@ -98,60 +101,59 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 class BatHit(OptimisedPlanner):
     """The planner of [Yu2023bat]; with `transition=False` its "Bat-Lite".
 
-    The decision variables, n = 3 (M - 1) + 5, in units of `scale`, are the waypoints' positions
-    [m], log T, p_y_dot, p_z_dot, tau_x and tau_z. These parts follow the paper without changes:
+    The n = 3 (M - 1) + 5 decision variables, in units of `scale`, are the waypoints' positions [m],
+    log T, p_y_dot, p_z_dot, tau_x and tau_z. These parts follow the paper without changes:
 
-    - eqs 11-14, which derive the complete state at the impact (`solve_decoupled_hit`);
-    - Section IV-A, the transition point, and Section IV-C, a minimum-jerk primitive to it and
-      another one from it (eqs 15-17): together they form the initial guess, with the values of
-      Section VI-A;
-    - eq. 19, MINCO with s = 4 and equal times; eqs 18a, 20-22 and 24a, a weighted sum of the
-      squared snap, T and the penalties L_mu of its ref. [10]; L-BFGS from one start, whose last
-      iterate is returned even if it breaks limits.
+    - Eqs 11-14 derive the complete state at the impact (`solve_decoupled_hit`).
+    - The initial guess has the values of Section VI-A. It consists of two minimum-jerk primitives
+      (eqs 15-17, Section IV-C), to the transition point of Section IV-A and from there to the hit.
+    - The trajectory is MINCO with s = 4 and equal times (eq. 19). The cost is a weighted sum of the
+      squared snap, T and the penalties L_mu of the paper's ref. [10] (eqs 18a, 20-22 and 24a).
+    - L-BFGS runs from one start. Its last iterate is returned even if this iterate breaks limits.
 
     Two misprints are corrected: eq. 18a has D_max^2, and eq. 22 has the velocity's z. The ground
     term of eq. 18a is z_min - z, because the difference of squares changes its sign below the
     ground.
 
-    The paper leaves some choices open; here they are:
+    The paper leaves some choices open. This planner makes these choices:
 
     - The transition acts only on the initial guess. Eq. 18e leaves the transition state free, and
-      the least-snap trajectory through free waypoints is MINCO's joined trajectory.
-    - `transition_point` reads the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
+      the least-snap trajectory through free waypoints is the trajectory of MINCO.
+    - `transition_point` interprets the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
     - The jerk at the impact is zero.
-    - Bat-Lite's front end is one primitive straight to the impact (ref. [11]), with the time T_0.
-    - Weights, mu, M, kappa, units and the stopping rule are usual values of MINCO planners, with M
-      = 4.
+    - Bat-Lite's initial guess is one primitive straight to the impact (ref. [11]), with time T_0.
+    - Weights, mu, M = 4, kappa, units and the stopping rule are usual values of MINCO planners.
 
-    `max_steps` is fitted: with 80 iterations both planners are within two points of the mean
-    success of the published trials, 85.4 and 46.6 %, though hardly on the same serves. The number
-    of iterations decides the success almost alone. Success on 1,800 published serves by iterations,
-    in %:
+    `max_steps` is fitted to the mean success rates of the published trials, 85.4 % for `bat` and
+    46.6 % for `bat-lite`. With 80 iterations both planners are within two points of these rates,
+    though they hardly succeed on the same serves as the published planners. The number of
+    iterations decides the success almost alone. Success on 1,800 published serves, in %:
 
         iterations                 0   20   40   60   80  100  150  200  300
         bat                        0   45   58   77   85   92   94   94   94
         bat-lite                   0    8    5   23   48   63   79   82   82
         bat-lite from T_0 + T_1   24   53   72   85   91   94   94   94   94
 
-    The main benefit of the two-stage guess is therefore an initial impact time closer to the
-    optimum. A solver that runs to convergence needs this benefit less than the published one.
+    In the last row Bat-Lite starts with the longer impact time of `bat`. The main benefit of the
+    guess in two stages is therefore an initial impact time closer to the optimum. A solver that
+    runs to convergence needs this benefit less than the published solver.
 
     This planner ignores a case's extras; the referee checks them.
     """
 
     case_type = HitCase
     transition: bool = True
-    num_pieces: int = 4  # M
-    nodes: int = 16  # kappa, penalty intervals per piece
-    num_table_nodes: int = 48
-    time_weight: float = 1e3  # rho
+    num_pieces: int = 4  # M, number of polynomial pieces
+    nodes: int = 16  # kappa, number of intervals per piece in which penalties are integrated
+    num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
+    time_weight: float = 1e3  # rho, weight of the impact time T
     limit_weight: float = 1e5  # W_D and W_c: speed, acceleration, body rate, ground
-    terminal_weight: float = 1e4  # W_r and W_t: apex, hitting speed; also the defect of eqs 13-14
+    terminal_weight: float = 1e4  # W_r and W_t: apex, hitting speed, and the defect of eqs 13-14
     hinge_width: float = 0.01  # mu, in the unit of each constraint
     stage_times: tuple[float, float] = (0.7, 0.5)  # T_0, T_1 [s]; without transition only T_0
-    first_angle: float = math.radians(60.0)  # elevation of the returned ball
-    first_thrust_z: float = 1.1  # tau_z over gravity
-    first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s]
+    first_angle: float = math.radians(60.0)  # [rad], elevation of the returned ball in the guess
+    first_thrust_z: float = 1.1  # tau_z of the guess, divided by gravity
+    first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s], in the guess
     rounds: tuple[Round, ...] = (
         Round(
             starts=1,
@@ -174,22 +176,22 @@ class BatHit(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices from boundary states and offsets to the trajectory."""
+        """The constant matrices that map boundary states and offsets to the trajectory."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
-        """The number of waypoint variables."""
+        """The number of waypoint variables, three for each inner waypoint."""
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """Tabulate the incoming ball; see `prepare_hit`."""
+        """Tabulate the incoming ball's trajectory of a case by `prepare_hit`."""
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """Return the impact of the last five variables, and the defect of eqs 13-14.
+        """Return the impact that the last five variables describe, and the defect of eqs 13-14.
 
-        They are log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
+        The variables are log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
         """
         case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)
@@ -202,11 +204,11 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """Return the initial values of Section VI-A with waypoints on the primitives, (1, n)."""
+        """Return the initial guess (1, n): values of Section VI-A, waypoints on the primitives."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
-        # A ball that lands sooner, because planning starts late, is hit before it lands.
+        # If planning starts late, the ball may land before that time; it is hit before it lands.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
@@ -219,7 +221,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Return positions on the minimum-jerk primitives at equal times, (M - 1, 3) [m]."""
+        """Sample the minimum-jerk primitives at M - 1 equally spaced times, (M - 1, 3) [m]."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
@@ -235,9 +237,10 @@ class BatHit(OptimisedPlanner):
     def transition_state(self, impact: Impact, case: HitCase) -> Array:
         """Return position, velocity and acceleration at the transition, (3, 3).
 
-        The acceleration is 2/3 of the acceleration at the hit. The thrust then has the paper's
-        vertical part g + 2 (tau_z - g) / 3. Only Fig. 4b defines the direction e_tau; here it
-        follows from that acceleration and lies between vertical and the direction at the hit.
+        The acceleration is 2/3 of the acceleration at the hit, so that the thrust has the paper's
+        vertical part g + 2 (tau_z - g) / 3. The thrust's direction e_tau is defined only by the
+        paper's Fig. 4b. Here it follows from the acceleration, and lies between the vertical and
+        the thrust's direction at the hit.
         """
         hit = impact.tail_state
         pos = transition_point(case.head_state[0], hit[0], serve_origin(case), case.target)
@@ -282,9 +285,10 @@ class BatHit(OptimisedPlanner):
         return self.limit_weight * duration * jnp.sum(hinges * weights)
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
-        """Return the cost of eq. 20.
+        """Return the cost of eq. 20, divided by `_COST_UNIT`.
 
-        The violation is zero, so that the solver returns its last iterate.
+        The reported violation is always zero, so that the solver does not prefer iterates that keep
+        the limits, and returns its last iterate.
         """
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])
@@ -298,7 +302,7 @@ class BatHit(OptimisedPlanner):
         return Evaluation(cost=cost / _COST_UNIT, violation=jnp.zeros_like(cost))
 
     def rules_out(self, context: HitContext) -> Array:
-        """Return whether the ball is never within reach."""
+        """Return whether the ball never comes within the quadrotor's reach, () bool."""
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
@@ -316,5 +320,5 @@ class BatHit(OptimisedPlanner):
 
 
 def bat_lite(**options: Any) -> BatHit:
-    """Create a `BatHit` without the transition point; options are its fields."""
+    """Create the baseline `bat-lite`, a `BatHit` without transition; `options` are its fields."""
     return BatHit(transition=False, **options)

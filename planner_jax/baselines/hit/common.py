@@ -1,4 +1,4 @@
-"""Shared parts of the baselines of [Yu2023bat]: the stroke, and the largest violation of a plan."""
+"""Shared parts of the baselines of [Yu2023bat]: the impact, and the largest excess over a limit."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -30,13 +30,13 @@ def make_impact(
     """Return the impact of a ball on a quadrotor whose racket faces along its thrust.
 
     Args:
-        time: () [s], of the impact.
-        flight_time: () [s], from the impact to the landing.
-        ball: just before the impact.
-        after: (3,) [m/s], velocity of the ball just after it.
+        time: () [s], time of the impact.
+        flight_time: () [s], duration of the ball's flight from the impact to the landing.
+        ball: state of the ball just before the impact.
+        after: (3,) [m/s], velocity of the ball just after the impact.
         racket_vel: (3,) [m/s], velocity of the quadrotor.
-        thrust: (3,) [m/s^2], per unit mass; not zero.
-        case: for racket height and gravity.
+        thrust: (3,) [m/s^2], thrust per unit mass; not zero.
+        case: the case, for the height of the racket and gravity.
 
     Returns:
         The impact, with the racket's centre at the ball and no jerk of the quadrotor.
@@ -66,9 +66,9 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
     """Return the largest excess over any limit, (); relative, but in metres for the ground.
 
     Args:
-        along: (4, N) from `motion_excess`.
-        impact: with the apex and the hitting speeds.
-        case: for the limits.
+        along: (4, N) excess at samples of the trajectory, from `motion_excess`.
+        impact: the impact, for apex and hitting speeds.
+        case: the case, for its limits.
     """
     limits = case.hit_limits
     apex = apex_excess(impact.apex, limits.min_apex, limits.max_apex)

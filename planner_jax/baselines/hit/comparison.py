@@ -1,4 +1,4 @@
-"""Comparison of runs of hits with the outcomes and rates published with [Yu2023bat]."""
+"""Comparison of a run's success on hits with the outcomes and rates published by [Yu2023bat]."""
 
 import hashlib
 from collections import Counter
@@ -16,14 +16,14 @@ from planner_jax.task.hit.suites import Serves
 
 
 def describe_serves(serves: Serves) -> Entries:
-    """Return the number of distinct balls of serves, and a digest of balls and targets."""
+    """Return the number of distinct balls among serves, and a SHA-256 of balls and targets."""
     balls = np.column_stack([serves.position, serves.velocity])
     digest = hashlib.sha256(np.column_stack([balls, serves.target]).tobytes()).hexdigest()
     return {"distinct": len(np.unique(balls, axis=0)), "sha256": digest}
 
 
 def choose_reference(planner: str) -> str:
-    """Return the published planner for comparison: the planner itself, or else bat."""
+    """Return the published planner to compare with: the planner of this name, or else `bat`."""
     return planner if planner in court.PLANNERS else "bat"
 
 
@@ -44,7 +44,7 @@ OUTCOMES = [_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)
 
 
 class ScenarioCounts:
-    """Successes by scenario of the court: the run's own, and the published on the same serves."""
+    """Counts by court scenario of the run's successes and of published ones on the same serves."""
 
     READS = ("scenario", *(column.name for column in OUTCOMES))
 
@@ -55,7 +55,7 @@ class ScenarioCounts:
         self._num_published: Counter[tuple[str, str]] = Counter()
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Count the successes in some rows of the run's table."""
         scenario = rows["scenario"].to_numpy()
         self._num.update(scenario)
         self._successes.update(scenario[rows["success"].to_numpy().astype(bool)])
@@ -67,7 +67,7 @@ class ScenarioCounts:
             self._published.update((planner, name) for name in scenario[solved])
 
     def summary(self) -> Entries:
-        """Return success rates from 0 to 1, with published rates of the same serves."""
+        """Return each scenario's success rate from 0 to 1, and published rates on its serves."""
         return {
             name: {
                 "num": self._num[name],
@@ -85,7 +85,7 @@ class ScenarioCounts:
 
 
 def make_table(manifest: Entries) -> RateTable:
-    """Return success per scenario in percent, beside the rates of a published planner."""
+    """Return the success per scenario in percent, beside the rates of a published planner."""
     planner, summary = manifest["parameters"]["planner"], manifest["summary"]
     other = choose_reference(planner)
     published, column = read_published_rates(), court.PLANNERS.index(other)
@@ -112,7 +112,7 @@ def make_table(manifest: Entries) -> RateTable:
 
 
 def explain_table(manifest: Entries) -> str:
-    """Return sentences on the published columns of the table."""
+    """Return sentences that explain the published columns of the table."""
     other, same = choose_reference(manifest["parameters"]["planner"]), ""
     if _knows_same_serves(manifest["summary"], other):
         same = '"Same serves" are the published outcomes of this run\'s cases, if known. '
@@ -125,5 +125,5 @@ def explain_table(manifest: Entries) -> str:
 
 
 def _knows_same_serves(summary: Entries, other: str) -> bool:
-    """Return whether published outcomes of the run's own cases are known."""
+    """Return whether the published planner's outcomes on the run's own serves are known."""
     return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())

@@ -1,7 +1,7 @@
-"""The impact with decoupled components of [Yu2023bat, Section IV-B] (eqs 11-14).
+"""The impact of [Yu2023bat, Section IV-B], computed from decoupled components (eqs 11-14).
 
-Two components of the racket's velocity and two of its thrust are given; the others follow from the
-ball and the target.
+Two components of the racket's velocity and two of its thrust are given. The remaining components
+follow from the ball and the target.
 """
 
 import jax.numpy as jnp
@@ -11,10 +11,10 @@ from jax import Array
 from planner_jax.ball.aim import aim_drag_free
 from planner_jax.ball.flight import BallState
 
-_LEAST_THRUST_X = 1e-2  # [m/s^2]
-_LEAST_ROOT = 1e-2  # [m/s], of the discriminant of eq. 13c
-_LEAST_FLIGHT = 1e-2  # [s]
-_LEAST_PUSH = 1e-3  # [s], (change of the ball's velocity) / thrust
+_LEAST_THRUST_X = 1e-2  # [m/s^2], least |tau_x|
+_LEAST_ROOT = 1e-2  # [m/s], least root of the discriminant of eq. 13c
+_LEAST_FLIGHT = 1e-2  # [s], least flight time of the returned ball
+_LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 
 
 @struct.dataclass
@@ -22,10 +22,10 @@ class DecoupledHit:
     """The solution of eqs 13 and 14 for four given components."""
 
     ball_vel_after: Array  # (3,) [m/s]
-    flight_time: Array  # () [s], of the ball to the target
-    racket_vel: Array  # (3,) [m/s], x by eq. 14a
-    thrust: Array  # (3,) [m/s^2], y by eq. 14b
-    defect: Array  # () >= 0; if > 0, no hit with these components reaches the target
+    flight_time: Array  # () [s], of the ball from the impact to the target
+    racket_vel: Array  # (3,) [m/s], its x by eq. 14a
+    thrust: Array  # (3,) [m/s^2], per unit mass, its y by eq. 14b
+    defect: Array  # () >= 0; if > 0, no hit with the given components reaches the target
 
 
 def solve_decoupled_hit(
@@ -39,21 +39,23 @@ def solve_decoupled_hit(
     """Solve eqs 13 and 14 for a hit that sends the ball to the target.
 
     With delta = tau_z / tau_x, xi = target - ball and c = v-_z - delta v-_x the flight time is the
-    later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x divided by that root;
-    the root avoids eq. 13c's divisions by xi_x and delta xi_x - xi_z. Eq. 14b is the change of the
-    ball's v_y divided by the change of its v_x, times tau_x. The remaining singularities are
-    guarded, and `defect` measures them: tau_x = 0, a negative discriminant, a ball that flies or is
-    pushed backwards. Values and gradients are finite everywhere.
+    later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x divided by that root.
+    Using the root avoids the divisions by xi_x and delta xi_x - xi_z in eq. 13c. Eq. 14b is the
+    change of the ball's v_y divided by the change of its v_x, times tau_x.
 
-    Eq. 13d measures xi from the quadrotor. Measured from the ball, 6 cm away, the target is hit
-    exactly.
+    The remaining singularities are guarded, so that values and gradients are finite everywhere.
+    `defect` measures how far a hit is beyond a guard: tau_x = 0, a negative discriminant, or a ball
+    that flies or is pushed backwards.
+
+    The paper's eq. 13d measures xi from the quadrotor. Here xi is measured from the ball, 6 cm
+    away, so that the ball meets the target exactly.
 
     Args:
-        ball: just before the impact.
+        ball: state of the ball just before the impact.
         target: (3,) [m].
-        racket_vel_yz: (2,) [m/s].
-        thrust_xz: (2,) [m/s^2], per unit mass.
-        restitution: ().
+        racket_vel_yz: (2,) [m/s], y and z of the racket's velocity.
+        thrust_xz: (2,) [m/s^2], tau_x and tau_z, thrust per unit mass.
+        restitution: (), coefficient of restitution.
         gravity: () [m/s^2], magnitude.
     """
     size_x = jnp.abs(thrust_xz[0])
@@ -90,7 +92,7 @@ def solve_decoupled_hit(
 
 
 def aim_at_angle(pos: Array, target: Array, angle: float, gravity: Array) -> Array:
-    """Return the velocity of a drag-free ball that leaves at an angle and reaches the target.
+    """Return the initial velocity of a drag-free ball that leaves at an angle and hits a target.
 
     Args:
         pos: (3,) [m].

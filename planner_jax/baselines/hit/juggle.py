@@ -1,4 +1,4 @@
-"""The `juggle` baseline: one state-to-state primitive to a predetermined stroke."""
+"""The baseline `juggle`: one primitive to a racket state that is fixed without optimisation."""
 
 import dataclasses
 from typing import ClassVar
@@ -18,22 +18,22 @@ from planner_jax.task.hit.context import HitContext, Impact, prepare_hit
 from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import sample_pieces, snap_energy
 
-_BISECTIONS = 30
-_SHORTEST = 1e-2  # [s], of a trajectory
-_LEAST_UPRIGHT = 1e-2  # least vertical part of the racket's normal, the divisor of v_z
+_BISECTIONS = 30  # number of bisection steps for the time of the fall
+_SHORTEST = 1e-2  # [s], least duration of a trajectory
+_LEAST_UPRIGHT = 1e-2  # least vertical part of the racket's normal, by which v_z is divided
 
 
 def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array) -> Array:
-    """Return the time () [s] at which the target falls through a height.
+    """Return the time () [s] at which the ball falls through a height.
 
-    Bisection is followed by one Newton step, which alone is differentiated. If the height is not
-    crossed between the bounds, the result is next to one of them.
+    Bisection is followed by one Newton step, and only this step is differentiated. If the ball does
+    not cross the height between the bounds, the result is next to one of the bounds.
 
     Args:
-        path: path of the target.
+        path: tabulated trajectory of the ball.
         height: () [m].
-        earliest: () [s], when the target is above `height`.
-        latest: () [s], when the target is below `height`.
+        earliest: () [s], lower bound, when the ball is above `height`.
+        latest: () [s], upper bound, when the ball is below `height`.
     """
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -53,47 +53,47 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class JuggleHit(Planner):
-    """A minimum-jerk primitive to a predetermined stroke, without optimisation.
+    """The "Juggle" of [Yu2023bat]: a primitive to a predetermined hit, without optimisation.
 
-    This is the "Juggle" of [Yu2023bat]. Its parts come from these sources:
+    Its parts come from these sources:
 
-    - [Mueller2011] and [Dong2015]: the ball is hit where it falls through a fixed height; the
-      returned ball rises to a fixed apex; two components of the racket's velocity are fixed and the
-      third follows from the impact.
+    - [Mueller2011] and [Dong2015]: the ball is hit where it falls through a fixed height. The
+      returned ball rises to a fixed apex. Two components of the racket's velocity are fixed, and
+      the third follows from the impact.
     - [Mueller2015]: the primitive of least jerk to that state.
-    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), 15-17 (the primitive),
-      and its tau_z = 1.1 g at the impact.
-    - The published trials: v_x = v_y = 0 in every recorded hit; a quadrotor height of 1.43 to 1.50
-      m, never above, which is the first 10 ms sample below 1.5 m; an apex of 2.3 m (median;
-      quartiles 2.2 and 2.4), which follows from attitude and target if only gravity acts.
-    - Assumed: the ramp of `minimum_jerk_after_ramp`. Without it the body rate jumps at time 0.
+    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), eqs 15-17 (the
+      primitive), and tau_z = 1.1 g at the impact.
+    - The published trials: every recorded hit has v_x = v_y = 0. The quadrotor is at a height of
+      1.43 to 1.50 m, never above, which is the first 10 ms sample below 1.5 m. The apex is 2.3 m
+      (median; quartiles 2.2 and 2.4 m); it follows from attitude and target if only gravity acts.
+    - Assumption: the ramp of `minimum_jerk_after_ramp`; without it the body rate jumps at time 0.
 
     With the restitution 0.7 of [Yu2023bat] this planner succeeds on two of three serves, the
-    published one on one of ten. The recorded hits have a restitution near 0.32, which requires a
-    racket that rises at 3 m/s at the impact instead of being almost at rest. With that restitution
-    in the cases this planner succeeds on one of ten. Over the 36 scenarios its success correlates
-    with the published success (0.65).
+    published planner on one of ten. The recorded hits imply a restitution near 0.32. A racket then
+    has to rise at 3 m/s at the impact, instead of almost standing still. With a restitution of 0.32
+    in the cases this planner also succeeds on one of ten. Over the 36 scenarios its success rate
+    correlates with the published success rate (coefficient 0.65).
 
     This planner ignores a case's extras; the referee checks them.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = HitCase
-    height: float = 1.5  # [m], of the ball at the impact
-    apex: float = 2.3  # [m], of the returned ball
-    thrust_z: float = 1.1  # vertical thrust at the impact over gravity
+    height: float = 1.5  # [m], height of the ball at the impact
+    apex: float = 2.3  # [m], height to which the returned ball rises
+    thrust_z: float = 1.1  # vertical thrust at the impact, divided by gravity
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
     ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
     nodes: int = 60  # intervals per piece at whose ends limits are evaluated
-    num_table_nodes: int = 48
+    num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
 
     def __post_init__(self) -> None:
         require_settings(self)
 
     def solve(self, case: HitCase, attempt: Attempt) -> HitPlan:
-        """Return the primitive to the stroke, which has no free variable.
+        """Return the plan that leads to the predetermined hit; nothing is optimised.
 
-        Its cost is the mean squared jerk [Yu2023bat, eq. 15].
+        The plan's cost is the mean squared jerk [Yu2023bat, eq. 15].
         """
         impact = self.impact(prepare_hit(case, self.num_table_nodes))
         trajectory = minimum_jerk_after_ramp(
@@ -101,7 +101,7 @@ class JuggleHit(Planner):
         )
         motion = sample_pieces(trajectory, self.nodes)
         along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
-        # An impossible height or apex, or a vertical racket, counts as a violation too.
+        # A height or apex that cannot be met, or a vertical racket, counts as a violation too.
         meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
         too_low = jnp.maximum(impact.stroke.ball_pos[2], case.target[2]) - self.apex
         lying = _LEAST_UPRIGHT - impact.stroke.normal[2]
@@ -116,7 +116,7 @@ class JuggleHit(Planner):
         )
 
     def impact(self, context: HitContext) -> Impact:
-        """Return the stroke at the fixed height.
+        """Return the hit where the ball falls through the fixed height.
 
         A ball that never falls through `height` is hit where it comes closest to that height.
         """

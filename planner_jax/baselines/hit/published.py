@@ -1,4 +1,4 @@
-"""Data published with [Yu2023bat]: trial files (serves and outcomes), and success rates."""
+"""Data published with [Yu2023bat]: trial files with serves and outcomes, and success rates."""
 
 import csv
 import dataclasses
@@ -24,16 +24,16 @@ _FILE_NAME = re.compile(r"([1-4])_([1-4])_([1-4])_([plb])\.csv")
 _FILE_PLANNER = {"p": "bat", "l": "bat-lite", "b": "juggle"}
 _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "target")
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
-_LISTED = 5  # greatest number of bad rows in a message
+_LISTED = 5  # greatest number of problems that an error message lists
 
-# Numbers and outcome of each line of a file; None if the line does not parse.
+# The twelve numbers and the outcome of each line of a file, by line; None if parsing failed.
 _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 
 
 class Trial(NamedTuple):
-    """One serve of a trial file."""
+    """One serve of a trial file, and which published planners solved it."""
 
-    line: int  # line number, from 1
+    line: int  # line number in the file, from 1
     scenario: int  # index in court.SCENARIOS
     file: str
     numbers: list[float]  # 12: serve position, serve velocity, landing position, target
@@ -41,7 +41,7 @@ class Trial(NamedTuple):
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """Read the serves of a folder of trial files; see `task.hit.suites.read_serves`."""
+    """Read all serves of a folder of trial files, for `task.hit.suites.read_serves`."""
     problems: list[str] = []
     trials: list[Trial] = []
     for scenario, paths in _find_trial_files(folder).items():
@@ -90,7 +90,7 @@ def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
 
 
 def _read_file(path: Path, problems: list[str]) -> _Table:
-    """Read the table of one file; append a problem for each line that does not parse."""
+    """Read the table of one trial file; append a problem for each line that does not parse."""
     try:
         with open_plain(path) as file:
             lines = file.read().decode("utf-8-sig", errors="replace").splitlines()
@@ -112,7 +112,7 @@ def _read_file(path: Path, problems: list[str]) -> _Table:
 
 
 def _parse(line: str) -> tuple[list[float], bool]:
-    """Parse one line into the serve's twelve numbers and whether the planner solved it."""
+    """Parse one line of a trial file: the serve's twelve numbers, and whether it was solved."""
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != 8:
         raise ArgumentError("row", "8 columns between commas", len(cells), verb="have")
@@ -127,7 +127,7 @@ def _parse(line: str) -> tuple[list[float], bool]:
 
 
 def _vector(name: str, cell: str, size: int) -> list[float]:
-    """Parse the finite numbers of one blank-separated cell."""
+    """Parse one cell of `size` finite numbers separated by blanks; `name` is for the error."""
     try:
         vector = [float(word) for word in cell.split()]
     except ValueError:
@@ -140,7 +140,7 @@ def _vector(name: str, cell: str, size: int) -> list[float]:
 def _merge(
     scenario: int, paths: dict[str, Path], tables: dict[str, _Table], problems: list[str]
 ) -> list[Trial]:
-    """Merge the serves of one scenario from its planners' files; append a problem for conflicts."""
+    """Merge one scenario's serves from all planners' files; append a problem for each conflict."""
     trials = []
     for line in sorted(set().union(*tables.values())):
         present = [letter for letter, table in tables.items() if line in table]
@@ -165,7 +165,7 @@ def _merge(
 
 
 def _list_out_of_play(trials: list[Trial]) -> list[str]:
-    """List the serves that start in the ground or do not land in the hitting half."""
+    """List problems of serves that start in the ground or do not land in the hitting half."""
     numbers = np.array([trial.numbers for trial in trials]).reshape(-1, 12)
     height = numbers[:, 2]
     position = np.column_stack([numbers[:, :2], np.where(height > 0.0, height, 1.0)])
@@ -182,9 +182,9 @@ def _list_out_of_play(trials: list[Trial]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class PublishedRates:
-    """Planning success rates in percent: a row per court.SCENARIOS, a column per planner.
+    """Planning success rates in percent, one row per court scenario, one column per planner.
 
-    The two sources differ by up to 20 points, so name the source of every comparison.
+    The two sources differ by up to 20 points, so that every comparison should name its source.
     """
 
     paper: np.ndarray  # (36, 3) [%], Table I of the paper
@@ -192,7 +192,7 @@ class PublishedRates:
 
 
 def read_published_rates() -> PublishedRates:
-    """Return the rates published with [Yu2023bat], columns in the order of court.PLANNERS."""
+    """Read the success rates of [Yu2023bat] from a CSV file, columns by court.PLANNERS."""
     text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )

@@ -1,1 +1,1 @@
-"""Published methods for interceptions, and the searches and splines they need."""
+"""Published methods for interceptions by a car, and the searches and splines that they use."""

@@ -1,14 +1,14 @@
-"""Curves of one number over time, made of Bezier pieces of equal duration.
+"""Scalar curves over time, made of Bezier pieces of equal duration, for `speed`.
 
 Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with the Bernstein
-polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A point here is the paper's control
-point times the duration of its piece, h_j c_j^i. The curve lies between its points, so that a bound
-on the curve is the same bound on the points. Eqs 22 and 23 as printed bound c_j^i, which is right
-only for pieces of 1 s.
+polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A control point here is the paper's
+control point times the duration of its piece, h_j c_j^i. The curve lies within the range of its
+control points, so that a bound on the control points also bounds the curve. Eqs 22 and 23 as
+printed bound c_j^i, which is right only for pieces of 1 s.
 
-Everything that is linear in the points is a constant matrix for a horizon of 1. For a horizon T,
-speeds scale with 1 / T and accelerations with 1 / T^2. Since all pieces have the same duration,
-these matrices do not depend on the problem. They are NumPy arrays in double precision.
+All maps that are linear in the control points are constant NumPy matrices for a horizon of 1, in
+double precision. For a horizon T, speeds scale with 1 / T and accelerations with 1 / T^2. Since all
+pieces have the same duration, the matrices do not depend on the problem.
 """
 
 import math
@@ -21,7 +21,7 @@ from jax import Array
 
 @struct.dataclass
 class BezierCurve:
-    """A curve, or a batch of curves with a leading axis on every leaf."""
+    """A scalar curve over time, or a batch of curves with a leading axis on every leaf."""
 
     points: Array  # (K, n + 1) [m], control points
     horizon: Array  # () T [s], duration of all pieces together
@@ -29,7 +29,7 @@ class BezierCurve:
     def at(self, time: Array, order: int = 0) -> Array:
         """Return the value of one curve, or its derivative of an order, at times (...) [s].
 
-        Before 0 and after the horizon the nearest piece is extrapolated.
+        Before time 0 the first piece is extrapolated, after the horizon the last piece.
         """
         pieces, degree = self.points.shape[0], self.points.shape[1] - 1
         place = time / self.horizon * pieces
@@ -45,9 +45,10 @@ class BezierCurve:
 
 
 def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
-    """Return the matrix that maps a piece's points to the points of its derivative.
+    """Return the matrix that maps a piece's control points to control points of a derivative.
 
-    The horizon is 1 and has `pieces` pieces ([Qu2022], third property of Bezier curves).
+    The derivative has the given order. The horizon is 1 and has `pieces` pieces ([Qu2022], third
+    property of Bezier curves).
 
     Returns:
         (degree + 1 - order, degree + 1).
@@ -59,7 +60,7 @@ def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
-    """Return the Bernstein polynomials at positions (S,) in a piece, (S, degree + 1)."""
+    """Return the Bernstein polynomials' values (S, degree + 1) at fractions (S,) of a piece."""
     u = np.asarray(shares, float)[:, None]
     i = np.arange(degree + 1)
     binomials = np.array([math.comb(degree, k) for k in i])
@@ -67,7 +68,7 @@ def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
 
 
 def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
-    """Return the quadratic form of the squared derivative's integral over a horizon of 1.
+    """Return the quadratic form that integrates a curve's squared derivative over a horizon of 1.
 
     Returns:
         (K (n + 1), K (n + 1)), symmetric; the integral is points^T form points.
@@ -82,9 +83,9 @@ def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
-    """Return the rows that vanish if neighbouring pieces agree up to derivative `orders`.
+    """Return rows that vanish if neighbouring pieces agree up to derivative `orders`.
 
-    This is [Qu2022, eq. 21].
+    The product of the rows with all control points is the left side of [Qu2022, eq. 21].
 
     Returns:
         ((K - 1) (orders + 1), K (n + 1)).
@@ -100,10 +101,10 @@ def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
 
 
 def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
-    """Expand rows (W, n + 1) for one piece's points into rows for the points of all pieces.
+    """Expand rows (W, n + 1) for one piece's control points into rows for those of all pieces.
 
-    On a smooth curve the first row of a piece equals the last row of the previous piece, so that it
-    is left out.
+    On a smooth curve the first row of a piece equals the last row of the previous piece. Such first
+    rows are left out.
 
     Returns:
         (K (W - 1) + 1, K (n + 1)).
@@ -115,7 +116,7 @@ def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
     """Convert bounds (K, W) on the rows of single pieces into bounds on `rows_of_pieces`.
 
-    At a joint the bounds of both pieces apply.
+    Where two pieces meet, the stricter bound of the two pieces applies.
     """
 
     def flat(bounds: Array, at_joints: Array) -> Array:

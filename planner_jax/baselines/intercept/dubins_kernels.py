@@ -1,8 +1,8 @@
 """Closed forms of Dubins paths, compiled by numba; importing this module requires numba.
 
-A Dubins word is a sequence of left turns L, right turns R and straight lines S, such as LSL. The
-unit of length is the least turning radius, and the start is the origin of the frame. All code is
-scalar and runs on the host in float64.
+A Dubins word is a sequence of left turns L, right turns R and straight lines S, such as LSL; C is a
+turn of either direction. The unit of length is the least turning radius, and the start is the
+origin of the frame. All code is scalar and runs on the host in float64.
 """
 
 import math
@@ -22,9 +22,10 @@ def _positive(angle):
 
 @njit(cache=True)
 def words_to_pose(x, y, heading, lengths):
-    """Write the lengths (6, 3) of the parts of Dubins words to a pose, infinite without a path.
+    """Write the lengths of the three parts of each Dubins word to a pose into `lengths` (6, 3).
 
-    Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR, as in `SENSES`.
+    Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR, as in `SENSES`. A row is infinite
+    if no path of this word exists.
     """
     lengths[:, :] = np.inf
     sin, cos = math.sin(heading), math.cos(heading)
@@ -32,7 +33,7 @@ def words_to_pose(x, y, heading, lengths):
         if side == 1:
             y, sin, heading = -y, -sin, -heading
         row = 3 * side
-        # Vector from the centre of the first circle to the centre of the last circle, same sense.
+        # Vector from the first to the last circle's centre, for circles of the same direction.
         across, up = x - sin, y + cos - 1.0
         far = math.sqrt(across**2 + up**2)
         if far < 1e-9:
@@ -63,9 +64,9 @@ SENSES = np.array(
 
 @njit(cache=True)
 def words_to_point(x, y, lengths):
-    """Write the lengths (6, 3) of an arc and a straight line to a point, for either side.
+    """Write the lengths of an arc and a straight line to a point, for either side, into `lengths`.
 
-    They stand in the rows of LSL and RSR in `SENSES`; the other rows are infinite.
+    The two paths stand in the rows of LSL and RSR of `lengths` (6, 3); other rows are infinite.
     """
     lengths[:] = np.inf
     for side in range(2):
@@ -80,9 +81,10 @@ def words_to_point(x, y, lengths):
 
 @njit(cache=True)
 def length_to_point(x, y):
-    """Return the least length to a point with any heading: CS or, inside of a circle, CC.
+    """Return the length of the shortest path to a point with any heading.
 
-    The shortest paths to a point are of these kinds [Bui1994].
+    The shortest path is a turn and a straight line (CS) or, if the point is inside a turning
+    circle, two turns (CC) [Bui1994].
     """
     y = abs(y)
     best = np.inf
@@ -106,7 +108,7 @@ def length_to_point(x, y):
 
 @njit(cache=True)
 def in_frame(pose, goal, curvature):
-    """Return the goal's position ahead and to the left of a pose, in least turning radii."""
+    """Return a goal's position ahead and to the left of a pose, in least turning radii."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     east, north = goal.pose[0] - pose[0], goal.pose[1] - pose[1]
     return (cos * east + sin * north) * curvature, (cos * north - sin * east) * curvature
@@ -114,12 +116,12 @@ def in_frame(pose, goal, curvature):
 
 @njit(cache=True)
 def least_length(pose, goal, middle, curvature, lengths):
-    """Return the least length [m] from a pose to a goal without obstacles.
+    """Return the length [m] of the shortest path from a pose to a goal without obstacles.
 
-    If the heading at the goal is free, it is a lower bound.
+    If the heading at the goal is free, the result is a lower bound of this length.
 
     Args:
-        pose: (3,).
+        pose: (3,) x, y [m] of the rear axle and heading [rad].
         goal: a `Goal`.
         middle: [m], distance of the body's centre ahead of the rear axle.
         curvature: [1/m], greatest curvature.

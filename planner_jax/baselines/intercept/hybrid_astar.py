@@ -1,12 +1,12 @@
-"""Hybrid A*: a path for a car that only drives forward, among standing polygons.
+"""Hybrid A*: a search for the path of a car that only drives forward among standing polygons.
 
 The search runs over cells of position and heading, with one continuous state per cell, along arcs
-that the car can drive [Dolgov2008]. It is the first half of the path planning of [Qu2022] (Section
-III-B). Shots, which are collision-free Dubins paths from a node to the goal, are tried more often
-near the goal. The cheapest shot ends the search once no open node can be cheaper; the paper takes
-the first shot. The search runs on the host, one case at a time; its loops are compiled by numba,
-which the extra `baselines` installs. World frame in the plane, SI units, headings counter-clockwise
-from the x axis.
+that the car can drive [Dolgov2008]. It is the first half of the path planning of [Qu2022, Section
+III-B]. A shot is a Dubins path from a node to the goal that touches nothing. Shots are tried more
+often near the goal. When no open node can be cheaper than the cheapest shot, this shot ends the
+search; the paper takes the first shot. The search runs on the host, one case at a time. Its loops
+are compiled by numba, which the extra `baselines` installs. Positions are in the world frame in the
+plane, in SI units, with headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -20,35 +20,35 @@ from planner_jax.core.choices import require
 from planner_jax.core.errors import MissingExtra
 from planner_jax.plane.obstacles import Obstacles
 
-_DISCS = 3  # number of discs that cover the body
+_DISCS = 3  # number of discs that cover the car's body
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridAstar:
-    """Settings of the search.
+    """Settings of the search Hybrid A*.
 
     The cost of a path is its length plus a price for turns. The heuristic is the length of the
     shortest path without obstacles. [Qu2022] takes the maximum of this length and the straight-line
-    distance, which is equivalent, since the straight line is never longer.
+    distance. Both heuristics are equal, since the straight line is never longer.
     """
 
     cell: float = 0.1  # [m], side of a cell
-    headings: int = 72  # heading bins of a full turn
+    headings: int = 72  # number of heading bins in a full turn
     turn_price: float = 0.05  # added cost [m] per metre driven at the greatest curvature
     # Relative inflation of the heuristic (weighted A* [Pohl1970]), and thereby a bound on the
     # relative excess over the least cost on the lattice.
     slack: float = 0.1
     margin: float = 0.01  # [m], distance from polygons; covers the gaps between samples
-    poses: int = 129  # number of poses of the result
-    max_expansions: int = 200_000
+    poses: int = 129  # number of poses of the resulting path
+    max_expansions: int = 200_000  # number of expanded nodes after which the search gives up
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridPath:
-    """Result of a search; without a path the arrays are NaN, length and cost infinite.
+    """Result of Hybrid A*; without a path the arrays are NaN, and length and cost infinite.
 
-    Poses have equal distances along the path. The path consists of arcs and straight lines, so that
-    the curvature jumps between poses.
+    The poses are equally spaced along the path. The path consists of arcs and straight lines, so
+    that the curvature jumps between poses.
     """
 
     poses: np.ndarray  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
@@ -72,11 +72,11 @@ def hybrid_astar(
     end_heading: float | None = None,
     settings: HybridAstar = HybridAstar(),
 ) -> HybridPath:
-    """Search a path from a pose to a pose at which the body's centre is on the meeting point.
+    """Search a path on which the body's centre of a car reaches the meeting point.
 
-    The body is covered by three discs, so that it is treated as wider and longer than it is: a gap
-    just as wide as the car counts as closed. If the final heading is free, paths end with an arc
-    and a straight line.
+    Three discs cover the body, so that the search treats the body as wider and longer than it is. A
+    gap just as wide as the car counts as closed. If the final heading is free, paths end with an
+    arc and a straight line.
 
     Args:
         start: (3,) x, y [m] of the rear axle and heading [rad].
@@ -155,7 +155,7 @@ def _kernels() -> ModuleType:
 
 
 def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:
-    """Raise `ArgumentError` if an argument is out of its range."""
+    """Raise `ArgumentError` if an argument or a setting of `hybrid_astar` is out of its range."""
     points = {"meeting": (meeting, 2), "lower": (lower, 2), "upper": (upper, 2)}
     for name, (value, size) in ({"start": (start, 3)} | points).items():
         is_finite = value.shape == (size,) and np.isfinite(value).all()
@@ -177,7 +177,7 @@ def _require(start, meeting, lower, upper, curvature, body, end_heading, setting
 def _sample_arcs(
     start: np.ndarray, curvatures: np.ndarray, lengths: np.ndarray, num: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample poses (num, 3) and curvatures (num,) equidistantly along arcs (P,) from a pose."""
+    """Sample `num` equally spaced poses (x, y, heading) and curvatures along a sequence of arcs."""
     if not len(lengths):
         return np.full((num, 3), np.nan), np.full(num, np.nan)
     ends = np.cumsum(lengths)
@@ -193,7 +193,7 @@ def _sample_arcs(
 
 
 def _chords(heading: np.ndarray, curvature: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the vectors (..., 2) [m] from start to end of arcs."""
+    """Return the vectors (..., 2) [m] from the start to the end of arcs [rad], [1/m], [m]."""
     half = 0.5 * curvature * length
     chord = length * np.sinc(half / np.pi)
     return chord[..., None] * np.stack([np.cos(heading + half), np.sin(heading + half)], axis=-1)

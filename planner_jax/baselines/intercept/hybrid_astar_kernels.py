@@ -20,12 +20,13 @@ from planner_jax.baselines.intercept.dubins_kernels import (
     words_to_pose,
 )
 
-FOUND, NOT_FOUND, BLOCKED = 0, 1, 2
-PRIMITIVES = 5  # left at full and half curvature, straight, right at half and full curvature
+FOUND, NOT_FOUND, BLOCKED = 0, 1, 2  # status of a search
+# Number of arcs from a node: left at full and half curvature, straight, right at half and full.
+PRIMITIVES = 5
 
 
 class Scene(NamedTuple):
-    """Obstacles, the map, and the discs that cover the body."""
+    """The obstacles, the map, and the discs that cover the car's body."""
 
     polygons: np.ndarray  # (N, V, 2) [m], convex, counter-clockwise
     present: np.ndarray  # (N,) bool
@@ -34,53 +35,54 @@ class Scene(NamedTuple):
     middle: float  # [m], distance of the body's centre ahead of the rear axle
     offsets: np.ndarray  # (D,) [m], distances of the discs' centres ahead of the rear axle
     clear: float  # [m], least distance of a disc's centre from a polygon
-    corner: np.ndarray  # (2,) [m], of a grid that contains the rear axle and all discs
-    shape: tuple[int, int]  # of that grid, in cells
+    corner: np.ndarray  # (2,) [m], lowest corner of a grid that contains rear axle and all discs
+    shape: tuple[int, int]  # number of cells of this grid along x and y
 
 
 class Goal(NamedTuple):
-    """A pose, or a point for the body's centre with a free heading."""
+    """The goal of a search: a pose, or a point for the body's centre with a free heading."""
 
     pose: np.ndarray  # (3,), of the rear axle; x and y of the point if the heading is free
     has_heading: bool
 
 
 class Rules(NamedTuple):
-    """Limits and prices of a search."""
+    """The settings and limits of a search."""
 
     curvature: float  # [1/m], greatest curvature
     cell: float  # [m], side of a cell
-    headings: int  # heading bins of a full turn
+    headings: int  # number of heading bins in a full turn
     price: float  # added cost [m] per metre driven at the greatest curvature
     slack: float  # relative inflation of the heuristic
-    max_expansions: int
+    max_expansions: int  # number of expanded nodes after which the search gives up
 
 
 class _Field(NamedTuple):
-    """Distances from polygons at the nodes of a grid, for lookups during a search."""
+    """Distances from the nearest polygon at the nodes of a grid, computed before a search."""
 
     far: np.ndarray  # (X, Y) [m], distances from the nearest polygon
     corner: np.ndarray  # (2,) [m], position of node (0, 0)
-    step: float  # [m], between nodes
+    step: float  # [m], distance between neighbouring nodes
 
 
 class _Primitives(NamedTuple):
-    """Arcs of one length that each turn by a whole number of bins."""
+    """The arcs that lead from a node to its neighbours; each turns by a whole number of bins."""
 
-    reach: float  # [m], their length
-    bins: np.ndarray  # (PRIMITIVES,) int, heading change of each arc in bins
+    reach: float  # [m], length of every arc
+    bins: np.ndarray  # (PRIMITIVES,) int, heading change of each arc in heading bins
     moves: np.ndarray  # (PRIMITIVES, M, 2) [m], samples in the frame of the start
     directions: np.ndarray  # (headings, PRIMITIVES, M, 2), cos and sin of the samples' headings
 
 
 class _Tree(NamedTuple):
-    """The reached nodes, one per cell."""
+    """The nodes that a search has reached, at most one per cell."""
 
     place: np.ndarray  # (nodes, 3), x [m], y [m], and cost from the start [m]
     bin: np.ndarray  # (nodes,) int32, heading bin relative to the start's heading
-    parent: np.ndarray  # (nodes,) int32, -1 for the start
-    primitive: np.ndarray  # (nodes,) int32, the arc from the parent
-    node: np.ndarray  # (cells,) int32, n + 1 for node n of a cell, -n - 1 if it is expanded
+    parent: np.ndarray  # (nodes,) int32, index of the previous node; -1 for the start
+    primitive: np.ndarray  # (nodes,) int32, index of the arc from the parent
+    # (cells,) int32: 0 for an unreached cell, n + 1 for node n, -n - 1 once node n is expanded.
+    node: np.ndarray
 
 
 @njit(cache=True)
@@ -109,9 +111,9 @@ def distance_field(polygons, present, corner, step, shape, cap):
         polygons: (N, V, 2) [m].
         present: (N,) bool.
         corner: (2,) [m], position of node (0, 0).
-        step: [m], between nodes.
+        step: [m], distance between neighbouring nodes.
         shape: number of nodes along x and y.
-        cap: [m], > 0.
+        cap: [m], > 0, greatest distance that is computed.
     """
     field = np.full(shape, cap)
     for k in range(polygons.shape[0]):
@@ -133,7 +135,7 @@ def distance_field(polygons, present, corner, step, shape, cap):
 
 @njit(cache=True)
 def _interpolate(field, x, y):
-    """Interpolate a field bilinearly at a position in nodes, clamped to the grid."""
+    """Interpolate a distance field bilinearly at a position in grid steps, clamped to the grid."""
     x = min(max(x, 0.0), field.shape[0] - 1.000001)
     y = min(max(y, 0.0), field.shape[1] - 1.000001)
     i, j = int(x), int(y)
@@ -201,11 +203,11 @@ def _is_blocked(start, goal, scene, field):
 
 @njit(cache=True)
 def _compute_primitives(start_heading, rules):
-    """Compute arcs longer than a cell's diagonal, sampled at most half a cell apart."""
+    """Compute arcs longer than a cell's diagonal, with samples at most half a cell apart."""
     width = TURN / rules.headings
     turns = 2
     while turns * width / rules.curvature <= math.sqrt(2.0) * rules.cell:
-        turns += 2  # even, since half the curvature turns by half the bins
+        turns += 2  # even, since an arc of half the curvature turns by half as many bins
     reach = turns * width / rules.curvature
     num = int(math.ceil(reach / (0.5 * rules.cell)))
     half = turns // 2
@@ -227,13 +229,13 @@ def _compute_primitives(start_heading, rules):
 
 @njit(cache=True)
 def _sinc(x):
-    """Return sin(x) / x."""
+    """Return sin(x) / x, and 1 near x = 0."""
     return math.sin(x) / x if abs(x) > 1e-9 else 1.0
 
 
 @njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
-    """Return whether a path of three parts [m] from a pose is collision-free."""
+    """Return whether a path of three arcs or lines [m] from a pose is collision-free."""
     x, y, heading = pose[0], pose[1], pose[2]
     for k in range(3):
         if parts[k] > 0.0:
@@ -251,10 +253,10 @@ def _is_free_along(pose, parts, senses, curvature, scene, field):
 
 @njit(cache=True)
 def _shoot(pose, goal, bound, rules, scene, field, lengths):
-    """Find the cheapest collision-free Dubins word to the goal with a cost below a bound [m].
+    """Find the cheapest collision-free Dubins path to the goal that costs less than a bound [m].
 
     Returns:
-        Its row of `lengths` [m], or -1 without such a word, and its cost [m].
+        The path's row in `lengths` [m], or -1 without such a path, and its cost [m].
     """
     x, y = in_frame(pose, goal, rules.curvature)
     if goal.has_heading:
@@ -284,7 +286,7 @@ def _shoot(pose, goal, bound, rules, scene, field, lengths):
 
 @njit(cache=True)
 def _empty_tree(node_of, max_expansions):
-    """Allocate a tree without nodes that holds all nodes `max_expansions` can reach."""
+    """Allocate a tree without nodes, large enough for `max_expansions` expansions."""
     most = min(PRIMITIVES * max_expansions, node_of.size) + 1
     return _Tree(
         np.empty((most, 3)),
@@ -297,7 +299,7 @@ def _empty_tree(node_of, max_expansions):
 
 @njit(cache=True)
 def _cell_of(x, y, heading_bin, field, headings):
-    """Return the index of the cell of (x, y, heading), or -1 outside the grid."""
+    """Return the index of the cell that contains (x, y, heading), or -1 outside the grid."""
     i = int((x - field.corner[0]) / (2.0 * field.step))
     j = int((y - field.corner[1]) / (2.0 * field.step))
     num_x, num_y = field.far.shape[0] // 2, field.far.shape[1] // 2
@@ -310,7 +312,7 @@ def _cell_of(x, y, heading_bin, field, headings):
 def _is_free_primitive(tree, node, p, primitives, scene, field):
     """Return whether a primitive from a node is collision-free."""
     x, y, k = tree.place[node, 0], tree.place[node, 1], tree.bin[node]
-    # The straight primitive keeps the heading of the node.
+    # The straight arc keeps the node's heading, so that its first sample has the node's direction.
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     for m in range(primitives.moves.shape[1]):
         ahead, aside = primitives.moves[p, m]
@@ -323,7 +325,7 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Collect the path to a node and its shot: curvatures [1/m] and lengths [m] of all parts."""
+    """Collect curvatures [1/m] and lengths [m] of a path's parts: arcs to a node, then a shot."""
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]
@@ -340,14 +342,14 @@ def _trace_back(tree, node, primitives, lengths, senses, curvature):
 
 @njit(cache=True)
 def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
-    """Write a node into the tree."""
+    """Write position, cost, heading bin, parent and arc of a node into the tree."""
     tree.place[node, 0], tree.place[node, 1], tree.place[node, 2] = x, y, cost
     tree.bin[node], tree.parent[node], tree.primitive[node] = heading_bin, parent, primitive
 
 
 @njit(cache=True)
 def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
-    """Add the neighbours of a node to tree and heap, and return the number of nodes in use."""
+    """Add a node's neighbours to tree and heap; return how many nodes the tree then has."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     last = primitives.moves.shape[1] - 1
@@ -381,15 +383,15 @@ def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, 
 
 @njit(cache=True)
 def search(start, goal, scene, rules, node_of):
-    """Run Hybrid A* from a pose (3,) to a `Goal` in a `Scene` by `Rules`.
+    """Run Hybrid A* from a pose to a goal; see the module `hybrid_astar`.
 
     Args:
-        start: (3,).
+        start: (3,) x, y [m] of the rear axle and heading [rad].
         goal: a `Goal`.
         scene: a `Scene`.
         rules: `Rules`.
-        node_of: (cells and headings,) int32, zeros, overwritten. NumPy allocates such zeros without
-            touching the memory; numba would write them.
+        node_of: (cells times heading bins,) int32, zeros, overwritten. The caller allocates the
+            zeros in NumPy, which does not touch the memory; numba would write every zero.
 
     Returns:
         Status (FOUND, NOT_FOUND or BLOCKED), curvatures (P,) [1/m] and lengths (P,) [m] of the
@@ -419,7 +421,7 @@ def search(start, goal, scene, rules, node_of):
         tree.node[cell] *= -1
         expansions += 1
         wait -= 1
-        if wait <= 0:  # shots are more frequent near the goal
+        if wait <= 0:  # the wait is shorter near the goal, so that shots are more frequent there
             row, rest = _shoot(pose, goal, best_cost - cost, rules, scene, field, lengths)
             if row >= 0:
                 best_cost, best_node, best_row = cost + rest, node, row

@@ -1,8 +1,9 @@
 """The planner of [Qu2022]: Hybrid A*, gradient descent, dynamic programming, Bezier pieces.
 
-The search runs on the host, one case after another; all later steps are one compiled program. Where
-the paper leaves a choice open, sizes and limits are taken from the case. The car drives beside the
-smoothed path, along a path whose curvature starts at the case's curvature and has no jumps.
+The search runs on the host, one case after another; all later steps are one compiled program. If
+the paper does not report a size or a limit, the value of the case is used. The curvature of a
+searched path jumps, and differs from the car's curvature at the start. The car therefore drives a
+path close to the smoothed path whose curvature starts at the case's curvature and has no jumps.
 """
 
 import dataclasses
@@ -26,11 +27,13 @@ from planner_jax.task.intercept.plan import InterceptPlan, explain
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import ends_of
 
-_PACE = 1.2  # factor on the expected speed that the steering rate must still allow
+_PACE = 1.2  # factor on the expected speed that the steering rate limit must still allow
 
 
 def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
-    """Return the speed step of [Qu2022]: continued polygon edges, pieces of a tenth of the horizon.
+    """Return the settings of the speed step of [Qu2022].
+
+    The corridor continues the polygons' edges, and a curve has ten pieces of equal duration.
 
     Args:
         end_weight: w_2 T^3 / w_1 of a soft end, 300 for the paper's weights and T = 10 s. By
@@ -42,7 +45,7 @@ def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
 
 @dataclasses.dataclass(frozen=True)
 class PaperIntercept(Planner):
-    """A planner that reaches the target at the case's time along one searched path."""
+    """The planner of [Qu2022]; the car reaches the target at the case's time on a searched path."""
 
     case_type: ClassVar[type] = InterceptCase
     search: HybridAstar = HybridAstar()
@@ -52,7 +55,7 @@ class PaperIntercept(Planner):
     attempts: ClassVar[tuple[Search, ...]] = (Search(1),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch."""
+        """Return the plans of a batch: search paths one by one, then plan all speeds compiled."""
         num = len(np.asarray(cases.time))
         found = [self.search_path(take(cases, k)) for k in range(num)]
         poses, curvatures, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
@@ -60,7 +63,7 @@ class PaperIntercept(Planner):
         return jax.tree.map(np.array, plans)
 
     def search_path(self, case: InterceptCase) -> tuple[np.ndarray, ...]:
-        """Return a path: poses (N, 3), curvatures (N,), length () [m], and whether it exists."""
+        """Search a path; return its poses (N, 3), curvatures (N,), length and whether it exists."""
         found = self.find_path(case)
         dtype = np.asarray(case.time).dtype
         if found is None or not found.found:
@@ -75,7 +78,7 @@ class PaperIntercept(Planner):
         )
 
     def find_path(self, case: InterceptCase) -> HybridPath | None:
-        """Return the path that Hybrid A* finds, or None if the case is not finite."""
+        """Search a path by Hybrid A*; return None if a number of the case is not finite."""
         goal = np.asarray(case.target.at(case.time).pos)
         numbers = [case.start, goal, case.limits.curvature, case.lower, case.upper]
         numbers += jax.tree.leaves((case.body, case.walls.corners, case.walls.centre))
@@ -96,7 +99,7 @@ class PaperIntercept(Planner):
         )
 
     def path(self, case: InterceptCase, poses: Array, curvatures: Array, length: Array) -> Path:
-        """Return the path that the car drives, from the poses of a searched path."""
+        """Smooth a searched path, and return a path beside it that the car can drive."""
         smooth = smooth_path(
             poses,
             curvatures,
@@ -108,7 +111,7 @@ class PaperIntercept(Planner):
             upper=case.upper,
             settings=self.smoothing,
         )
-        # The steering rate must suffice for the initial speed and for the mean speed.
+        # The steering rate limit must allow the initial speed and the mean speed, times `_PACE`.
         pace = _PACE * jnp.maximum(case.speed, smooth.length / case.time)
         rate = case.limits.steering_rate / (case.body.wheelbase * pace)
         return path_beside(
@@ -132,7 +135,7 @@ def _drive_paths(
     length: Array,
     is_found: Array,
 ) -> InterceptPlan:
-    """Return the plans along searched paths; leaves have a leading axis B."""
+    """Plan a speed along each case's searched path; leaves have a leading axis B, one per case."""
 
     def plan_one(lane: tuple) -> InterceptPlan:
         case, poses, curvatures, length, is_found = lane

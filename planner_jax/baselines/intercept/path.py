@@ -1,4 +1,4 @@
-"""A path of the rear axle without a speed: the result of a planner's first half."""
+"""Paths of a car's rear axle without a speed, and the fit of a drivable path to given points."""
 
 import dataclasses
 
@@ -14,9 +14,10 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @struct.dataclass
 class Path:
-    """N equally spaced points of a path, or a batch with leading axes; stations start at 0.
+    """N equally spaced points of a path, or a batch of paths with leading axes.
 
-    Between two points the curvature is linear in the station.
+    A station is a distance along the path from its start. Between two points the curvature is
+    linear in the station.
     """
 
     pos: Array  # (N, 2) [m], of the rear axle's middle
@@ -31,7 +32,7 @@ class Path:
 
 
 def path_along(start: Array, length: Array, curvature: Array) -> Path:
-    """Return the path from a pose (3,) with curvatures (N,) [1/m] at equal distances."""
+    """Return the path from a pose (3,) with curvatures (N,) [1/m] at equally spaced points."""
     drive = motion(start, length, jnp.ones_like(curvature), curvature, 1)
     return Path(
         pos=jnp.concatenate([start[None, :2], drive.pos[:, 0]]),
@@ -48,17 +49,17 @@ def path_of_drive(
 
     Args:
         start: (3,) x, y [m], heading [rad].
-        time: () [s], end of the drive.
-        speed: (K + 1,) [m/s], at the knots, >= 0.
-        curvature: (K + 1,) [1/m].
+        time: () [s], duration of the drive.
+        speed: (K + 1,) [m/s], >= 0, at the knots.
+        curvature: (K + 1,) [1/m], at the knots.
         num: N, number of points of the path.
-        samples: samples per piece, between which the curvature is interpolated by station.
+        samples: number of samples per piece, between which the curvature is linear in the station.
     """
     knots = jnp.arange(speed.shape[0]) * samples
     fine = jnp.arange((speed.shape[0] - 1) * samples + 1)
     v, c = (jnp.interp(fine, knots, each) for each in (speed, curvature))
     step = time / (fine.shape[0] - 1)
-    # At standstill the station increases by a tiny step, since interpolation needs distinct values.
+    # Interpolation needs distinct stations. At standstill the station increases by a tiny step.
     moved = jnp.maximum(0.5 * (v[1:] + v[:-1]) * step, 1e-6)
     station = jnp.concatenate([jnp.zeros_like(moved[:1]), jnp.cumsum(moved)])
     even = jnp.linspace(0.0, 1.0, num) * station[-1]
@@ -69,9 +70,9 @@ def path_of_drive(
 class FollowConfig:
     """Settings of the fit of a drivable path to given points; static."""
 
-    stride: int = 2  # points between two knots of the curvature
+    stride: int = 2  # number of points from one knot of the curvature to the next
     miss: float = 0.01  # [m], distance from a point that adds 1 to the cost
-    rate: float = 1.0  # factor of (curvature rate / limit) in the residuals
+    rate: float = 1.0  # weight of (curvature rate / limit) in the residuals
     slack: float = 0.02  # fraction of every limit that stays unused
     solver: LevenbergConfig = LevenbergConfig(30)
 
@@ -89,8 +90,8 @@ def path_beside(
     """Return a path without curvature jumps that a car can drive along given points.
 
     Searched and smoothed paths consist of arcs, and start with a curvature that the car does not
-    have. The returned path minimises the squared distance from their points. Its curvature is
-    linear between knots and keeps its limits where the solver can satisfy them.
+    have. The returned path minimises the squared distance from the given points. Its curvature is
+    linear between knots, and keeps its limits where the solver can satisfy them.
 
     Args:
         start: (3,) x, y [m] and heading [rad].
@@ -144,7 +145,8 @@ def path_beside(
 def nearness(push: Array, miss: float) -> Quadratic:
     """Return the quadratic model of the squared distance of samples (K, S) from given positions.
 
-    `push` is half the gradient (K, S, 2) by positions; `miss` [m] is the distance of unit cost.
+    `push` (K, S, 2) is half the cost's gradient by the samples' positions. `miss` [m] is the
+    distance that adds 1 to the cost.
     """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)

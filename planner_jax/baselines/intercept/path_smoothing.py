@@ -2,26 +2,27 @@
 
 Inner points of the path move, its ends are fixed. The cost (eq. 12) keeps the points away from
 obstacles (eq. 13), within the curvature limit (eq. 14) and evenly spaced on a line that is as
-straight as possible (eq. 15). The equations as printed do not work. The differences are:
+straight as possible (eq. 15). The equations as printed do not work. These are the changes:
 
 * J_obs counts only points nearer than d_max, as the paper's text says. Eq. 13 would also attract
-  the other points to that distance.
+  farther points to that distance.
 * J_cur counts only the excess over kappa_max, squared. Eq. 14 sums the difference itself, which has
   no minimum. Delta phi is the angle between two displacements; the difference of two arctangents
   has jumps.
-* alpha_1, alpha_2, alpha_3 of eq. 16 are the single step alpha times the weights of eq. 12, which
-  the experiments name.
-* Lengths are measured in the mean distance of neighbouring points, which is close to a pixel of the
+* alpha_1, alpha_2, alpha_3 of eq. 16 are the single step alpha times the weights of eq. 12, as in
+  the paper's experiments.
+* The unit of length is the mean distance of neighbouring points, which is close to a pixel of the
   paper's map. The scale of J_cur depends on the unit, and in metres the descent diverges. A step
   that would increase the cost is halved instead.
 * The first two and the last two points are fixed, since the car's heading at the ends is given.
 
 The points are the control points of a cubic B-spline, which has headings and a continuous
-curvature. At a knot its curvature is close to the curvature of three neighbouring points, which
-J_cur limits. No term is a strict limit, so that a smooth path may exceed the curvature limit, often
-because a wall near an end pushes the points next to the fixed ones. Then points between the given
-and the smooth path are tried, and finally the given path is returned. A given path at the curvature
-limit leaves no freedom: search with nine tenths of the limit. World frame in the plane, SI units.
+curvature. At a knot the spline's curvature is close to the curvature of three neighbouring points,
+which J_cur limits. No term is a strict limit, so that a smooth path may exceed the curvature limit.
+This often happens if a wall near an end pushes the points next to the fixed points. Points between
+the given and the smooth path are then tried, and at last the given path is returned. A given path
+at the curvature limit leaves no freedom; the caller should search with nine tenths of the limit.
+Positions are in the world frame in the plane, in SI units.
 """
 
 import dataclasses
@@ -35,7 +36,7 @@ from jax import Array, lax
 from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
-_FINE = 8  # samples per piece of the spline, for its length
+_FINE = 8  # number of samples per piece of the spline, for the computation of its length
 # Fractions of the shift from given to smooth points that are tried; at 0 only the spline smooths.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
 # Relative tolerance for rounding, since searched arcs have exactly the greatest curvature.
@@ -46,13 +47,13 @@ _CURVATURE_TOLERANCE = 1e-3
 class Smoothing:
     """Weights and step of [Qu2022, Section V-C], and sizes of the compiled program."""
 
-    obstacle: float = 0.1
-    curvature: float = 0.1
-    smoothness: float = 0.2
-    step: float = 0.25
+    obstacle: float = 0.1  # weight of J_obs
+    curvature: float = 0.1  # weight of J_cur
+    smoothness: float = 0.2  # weight of the smoothness term
+    step: float = 0.25  # initial step size alpha of gradient descent
     reach: float = 0.5  # [m], d_max, range of obstacles; not in the paper
-    iterations: int = 100
-    stride: int = 4  # poses between two points that move
+    iterations: int = 100  # number of gradient steps
+    stride: int = 4  # number of poses from one moving point to the next
     margin: float = 0.01  # [m], distance from walls; covers the gaps between poses
 
 
@@ -63,7 +64,7 @@ class SmoothPath:
     poses: Array  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
     curvature: Array  # (N,) [1/m]
     length: Array  # () [m]
-    is_smooth: Array  # () bool; False if the given path is returned
+    is_smooth: Array  # () bool; False if the given path is returned unchanged
     share: Array  # (), fraction of the shift from given to smooth points; 0 if not smooth
 
 
@@ -79,10 +80,10 @@ def smooth_path(
     upper: Array,
     settings: Smoothing = Smoothing(),
 ) -> SmoothPath:
-    """Smooth a path; return it unchanged if every smooth one would break a limit.
+    """Smooth a path; return it unchanged if every smooth path would break a limit.
 
-    A limit is broken in a wall, outside the map, or above the greatest curvature. Pure, for one
-    case; use `vmap` for a batch.
+    A path breaks a limit if it touches a wall, leaves the map, or exceeds the greatest curvature.
+    Pure, for one case; use `vmap` for a batch.
 
     Args:
         poses: (N, 3) at equal distances, N - 1 a multiple of the stride.
@@ -109,7 +110,7 @@ def smooth_path(
     middle = 0.5 * (body[0] + body[1])
 
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
-        """Return a path between the given and the smooth one, and whether it keeps all limits."""
+        """Return the path at a fraction of the shift, and whether it keeps all limits."""
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])
         x, y, heading = found.T
@@ -139,7 +140,7 @@ def smooth_path(
 def smooth_points(
     points: Array, walls: Obstacles, curvature: Array, settings: Smoothing = Smoothing()
 ) -> Array:
-    """Return points (n + 1, 2) [m] after gradient descent [Qu2022, eq. 16]; the ends are fixed.
+    """Return the points (n + 1, 2) [m] after gradient descent on the cost [Qu2022, eq. 16].
 
     Args:
         points: (n + 1, 2) [m], about equally spaced, such as `control_points`.
@@ -157,7 +158,7 @@ def smooth_points(
 
     def descend(state: tuple, _: None) -> tuple[tuple, None]:
         points, value, slope, step = state
-        # The cost has lengths in units: its gradient by units is `unit` times the one by metres.
+        # The cost has lengths in units: its gradient by units is `unit` times that by metres.
         moved = points - jnp.where(moves[:, None], step * unit**2 * slope, 0.0)
         new = (moved, *value_and_slope(moved))
         is_lower = new[1] <= value
@@ -183,7 +184,7 @@ def smoothing_cost(
         unit: () [m], unit of length.
         walls: standing obstacles.
         curvature: () [1/m], kappa_max.
-        settings: weights and reach.
+        settings: weights, and the range `reach` of obstacles.
     """
     steps = (points[1:] - points[:-1]) / unit
     before, after = steps[:-1], steps[1:]
@@ -202,8 +203,8 @@ def control_points(poses: Array, curvatures: Array) -> Array:
     """Return control points (n + 1, 2) [m] of a B-spline close to poses (n + 1, 3).
 
     A cubic B-spline deviates from a control point by a sixth of the second difference of the points
-    around it. Inner points are shifted to compensate. The points next to the ends are placed so
-    that the curvature at the ends is the given one.
+    around it. Inner points are shifted to compensate for this deviation. The points next to the
+    ends are placed so that the spline has the given curvature at its ends.
 
     Args:
         poses: (n + 1, 3), about equally spaced.
@@ -243,7 +244,7 @@ def resample(
     pieces = points.shape[0] - 1
     control = _clamp_ends(points, start_heading, end_heading)
     places = jnp.linspace(0.0, pieces, pieces * _FINE + 1, dtype=points.dtype)
-    # Simpson's rule on every pair of half steps.
+    # Lengths by Simpson's rule, with the midpoint of every interval as the middle node.
     half = 0.5 / _FINE
     speed, between = (
         jnp.linalg.norm(_spline(control, at)[1], axis=1) for at in (places, places[:-1] + half)
@@ -261,10 +262,10 @@ def resample(
 
 
 def _clamp_ends(points: Array, start_heading: Array, end_heading: Array) -> Array:
-    """Add a control point beyond each end, (n + 3, 2), so that the spline meets the ends.
+    """Add a control point beyond each end, (n + 3, 2), for the headings [rad] at both ends.
 
-    The first and the last point are shifted, so that the spline starts and ends at their original
-    positions.
+    The first and the last control point are shifted, so that the spline starts and ends at their
+    original positions.
     """
 
     def end(at: Array, beside: Array, heading: Array) -> tuple[Array, Array]:
@@ -277,14 +278,15 @@ def _clamp_ends(points: Array, start_heading: Array, end_heading: Array) -> Arra
 
 
 def _mean_distance(points: Array) -> Array:
-    """Return the mean distance () [m] of neighbouring points."""
+    """Return the mean distance () [m] between neighbouring points of a path."""
     return jnp.mean(jnp.linalg.norm(points[1:] - points[:-1], axis=1))
 
 
 def _nearest(points: Array, walls: Obstacles) -> Array:
-    """Return the distance (n,) [m] of points from the nearest wall.
+    """Return the distances (n,) [m] of points from their nearest walls.
 
-    Its gradient is the known unit vector away from the wall, without differentiating the distance.
+    The gradient is the unit vector away from the nearest wall. It is known in closed form, so that
+    the distance itself is not differentiated.
     """
     fixed = lax.stop_gradient(points)
     x, y = fixed.T
@@ -299,7 +301,7 @@ def _spline(control: Array, place: Array) -> tuple[Array, Array, Array]:
 
     Args:
         control: (n + 3, 2), control points of the knots -1, 0, ..., n + 1.
-        place: (M,), in knots, from 0 to n.
+        place: (M,), positions in units of knots, from 0 to n.
     """
     k = jnp.clip(place.astype(jnp.int32), 0, control.shape[0] - 4)
     u = (place - k)[:, None]

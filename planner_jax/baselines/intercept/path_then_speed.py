@@ -1,7 +1,7 @@
-"""Planners that first find a path and then a speed along it [Qu2022].
+"""Planners that first find a path and then a speed along the path [Qu2022].
 
-If an obstacle stays on the path, no speed along the path avoids it. These planners therefore try
-several paths that pass the standing obstacles on different sides.
+An obstacle that stays on a path cannot be avoided by a speed along this path. These planners
+therefore try several paths, which pass the standing obstacles on different sides.
 """
 
 import dataclasses
@@ -26,17 +26,17 @@ from planner_jax.task.intercept.searches import Search, make_grid
 
 @dataclasses.dataclass(frozen=True)
 class SpeedStep:
-    """Settings of the speed step, which all path sources share; static."""
+    """Settings of the second step, which plans a speed along a given path; static."""
 
-    # None: constant speed, moving obstacles are ignored.
+    # The speed planner. With None the car drives at constant speed and ignores moving obstacles.
     speed: SpeedPlanner | None = dataclasses.replace(SPEED_PLANNERS["trapezoid"], pieces=20)
     projection: Projection = Projection()
     slack: float = 0.015  # fraction of every limit that stays unused
     pieces: int = 200  # number of pieces of the plan's speed and curvature
-    checked: int = 2  # samples per piece at which distances from obstacles are computed
+    checked: int = 2  # number of samples per piece at which obstacle distances are computed
 
     def problem(self, case: InterceptCase, path: Path) -> StationTimeProblem:
-        """Return the station-time problem of driving along a path."""
+        """Return the problem of reaching a path's end in time, as stations over time."""
         return station_time_problem(
             path,
             case.movers,
@@ -49,7 +49,7 @@ class SpeedStep:
         )
 
     def drive(self, case: InterceptCase, path: Path, problem: StationTimeProblem) -> InterceptPlan:
-        """Return the plan along one path: the planned speed, with the curvature of the path."""
+        """Plan the speed along one path, and return it with the path's curvature as a plan."""
         times = jnp.linspace(0.0, 1.0, self.pieces + 1) * case.time
         if self.speed is None:
             station, speed = ramp_and_cruise(problem, times)
@@ -78,9 +78,9 @@ class SpeedStep:
 def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, Array]:
     """Return station [m] and speed [m/s] at times (M,) for a short ramp to a constant speed.
 
-    The ramp has the greatest acceleration a. Its speed change d makes the car reach the end of the
-    path at the horizon T if possible: the path length is v0 T + d T - d |d| / (2 a). [Qu2022]
-    compares with constant speed (Fig. 4) and leaves out the ramp.
+    The ramp has the greatest acceleration a. Its speed change d is chosen so that the car reaches
+    the end of the path at the horizon T if possible: (path length) = v0 T + d T - d |d| / (2 a).
+    [Qu2022] compares with constant speed (Fig. 4) and leaves out the ramp.
     """
     limit, horizon = problem.acceleration_limit, problem.horizon
     missing = problem.end_station - problem.initial_speed * horizon
@@ -96,14 +96,14 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathThenSpeed(Planner):
-    """A planner that reaches the target at the case's time along the best of several paths."""
+    """A planner that reaches the target at the case's time, on the best of several paths."""
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     source: PathSource = PathSource()
     step: SpeedStep = SpeedStep()
-    # Number of paths that get a speed, ranked by the acceleration of their lines from dynamic
-    # programming; None: all paths.
+    # Number of paths for which a speed is planned; None: all paths. Paths are ranked by the cost of
+    # the line that dynamic programming finds in their station-time graphs.
     tries: int | None = None
     searches: tuple[Search, ...] = (Search(8),)
 
@@ -114,15 +114,15 @@ class PathThenSpeed(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches; `paths` of a search is their number."""
+        """The searches; the field `paths` of a search is the number of paths to try."""
         return self.searches
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plan of one case: the best among all paths that get a speed."""
+        """Return the plan of one case: the best plan among all paths for which a speed exists."""
         return self.solve_in_layers(case, attempt, None)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch, computed together."""
+        """Return the plans of a batch, computed together with `vmap`."""
         # Every case uses the largest number of layers, so that all loops have the same length.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
@@ -130,7 +130,7 @@ class PathThenSpeed(Planner):
     def solve_in_layers(
         self, case: InterceptCase, attempt: Search, layers: Array | None
     ) -> InterceptPlan:
-        """Return the plan of one case; `layers` () int32 sets the reach set's number of layers."""
+        """Return the plan of one case; `layers` () int32 is the reach set's number of layers."""
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
@@ -152,7 +152,7 @@ class PathThenSpeed(Planner):
         return jax.tree.map(lambda leaf: leaf[best_of(drives)], drives)
 
     def rank_paths(self, problems: StationTimeProblem, violation: Array) -> Array:
-        """Return the indices of the paths (P,), the most promising path first."""
+        """Return the indices of the paths (P,), sorted by acceleration, violating paths last."""
         grid = (self.step.speed or SPEED_PLANNERS["trapezoid"]).grid
         lines = jax.vmap(lambda problem: reference_line(problem, grid))(problems)
         cost = jnp.where(lines.found, lines.cost, 1e6) + jnp.where(violation > 0.0, 1e3, 0.0)
@@ -162,8 +162,8 @@ class PathThenSpeed(Planner):
 def best_of(plans: InterceptPlan) -> Array:
     """Return the index of the best of several plans of one case.
 
-    A solved plan of least cost is best, then the plan with the smallest violation. A plan without a
-    line through the station-time graph is worse than a plan without a curve beside the line.
+    The best plan is the solved plan of least cost, or else the plan with the smallest violation. A
+    path without any free line through its station-time graph comes last.
     """
     cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
     cost = jnp.where(jnp.isfinite(cost), cost, 1e6)
@@ -171,22 +171,22 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Create the planner of eight paths with curves in corridors; options are its fields."""
+    """Create the planner `lattice`: eight paths, curves in corridors; `fields` are its options."""
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 
 def em(**fields: object) -> PathThenSpeed:
-    """Create the planner with the best path and the speed step of the EM planner.
+    """Create the planner `em`: the best path, with the speed step of the EM planner [Fan2018].
 
-    The speed step has the pieces and sample times of `lattice`; options are fields of the planner.
+    The speed step has the pieces and sample times of `lattice`; `fields` are the planner's options.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})
 
 
 def constant(**fields: object) -> PathThenSpeed:
-    """Create the planner that drives the best path at constant speed, ignoring movers.
+    """Create the planner that drives the best path at constant speed, ignoring moving obstacles.
 
-    A short ramp from the initial speed comes first; options are fields of the planner.
+    A short ramp from the initial speed comes first; `fields` are the planner's options.
     """
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=None), **fields})

@@ -1,11 +1,12 @@
 """Projection of moving obstacles onto a path: quadrangles in the plane of station and time.
 
-The body at a point of the path and a polygon in uniform motion overlap during one time interval.
-The separating axis theorem gives this interval exactly: along the normal of each edge the body and
-the polygon cover intervals, the polygon's interval moves uniformly, and the result is the
-intersection over all axes. Along the path these time intervals form a region. On a curved path the
-region can have several runs. Each run is divided into slabs of equal duration, and each slab is
-covered by a quadrangle ([Qu2022, Section IV-A] has parallelograms, the shape on a straight path).
+A station is a distance along the path. The car's body at a point of the path and a polygon in
+uniform motion overlap during one time interval. The separating axis theorem gives this interval
+exactly: along the normal of each edge, body and polygon cover intervals, and the polygon's interval
+moves uniformly. The time interval is the intersection over all axes. Along the path these time
+intervals form a region. On a curved path the region can have several runs of consecutive points.
+Each run is divided into slabs of equal duration, and a quadrangle covers each slab. [Qu2022,
+Section IV-A] has parallelograms, which is the shape on a straight path.
 """
 
 import dataclasses
@@ -20,17 +21,17 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-# Candidate slopes of an edge, in (height of the slab) / duration.
+# Candidate slopes of a quadrangle's edge, in (height of the slab) / (duration of the slab).
 _SLOPES = np.linspace(-2.0, 2.0, 17)
 _BEFORE = 0.05  # fraction of the horizon that is projected before its start and after its end
 
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
-    """Numbers of runs and slabs of a projection, and its margin; static."""
+    """Numbers of runs and slabs that cover an obstacle's blocked region; its margin; static."""
 
-    runs: int = 2  # runs of one obstacle; further runs are joined to the last one
-    slabs: int = 4  # slabs of one run
+    runs: int = 2  # runs of consecutive blocked points per obstacle; further runs join the last
+    slabs: int = 4  # number of slabs of equal duration in one run
     margin: float = 0.01  # [m], distance of the body from obstacles
 
 
@@ -44,7 +45,7 @@ def station_time_problem(
     projection: Projection = Projection(),
     slack: float = 0.0,
 ) -> StationTimeProblem:
-    """Return the problem of driving along a path among moving obstacles, to reach its end in time.
+    """Return the problem of reaching the end of a path in time, among moving obstacles.
 
     The car starts without acceleration [Qu2022, Section V-C].
 
@@ -53,9 +54,9 @@ def station_time_problem(
         movers: moving obstacles.
         body: body of the car.
         limits: limits of the car.
-        horizon: () [s].
+        horizon: () [s], when the car must be at the end of the path.
         speed: () [m/s], at time 0.
-        projection: sizes.
+        projection: numbers of runs and slabs, and the margin.
         slack: fraction of every limit that stays unused.
     """
     return StationTimeProblem(
@@ -90,7 +91,7 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
 def project_obstacles(
     path: Path, movers: Obstacles, body: CarBody, horizon: Array, projection: Projection
 ) -> Blocked:
-    """Return P = M * runs * slabs quadrangles that cover everything M obstacles block."""
+    """Return P = M * runs * slabs quadrangles that cover everything that M obstacles block."""
     half_step = 0.5 * path.length / (path.curvature.shape[0] - 1)
     begin, finish = overlap(path, movers, body, half_step, projection.margin)
     first, last = -_BEFORE * horizon, (1.0 + _BEFORE) * horizon
@@ -114,9 +115,9 @@ def overlap(
 ) -> tuple[Array, Array]:
     """Return when the body overlaps M obstacles at N path points: start and end [s], (M, N) each.
 
-    The body is enlarged by the margin [m], and so that the interval is valid for half a step () [m]
-    before and after each point. Without an overlap the interval starts after its end. For an
-    obstacle at rest it may be infinite.
+    The body is enlarged by the margin [m]. It is enlarged further so that each interval holds for
+    half a step () [m] of the path before and after its point. Without an overlap the interval
+    starts after its end. For an obstacle at standstill the interval may be infinite.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -145,7 +146,7 @@ def overlap(
         mine = [x * corner[:, 0] + y * corner[:, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
-        # They overlap while -after < rate t < before.
+        # Body and polygon overlap while -after < rate t < before.
         before = _most(mine) - _least(other)
         after = _most(other) - _least(mine)
         is_still = jnp.abs(rate) < 1e-7
@@ -179,10 +180,10 @@ def _least(values: list[Array]) -> Array:
 def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Cover a run with quadrangles (slabs,).
+    """Cover a run, the consecutive blocked points of a path, with quadrangles (slabs,).
 
-    The run consists of the path points `own` (N,) bool, which are blocked from `begin` to `finish`
-    (N,) [s].
+    The run consists of the path points where `own` (N,) bool is True. An obstacle blocks each point
+    from `begin` to `finish` (N,) [s].
     """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))
@@ -192,14 +193,14 @@ def _cover_run(
     start = first + width * jnp.arange(slabs)
     middle = (start + 0.5 * width)[:, None]
     is_in = own & (begin < start[:, None] + width) & (finish > start[:, None])  # (slabs, N)
-    # Every point blocks a rectangle; its sides are relative to the slab's middle.
+    # Every point blocks a rectangle. The times of its sides are relative to the slab's middle.
     left = jnp.clip(begin - middle, -0.5 * width, 0.5 * width)
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """Return the lowest line above the upper corners (side 1).
+        """Return the lowest line above the rectangles' upper corners (side 1).
 
-        Side -1 gives the highest line below the lower corners.
+        Side -1 gives the highest line below their lower corners.
         """
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)

@@ -3,12 +3,12 @@
     minimise x' Q x / 2   subject to   E x = e,   lower <= R x <= upper
 
 with Q, E and R constant; e, lower and upper differ between programs. All work that depends only on
-the matrices is done once, in double precision on the host: x = base e + Z y with Z' Q Z = 1 turns
-the program into finding the shortest y between pairs of parallel planes. The start y = 0 is the
-optimum without bounds. The dual method of [Goldfarb1983] adds one plane after another to its
-working set. It takes as many steps as planes are active at the optimum, unless a plane has to leave
-the working set again. The linear algebra consists of matrix products, without factorisations, so
-that a batch is a batch of products.
+the matrices is done once, in double precision on the host. The substitution x = base e + Z y with
+Z' Q Z = 1 turns the program into finding the shortest y between pairs of parallel planes. The start
+y = 0 is the optimum without bounds. The dual method of [Goldfarb1983] adds one plane after another
+to its working set. The number of steps is the number of active planes at the optimum, plus two for
+each plane that leaves the working set again. The linear algebra consists of matrix products without
+factorisations, so that a batch of programs is computed as batched products.
 """
 
 import dataclasses
@@ -27,11 +27,11 @@ from planner_jax.core.protocol import Status
 
 @struct.dataclass
 class QpTemplate:
-    """The part that programs of the same matrices share, in double precision; see `qp_template`."""
+    """The arrays that programs with equal matrices share, computed by `qp_template`."""
 
     base: Array | np.ndarray  # (n, q), maps e to the optimum without bounds
     base_cost: Array | np.ndarray  # (q, q), the cost of this optimum is e' base_cost e
-    directions: Array | np.ndarray  # (n, d) Z
+    directions: Array | np.ndarray  # (n, d), Z
     reach: Array | np.ndarray  # (M, q), maps e to R x at the optimum without bounds
     normals: Array | np.ndarray  # (M, d), unit rows of R Z; 0 if the equalities fix the row of R x
     scales: Array | np.ndarray  # (M,), lengths of the rows of R Z; 1 if the equalities fix the row
@@ -39,9 +39,9 @@ class QpTemplate:
 
 @struct.dataclass
 class QpSolution:
-    """One solution, or a batch of solutions with a leading axis on every leaf."""
+    """The solution of one program, or a batch of solutions with a leading axis on every leaf."""
 
-    point: Array  # (n,) x
+    point: Array  # (n,), x
     cost: Array  # (), x' Q x / 2
     multiplier: Array  # (M,), derivative of the cost by a bound: > 0 lower, < 0 upper, 0 inactive
     violation: Array  # (), the largest excess over a bound, relative to 1 + |bound|
@@ -51,7 +51,7 @@ class QpSolution:
 
 @dataclasses.dataclass(frozen=True)
 class QpConfig:
-    """Sizes of the method. Programs that they leave unsolved get status MAX_STEPS."""
+    """Sizes of the dual method; a program that exceeds them gets the status MAX_STEPS."""
 
     active: int = 64  # greatest number of active bounds; at most the number d of unknowns
     max_steps: int = 60
@@ -60,14 +60,14 @@ class QpConfig:
 def qp_template(
     hessian: ArrayLike, equalities: ArrayLike, rows: ArrayLike, zeros: ArrayLike | None = None
 ) -> QpTemplate:
-    """Prepare the part that programs of these matrices share; NumPy, in double precision.
+    """Compute the arrays that all programs with these matrices share, in double precision.
 
     A term linear in x can be written as a product with an unknown that an equality fixes to 1.
 
     Args:
         hessian: (n, n) Q, symmetric, positive definite on the null space of E.
         equalities: (q, n) E, independent rows.
-        rows: (M, n) R.
+        rows: (M, n) R, bounded rows.
         zeros: (z, n), more rows of equalities, whose right sides are always 0.
 
     Raises:
@@ -108,20 +108,20 @@ def qp_template(
 
 @struct.dataclass
 class _Search:
-    """State of the search of one program: a point, and the working set on which it is optimal."""
+    """State of the dual method: a point, and the working set of planes for which it is optimal."""
 
-    point: Array  # (d,) y
+    point: Array  # (d,), y
     excess: Array  # (M,), distance beyond the nearer plane of each pair, less the tolerance
     maps: Array  # (d + A, d): projector orthogonal to the working set, and its pseudo-inverse
     rows: Array  # (A,) int32, planes of the working set
-    sides: Array  # (A,), 1 for a lower bound, -1 for an upper bound, 0 for a free slot
-    multipliers: Array  # (A,)
+    sides: Array  # (A,), 1 for a lower bound, -1 for an upper bound, 0 for an unused entry
+    multipliers: Array  # (A,), Lagrange multipliers of the working set
     held: Array  # (M,) bool, whether a row is in the working set
     entering: Array  # () int32, the plane that is being added; -1 if none is selected
     pressure: Array  # (), multiplier of the entering plane
-    steps: Array  # () int32
+    steps: Array  # () int32, number of planes added and dropped
     status: Array  # () int32: MAX_STEPS, or INFEASIBLE if no step is possible
-    is_stuck: Array  # () bool, whether no step is possible or no slot is free
+    is_stuck: Array  # () bool, whether no step is possible or the working set is full
 
 
 def solve_qp(
@@ -133,20 +133,19 @@ def solve_qp(
 ) -> QpSolution:
     """Return the optimum of one program; differentiable by the right side and the bounds.
 
-    Derivatives hold the working set fixed, which is exact unless an active bound has a multiplier
+    Derivatives hold the working set fixed. They are exact unless an active bound has a multiplier
     of zero. In single precision the relative error of the cost is about 1e-6.
 
     Args:
-        template: prepared matrices.
+        template: the arrays from `qp_template`.
         right_side: (q,) e.
         lower: (M,), -inf for no bound.
         upper: (M,), inf for no bound.
-        config: sizes.
+        config: sizes of the method.
 
     Returns:
-        The solution, or the best point found if the program has no solution. Rows whose values
-        follow
-        from the equalities alone count in `violation` too, and can make the program infeasible.
+        The solution, or the best point found if the program has no solution. A row whose value the
+        equalities alone decide also counts in `violation`, and can make the program infeasible.
     """
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
@@ -194,7 +193,7 @@ def solve_qp(
 def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """Run the dual method from the empty working set to the optimum."""
+    """Run the dual method from the empty working set until the point is optimal or stuck."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype
@@ -213,7 +212,7 @@ def _search(
         reached = jnp.sum(normal * s.point)
         side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
         gap = jnp.maximum(low[row] - reached, reached - high[row])
-        # Direction of the point as the plane is added, and rates at which multipliers decrease.
+        # Direction of the point while the plane is added, and the rates at which multipliers fall.
         both = _product(s.maps, side * normal)
         move, fall = both[:size], both[size:]
         freedom = jnp.sum(move**2)

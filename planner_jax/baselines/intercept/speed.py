@@ -1,8 +1,9 @@
 """Speed along a known path: the second half of [Qu2022] (Section IV), and its baselines.
 
-Dynamic programming finds a line through the station-time graph. A quadratic program then finds the
-curve of least acceleration that passes every polygon on the same side as the line. The planners
-differ in the bounds that they derive from the polygons.
+The station is the distance along the path. Dynamic programming finds a line through the graph of
+station over time. A quadratic program then finds the curve of least acceleration that passes every
+blocked polygon on the same side as the line. The planners of this module differ in the bounds that
+they derive from the polygons.
 """
 
 import dataclasses
@@ -36,14 +37,14 @@ from planner_jax.core.protocol import Plan, Status
 
 @struct.dataclass
 class SpeedPlan(Plan):
-    """One plan, or a batch of plans with a leading axis on every leaf.
+    """The station over time along one path, or a batch of plans with a leading axis on every leaf.
 
     The cost is [Qu2022, eq. 19] divided by w_1: the integral of the squared acceleration [m^2/s^3],
     plus the end term if the end is soft. The violation is relative to path length and horizon.
     """
 
     curve: BezierCurve  # station [m] as a function of time [s]
-    reference: ReferenceLine  # the line that selects the side of each polygon
+    reference: ReferenceLine  # the line that decides on which side of each polygon the curve is
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,11 +54,11 @@ class SpeedPlanner:
     `SPEED_PLANNERS` holds the planners of [Qu2022, Table II] by name.
     """
 
-    pieces: int = 10
-    degree: int = 5
-    lines: Literal["tilted", "edges", "flat"] = "tilted"
-    # None bounds the control points of each piece, so that the bounds hold everywhere. A number
-    # bounds that many samples of each piece, including its end.
+    pieces: int = 10  # number of Bezier pieces of a curve
+    degree: int = 5  # degree of the pieces
+    lines: Literal["tilted", "edges", "flat"] = "tilted"  # bounds from polygons, see `corridor`
+    # With None the bounds apply to the control points of each piece, so that they hold everywhere.
+    # With a number they apply to that many samples of each piece, including its end.
     samples: int | None = None
     margin: float = 1e-3  # [m], distance from polygons
     # w_2 T^3 / w_1 of a soft end, 300 for the paper's weights and T = 10 s. None: an exact end.
@@ -66,9 +67,9 @@ class SpeedPlanner:
     solver: QpConfig = QpConfig()
 
 
-# "tilted" lines are this library's choice, "edges" the choice of [Qu2022]. "em" is the speed step
-# of [Fan2018]: bounds at samples, every 0.1 s of a horizon of 10 s, from intervals that are free
-# for a whole piece.
+# "tilted" lines are this library's choice, "edges" are the choice of [Qu2022]. "em" is the speed
+# step of [Fan2018]. Its bounds apply to samples, every 0.1 s of a horizon of 10 s, and come from
+# stations that are free for a whole piece.
 SPEED_PLANNERS = {
     "trapezoid": SpeedPlanner(),
     "trapezoid-edges": SpeedPlanner(lines="edges"),
@@ -80,8 +81,8 @@ SPEED_PLANNERS = {
 def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner()) -> SpeedPlan:
     """Return the station curve of least acceleration [Qu2022, eqs 17-24]; pure, for one problem.
 
-    The status is NO_PATH if no line on the grid is free, and INFEASIBLE if no curve fits the bounds
-    around the line.
+    The status is NO_PATH if no line on the grid is collision-free, and INFEASIBLE if no curve fits
+    the bounds around the line.
     """
     reference = reference_line(problem, planner.grid)
     bounds = speed_bounds(problem, reference, planner)
@@ -101,12 +102,12 @@ def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner
 
 @functools.cache
 def speed_matrices(planner: SpeedPlanner) -> dict[str, np.ndarray]:
-    """Return the matrices of a planner's program, the arguments of `qp_template`.
+    """Return the matrices of a planner's quadratic program, the arguments of `qp_template`.
 
-    They are scaled to a path length of 1 and a horizon of 1. The unknowns are the control points of
-    all pieces; a soft end adds the target station as an unknown. The right sides are the initial
-    speed, the initial acceleration and the final station. The bounded rows are stations, then
-    speeds, then accelerations, each at control points or at samples.
+    The matrices are scaled to a path length of 1 and a horizon of 1. The unknowns are the control
+    points of all pieces; a soft end adds the target station as an unknown. The right sides are the
+    initial speed, the initial acceleration and the final station. The bounded rows are stations,
+    then speeds, then accelerations, each at control points or at samples.
     """
     pieces, degree = planner.pieces, planner.degree
     size = pieces * (degree + 1)
@@ -129,12 +130,12 @@ def speed_matrices(planner: SpeedPlanner) -> dict[str, np.ndarray]:
 
 @functools.cache
 def speed_template(planner: SpeedPlanner) -> QpTemplate:
-    """Return the part of the quadratic program that all problems of a planner share."""
+    """Return the arrays of the quadratic program that all problems of a planner share."""
     return qp_template(**speed_matrices(planner))
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return the bounded rows of a derivative in one piece: control points or samples."""
+    """Return one piece's bounded rows of a derivative of an order: control points or samples."""
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows
@@ -142,11 +143,11 @@ def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
 
 
 def _shares(planner: SpeedPlanner) -> np.ndarray:
-    """Return the positions in a piece, from 0 to 1, at which stations are bounded.
+    """Return the positions in a piece, as fractions from 0 to 1, at which stations are bounded.
 
-    Without samples they are the equally spaced positions that belong to the control points. A curve
-    lies on one side of a straight line if every control point lies on that side of the line's value
-    at its position.
+    If control points are bounded, the position of control point i of n + 1 is i / n. A curve lies
+    on one side of a straight line if each control point lies on that side of the line's value at
+    the control point's position.
     """
     num = planner.samples or planner.degree
     return np.arange(num + 1) / num
@@ -157,8 +158,8 @@ def speed_bounds(
 ) -> tuple[Array, Array, Array]:
     """Return the right sides (3,), lower and upper bounds (M,) of one problem's program.
 
-    Lengths are in units of the path length, times in units of the horizon. The curve keeps to the
-    side of each polygon on which the reference line is.
+    Lengths are in units of the path length, times in units of the horizon. The bounds keep the
+    curve on the reference line's side of each polygon.
     """
     pieces = planner.pieces
     around = corridor(problem, reference.station, pieces, planner.lines)

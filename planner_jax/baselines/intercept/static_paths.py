@@ -1,11 +1,12 @@
 """Paths that pass standing obstacles on different sides, for planners that split path and speed.
 
-The paths come from the machinery of the `spacetime` planner, for a case without moving obstacles
-and with a target that stands at the meeting point. Random paths through the reach set are compared
-by the side on which they pass each wall: the angle by which a path turns around a wall's centre
-differs by whole turns between two paths if and only if the wall lies between them. The paths that
-differ most are refined by least squares, each with its own arrival time; their speeds are then
-discarded. Some paths are longer than necessary, because moving obstacles may block all short ones.
+The paths are planned by the parts of the planner `spacetime`, for a case without moving obstacles
+and with a target that stands at the meeting point. Random paths are drawn through the reach set,
+the cells that the car can reach at each time. Two paths are compared by the side on which they pass
+each wall. The angle by which a path turns around a wall's centre differs by whole turns between two
+paths if and only if the wall lies between the paths. The paths that differ most are refined by
+least squares, each with its own arrival time; their speeds are then discarded. Some paths are
+longer than necessary on purpose, because moving obstacles may block all short paths.
 """
 
 import dataclasses
@@ -26,16 +27,16 @@ from planner_jax.task.intercept.problem import Guess, MotionProblem
 from planner_jax.task.intercept.searches import Reachability, Search, draw_cell_path, search_reach
 from planner_jax.task.intercept.terms import wrap
 
-_SHARES = 8  # points of a path at which it is compared with others
-_OTHER_SIDE = 8.0  # [m], added distance of paths that pass a wall on different sides
+_SHARES = 8  # number of points of a path at which it is compared with other paths
+_OTHER_SIDE = 8.0  # [m], added to the distance of two paths that pass a wall on different sides
 
 
 @struct.dataclass
 class StaticPaths:
-    """P paths of one case, and the quality of the drives along them."""
+    """P paths of one case, and the largest violation of the refined motion along each path."""
 
     paths: Path  # leaves (P, ...)
-    violation: Array  # (P,), largest relative excess of the refined drive; <= 0 keeps all limits
+    violation: Array  # (P,), largest relative excess of the refined motion; <= 0 keeps all limits
     is_reached: Array  # () bool, whether a sequence of cells reaches the meeting point in time
     steps: Array  # () int32, greatest number of least-squares steps of any path
 
@@ -43,19 +44,19 @@ class StaticPaths:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathSource:
-    """A source of paths; an attempt's `paths` is their number."""
+    """Settings of the search for several different paths; an `attempt` sets their number."""
 
     problem: MotionProblem = MotionProblem()
-    drawn: int = 8  # random paths per returned path; the most different ones are refined
-    later: int = 10  # arrival layers after the earliest one, over which random paths cycle
+    drawn: int = 8  # number of random paths per returned path; the most different are refined
+    later: int = 10  # number of arrival times after the earliest over which random paths cycle
     points: int = 129  # number of points of a path
 
     def paths(
         self, case: InterceptCase, attempt: Search, layers: Array | None = None
     ) -> StaticPaths:
-        """Find the paths of one case; the attempt's `paths` is their number.
+        """Find several paths of one case; the attempt's field `paths` is their number.
 
-        `layers` is the number of layers of the reach set; see `search_reach`.
+        `layers` is the number of time layers of the reach set; see `search_reach`.
         """
         still = without_movers(case)
         found = search_reach(still, attempt, is_time_free=True, layers=layers)
@@ -92,7 +93,7 @@ class PathSource:
     def guess(
         self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
-        """Return arrival time [s] and initial guess along a random path that ends at a layer."""
+        """Draw a random path that ends at a time layer; return arrival time [s] and its guess."""
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step
@@ -102,11 +103,11 @@ class PathSource:
     def select_different(
         self, case: InterceptCase, times: Array, guesses: Guess, num: int
     ) -> Array:
-        """Return the indices of `num` of D guesses that differ most.
+        """Return the indices of the `num` guesses, of D guesses, that differ most.
 
-        The shortest comes first; each next guess is the one farthest from all selected guesses. The
-        distance of two paths is the mean distance of their points at equal fractions of their
-        lengths, plus a large constant if they pass a wall on different sides.
+        The shortest guess comes first. Each next guess is the guess farthest from all selected
+        guesses. The distance of two paths is the mean distance of their points at equal fractions
+        of their lengths, plus a large constant if they pass a wall on different sides.
         """
         goal = case.target.at(case.time).pos
 
@@ -135,10 +136,10 @@ class PathSource:
 
 
 def without_movers(case: InterceptCase) -> InterceptCase:
-    """Return the case without movers, its target at rest at the meeting point."""
+    """Return the case without moving obstacles, with a target that stands at the meeting point."""
     goal = case.target.at(case.time).pos
     still = TurningPath(pos=goal, vel=jnp.zeros_like(goal), turn_rate=jnp.zeros_like(case.time))
-    # One absent obstacle, so that movers cost no computation.
+    # A single absent obstacle, so that moving obstacles need no computing time.
     none = Obstacles(
         centre=jnp.zeros((1, 2), goal.dtype),
         corners=jnp.zeros((1, 3, 2), goal.dtype),
@@ -153,9 +154,9 @@ def count_turns(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Arra
 
     Args:
         walls: N walls.
-        start: (2,) [m].
-        pos: (M, 2) [m], points of the path, close enough together not to jump past a wall's centre.
-        goal: (2,) [m].
+        start: (2,) [m], start of the path.
+        pos: (M, 2) [m], points of the path, so close that no step jumps past a wall's centre.
+        goal: (2,) [m], end of the path.
     """
     points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre
     angle = jnp.arctan2(points[..., 1], points[..., 0])  # (M + 2, N)

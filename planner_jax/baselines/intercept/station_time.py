@@ -1,9 +1,9 @@
-"""The station-time graph: when a known path is blocked, and lines through the graph.
+"""The station-time graph of a path: which stations are blocked when, and lines through the graph.
 
 A car follows a path of known length; its station is the distance travelled along the path.
 Obstacles that cross the path block stations for some time: polygons in the plane of time and
-station [Qu2022, Section IV-A]. This module has the problem, dynamic programming on a grid (eq. 17),
-and corridors of trapezoids beside the line that dynamic programming finds (eq. 22).
+station [Qu2022, Section IV-A]. This module contains the problem, dynamic programming on a grid (eq.
+17), and corridors of trapezoids beside the line that dynamic programming finds (eq. 22).
 """
 
 import dataclasses
@@ -19,18 +19,18 @@ from jax import Array, lax
 class Blocked:
     """Up to P quadrangles in the plane of time and station, each between two vertical sides.
 
-    With parallel edges they are the parallelograms of [Qu2022]. An obstacle that blocks a curved
-    path takes several quadrangles.
+    Quadrangles with parallel edges are the parallelograms of [Qu2022]. An obstacle that blocks a
+    curved path takes several quadrangles.
     """
 
-    start: Array  # (P,) [s], the left side
-    end: Array  # (P,) [s], the right side, later than `start`
+    start: Array  # (P,) [s], time of the left side
+    end: Array  # (P,) [s], time of the right side, later than `start`
     lower: Array  # (P, 2) [m], the lower edge at `start` and at `end`
-    upper: Array  # (P, 2) [m], the upper edge, above the lower one
+    upper: Array  # (P, 2) [m], the upper edge, above the lower edge
     present: Array  # (P,) bool, which of the P quadrangles are used
 
     def edges_at(self, time: Array) -> tuple[Array, Array]:
-        """Return stations (..., P) [m] of the lower and upper edge lines at times (..., P) [s]."""
+        """Return stations (..., P) [m] of lower and upper edges at times (..., P) [s]."""
         share = (time - self.start) / (self.end - self.start)
         return (
             self.lower[..., 0] + share * (self.lower[..., 1] - self.lower[..., 0]),
@@ -40,9 +40,9 @@ class Blocked:
 
 @struct.dataclass
 class StationTimeProblem:
-    """One problem: reach the end of a path at a given time without entering a blocked station.
+    """The problem of reaching a path's end at a given time without entering a blocked station.
 
-    The station is 0 at time 0 and never decreases.
+    The station is the distance along the path. It is 0 at time 0 and never decreases.
     """
 
     end_station: Array  # () [m], > 0, length of the path
@@ -56,20 +56,20 @@ class StationTimeProblem:
 
 @dataclasses.dataclass(frozen=True)
 class StationTimeGrid:
-    """Size of the grid: speeds are multiples of (station step) / (time step).
+    """Size of the dynamic programming grid: speeds are multiples of (station step) / (time step).
 
     From start to end a line rises by `stations / steps` station steps a time step on average. It
     rises by at most `jumps` station steps in one time step.
     """
 
-    stations: int = 60
-    steps: int = 20
-    jumps: int = 8
+    stations: int = 60  # number of station steps
+    steps: int = 20  # number of time steps
+    jumps: int = 8  # greatest number of station steps in one time step
 
 
 @struct.dataclass
 class ReferenceLine:
-    """The result of dynamic programming: straight edges between equally spaced times."""
+    """The line that dynamic programming finds: straight edges between equally spaced times."""
 
     station: Array  # (N + 1,) [m], at times 0, T / N, ..., T
     cost: Array  # () [m^2/s^3], sum of (change of speed)^2 / (time step)
@@ -81,16 +81,16 @@ def reference_line(
 ) -> ReferenceLine:
     """Return the line of least acceleration through the free part of the graph [Qu2022, eq. 17].
 
-    A state of the search is a station at a time together with the edge that leads to it, so that
-    the cost of an edge can include the squared change of speed from the previous edge. Stations
-    themselves cost nothing. An edge that enters a polygon anywhere along its length is forbidden.
+    A state of the search is a station at a time, together with the edge that leads to this station.
+    The cost of an edge can then include the squared change of speed from the previous edge. The
+    stations themselves have no cost. An edge that enters a polygon along its length is forbidden.
     """
     num, steps, jumps = grid.stations, grid.steps, range(grid.jumps + 1)
     station_step, step = problem.end_station / num, problem.horizon / steps
     speed = jnp.arange(grid.jumps + 1) * (station_step / step)
 
     def charge(before: Array) -> Array:
-        """Return the cost (J + 1, ...) of changing from speeds (...) to every speed."""
+        """Return the cost (J + 1, ...) of changing from speeds (...) to each speed of the grid."""
         change = (jnp.expand_dims(speed, range(1, 1 + before.ndim)) - before) / step
         is_allowed = jnp.abs(change) <= problem.acceleration_limit * (1.0 + 1e-5)
         return jnp.where(is_allowed, change**2 * step, jnp.inf)
@@ -118,7 +118,7 @@ def reference_line(
     )
 
     def step_back(node: tuple[Array, Array], cost: Array) -> tuple[tuple[Array, Array], Array]:
-        """Step back to the previous node, given the costs (J + 1, S + 1) of all candidates."""
+        """Return the node before `node` on the best line, given the costs of all candidates."""
         jump, place = node
         place = place - jump
         jump = lax.argmin(cost[:, place] + change[jump], 0, jnp.int32)
@@ -136,9 +136,9 @@ def reference_line(
 
 
 def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) -> Array:
-    """Return which edges are forbidden, (N, J + 1, S + 1) bool.
+    """Return which edges of the grid are forbidden, (N, J + 1, S + 1) bool.
 
-    Edges are indexed by time step, jump, and the station at which they end.
+    Edges are indexed by time step, jump (number of station steps), and the station of their end.
     """
     num, steps = grid.stations, grid.steps
     station_step, step = problem.end_station / num, problem.horizon / steps
@@ -160,7 +160,7 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
     below, above = jnp.where(is_shared, below, jnp.inf), jnp.where(is_shared, above, -jnp.inf)
     is_met = (station > below[..., None]) & (station < above[..., None])
 
-    # Least speed limit on the cells that an edge passes.
+    # The least speed limit on the grid's station cells that an edge passes.
     limit = jnp.min(
         problem.speed_limit[_parts_of_cells(num, problem.speed_limit.shape[-1])], axis=1
     )
@@ -198,31 +198,31 @@ def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
 
 
 def stations_at_joints(station: Array, pieces: int) -> Array:
-    """Interpolate a line (N + 1,) [m] at the ends of K equal pieces, (K + 1,) [m]."""
+    """Interpolate a line (N + 1,) [m] at the ends of K equal pieces of time, (K + 1,) [m]."""
     times = jnp.linspace(0.0, 1.0, station.shape[-1])
     return jnp.interp(jnp.linspace(0.0, 1.0, pieces + 1), times, station)
 
 
 @struct.dataclass
 class Corridor:
-    """Bounds on a curve in each of K equal pieces of the horizon, around a line.
+    """Bounds on a station curve in each of K equal pieces of the horizon, around a line.
 
-    A curve within the bounds enters no polygon. If it also keeps the speeds of its pieces, it keeps
-    the speed limit of every part of the path. Each polygon contributes one line in each piece, at
-    an infinite station if the polygon does not overlap the piece. With the two vertical sides of
-    the piece the lines bound trapezoids.
+    A curve within the bounds enters no polygon. If the curve also keeps the speeds of its pieces,
+    it keeps the speed limit of every part of the path. Each polygon contributes one line in each
+    piece, at an infinite station if the polygon does not overlap the piece. The lines and the two
+    vertical sides of the piece bound trapezoids.
     """
 
     lower: Array  # (K, P) [m], lines to stay above, at the start of the piece
     lower_rise: Array  # (K, P) [m], rise of these lines over the piece
-    upper: Array  # (K, P) [m], lines to stay below
-    upper_rise: Array  # (K, P) [m]
+    upper: Array  # (K, P) [m], lines to stay below, at the start of the piece
+    upper_rise: Array  # (K, P) [m], rise of these lines over the piece
     floor: Array  # (K,) [m], below it the path has a lower speed limit than the piece
     ceiling: Array  # (K,) [m], above it the path has a lower speed limit than the piece
     speed: Array  # (K,) [m/s], greatest speed in the piece
 
     def bounds(self, shares: Array) -> tuple[Array, Array]:
-        """Return least and greatest stations (K, S) [m] at positions (S,) of every piece."""
+        """Return least and greatest stations (K, S) [m] at fractions (S,) of every piece."""
         passed = shares[:, None]
         lower = self.lower[:, None] + passed * self.lower_rise[:, None]
         upper = self.upper[:, None] + passed * self.upper_rise[:, None]
@@ -241,16 +241,16 @@ def corridor(
     """Return the corridor around a line that enters no polygon [Qu2022, Section IV-C].
 
     A piece that a polygon covers completely is bounded by the polygon's edge. If a polygon starts
-    or ends within the piece, any line through the polygon's corner is valid. The paper continues
-    the edge, which excludes much free space. A line parallel to the curve excludes almost none; the
-    slope of the reference line is close enough to the slope of the curve.
+    or ends within the piece, any line through the polygon's corner is a valid bound. The paper
+    continues the edge, which excludes much free space. A line parallel to the curve would exclude
+    least. The curve is not known yet, but the slope of the reference line is close to its slope.
 
     Args:
         problem: one problem.
         station: (N + 1,) [m], the line, at equally spaced times from 0 to the horizon.
-        pieces: K.
-        lines: `tilted` takes the slope of the reference line where it may; `edges` continues the
-            polygon's edge; `flat` makes rectangles.
+        pieces: K, number of pieces.
+        lines: slope of the bounds: "tilted", of the reference line where that is valid; "edges", of
+            the polygon's edge; "flat", 0, so that trapezoids are rectangles.
     """
     blocked = problem.blocked
     length = problem.horizon / pieces
@@ -296,10 +296,10 @@ def corridor(
 
 
 def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Array, Array]:
-    """Return floor, ceiling and greatest speed (K,) of every piece.
+    """Return least station, greatest station and greatest speed (K,) of every piece.
 
-    The speed is the least limit on the parts of the path that the line, at stations (K + 1,) of the
-    joints, passes in the piece. Floor and ceiling exclude parts with a lower limit.
+    The speed is the least limit on the parts of the path that the line, at stations `joints`
+    (K + 1,), passes in the piece. The two stations exclude parts with a lower limit.
     """
     limit = problem.speed_limit
     edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1) * problem.end_station

@@ -2,8 +2,8 @@
 
 Each joint is a double integrator with a velocity limit v and an acceleration limit a. The quickest
 motion by an angle d from an initial rate u accelerates towards the goal, coasts at v if v is
-reached, and brakes. A joint that would arrive before the slowest joint coasts more slowly, so that
-all joints arrive together. With the coasting rate p and the duration T,
+reached, and brakes. Every other joint than the slowest joint coasts at a lower rate, so that all
+joints arrive together. With the coasting rate p and the duration T,
 
     d = (u + p) |p - u| / 2a  +  p (T - |p - u| / a - p / a)  +  p^2 / 2a.
 """
@@ -17,11 +17,11 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 @struct.dataclass
 class _MirroredJoints:
-    """Joints mirrored so that each brakes from a rate >= 0."""
+    """Joints whose signs are flipped so that each joint brakes from a rate >= 0."""
 
-    side: Array  # (J,), 1 or -1
-    turn: Array  # (J,) [rad]
-    rate: Array  # (J,) [rad/s]
+    side: Array  # (J,), 1 or -1, the sign
+    turn: Array  # (J,) [rad], angle to the goal
+    rate: Array  # (J,) [rad/s], rate at the start
 
 
 def _mirror(turn: Array, rate: Array, acceleration: Array) -> _MirroredJoints:
@@ -39,8 +39,8 @@ def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) 
     """Return the shortest time (J,) [s] in which each joint turns by an angle and stops.
 
     Args:
-        turn: (J,) [rad].
-        rate: (J,) [rad/s], at the start, within the limit.
+        turn: (J,) [rad], angle by which each joint turns.
+        rate: (J,) [rad/s], rate at the start, within the limit.
         velocity: (J,) [rad/s], > 0, limit.
         acceleration: (J,) [rad/s^2], > 0, limit.
     """
@@ -55,21 +55,21 @@ def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) 
 def bang_bang(
     start: Array, rate: Array, turn: Array, duration: Array, acceleration: Array
 ) -> PiecewisePolynomial:
-    """Return the motion in which all joints arrive at the end of the duration and stop.
+    """Return the motion in which all joints arrive together after `duration`, and stand still.
 
     Args:
-        start: (J,) [rad].
-        rate: (J,) [rad/s], at the start.
+        start: (J,) [rad], angles at the start.
+        rate: (J,) [rad/s], rates at the start.
         turn: (J,) [rad], angle by which each joint turns.
-        duration: () [s], at least the greatest of `least_times`; rates then keep their limits.
+        duration: () [s], at least the greatest of `least_times`, so that rates keep their limits.
         acceleration: (J,) [rad/s^2], > 0, with which the joints accelerate and brake.
 
     Returns:
-        2 J + 1 pieces of degree 2, cut where a joint starts or ends coasting; some may last 0 s.
+        2 J + 1 pieces of degree 2 with knots where joints start or end coasting; some may last 0 s.
     """
     joints = _mirror(turn, rate, acceleration)
     u, d, a = joints.rate, joints.turn, acceleration
-    # Peaks above the initial rate solve the quadratic above; other peaks are linear in d.
+    # The equation for the coasting rate p is quadratic above the initial rate and linear below it.
     b, c = a * duration + u, a * d + 0.5 * u**2
     above = 2.0 * c / jnp.maximum(b + _root(b**2 - 4.0 * c), 1e-9)
     below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)

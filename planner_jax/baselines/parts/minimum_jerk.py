@@ -1,4 +1,4 @@
-"""Minimum-jerk primitives between two full states [Yu2023bat, eqs 15-17]."""
+"""Minimum-jerk primitives: quintics between two given states [Yu2023bat, eqs 15-17]."""
 
 import jax.numpy as jnp
 from jax import Array
@@ -9,9 +9,9 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> PiecewisePolynomial:
     """Return the quintic that minimises the integral of |jerk|^2 between two states.
 
-    [Yu2023bat, eqs 16-17]. The differences of eq. 17 are relative to the state after coasting,
-    Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2 and so on; the equation as printed holds only from
-    hover.
+    The coefficients are [Yu2023bat, eqs 16-17]. The differences in eq. 17 are taken relative to the
+    state after coasting without jerk, such as Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2. The
+    equation as printed holds only if the motion starts from hovering.
 
     Args:
         head_state: (3, 3) position, velocity, acceleration at the start.
@@ -38,16 +38,16 @@ def minimum_jerk_after_ramp(
 ) -> PiecewisePolynomial:
     """Return a minimum-jerk primitive after a linear ramp to its initial jerk.
 
-    The primitive starts with a jerk that a hovering quadrotor does not have, so that its body rate
-    would jump. Here the jerk first changes linearly from its value at the head to the initial jerk
+    The primitive alone starts with a jerk that a hovering quadrotor does not have, so that its body
+    rate would jump. Here the jerk first changes linearly from its initial value to the initial jerk
     J of the primitive, which starts where the ramp ends. J solves J = (initial jerk of the
     primitive after a ramp to J), which is affine in J.
 
     Args:
-        head_state: (4, 3), jerk included.
-        tail_state: (3, 3) position, velocity, acceleration.
+        head_state: (4, 3) position, velocity, acceleration, jerk at the start.
+        tail_state: (3, 3) position, velocity, acceleration at the end.
         duration: () [s] > 0, of ramp and primitive together.
-        ease: [s] > 0, of the ramp; half of `duration` if that is less.
+        ease: [s] > 0, duration of the ramp, but at most half of `duration`.
 
     Returns:
         Two pieces of degree 5 with continuous jerk.
@@ -69,7 +69,8 @@ def minimum_jerk_after_ramp(
         return 6.0 * primitive(jerk).coeffs[0, 3]
 
     constant = first_jerk(jnp.zeros_like(j0))
-    # Finite differences would lose the slope in rounding: both jerks are a thousand times as large.
+    # The slope of `first_jerk` is needed in closed form. Finite differences would lose it in
+    # rounding, since both of their jerks are about a thousand times as large as the difference.
     share = t / (duration - t)
     slope = -share * (4.5 + share * (6.0 + 2.5 * share))
     jerk = constant / (1.0 - slope)

@@ -1,1 +1,4 @@
-"""Stored motions for every pair of cells of both boxes [Natarajan2024, Algorithm 1]."""
+"""A library of stored arm motions, one for each pair of box cells that a ball passes.
+
+The method is [Natarajan2024, Algorithm 1].
+"""

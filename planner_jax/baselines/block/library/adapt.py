@@ -1,12 +1,13 @@
-"""The planner that warps stored motions to a given ball.
+"""The planner that warps stored motions to a given ball, for better blocks than a pure lookup.
 
-A library's motion ends where the nominal ball of its pair of cells passes. Here the motions of the
-pairs around the ball's own pair are warped until they end where this ball passes. The new end pose,
-by inverse kinematics on the branch of the old pose, minus the old end pose, is multiplied by a
-fixed profile in time and added to the motion. Both terms are steps of
-`planner_jax.task.block.motion`, so that limits at knots stay exact, and the motion takes all the
-available time. Motions with the smallest warp are evaluated first. If none is collision-free, they
-start the least squares of `OnlineBlock`.
+A stored motion ends where the nominal ball of its pair of cells passes; a pair is one cell of the
+outer and one cell of the inner box. This planner takes the motions of the pairs around the given
+ball's own pair, and warps each until it ends where the given ball passes. A warp adds a turn times
+a fixed profile in time to the motion. The turn is the new end pose, by inverse kinematics on the
+branch of the stored end pose, minus the stored end pose. Stored motion and warp are steps of
+`planner_jax.task.block.motion`, so that limits at knots stay exact. A warped motion takes all the
+available time. Motions with the smallest warp are evaluated first. If no warped motion is
+collision-free, the warped motions are the initial guesses of the least squares of `OnlineBlock`.
 """
 
 import dataclasses
@@ -37,24 +38,24 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
-# Weights of the squared joint changes. The wrist joints count less, since they carry little; the
-# flange joint keeps its stored angles.
+# Weights of the squared joint changes. The wrist joints have low weights, since they carry little
+# mass; the flange joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-_AWAY = 0.02  # [rad^2], penalty per squared cell between the motion's cells and the ball's
+_AWAY = 0.02  # [rad^2], penalty per squared distance, in cells, of the motion from the ball
 _LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
-_NEAR = 30.0  # [rad^2/m], penalty of a sample within the pole margin
+_NEAR = 30.0  # [rad^2/m], penalty per metre by which a sample misses the pole margin
 
 
 @dataclasses.dataclass(frozen=True)
 class Effort(Attempt):
-    """An attempt: numbers of stored motions to warp, to check and to refine; static."""
+    """An attempt: how many stored motions are warped, checked and refined; static."""
 
-    neighbours: int = 8  # stored motions that are warped, up to 16
-    points: int = 6  # points of the ball's trajectory to which each motion is warped
-    screened: int = 8  # warped motions whose distances from the pole are computed
-    samples: int = 12  # samples of such a motion
-    checks: int = 1  # greatest number of motions with a close check, most promising first
-    checked: int = 48  # samples of a close check
+    neighbours: int = 8  # number of stored motions that are warped, up to 16
+    points: int = 6  # number of points of the ball's trajectory to which each motion is warped
+    screened: int = 8  # number of warped motions whose distances from the pole are computed
+    samples: int = 12  # number of samples of a motion for its distance from the pole
+    checks: int = 1  # greatest number of motions that are checked closely, least penalty first
+    checked: int = 48  # number of samples of a motion that is checked closely
     refined: int = 0  # greatest number of least-squares refinements
     solver: LevenbergConfig = LevenbergConfig(
         *(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
@@ -63,10 +64,10 @@ class Effort(Attempt):
 
 @struct.dataclass
 class Warped:
-    """C warped motions, the most promising first."""
+    """C warped motions, sorted by penalty, the smallest penalty first."""
 
-    points: Array  # (C, 6 K + 1), unknowns of `OnlineBlock`
-    penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a motion
+    points: Array  # (C, 6 K + 1), vectors of unknowns of `OnlineBlock`
+    penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a stored motion
     is_open: Array  # (C,) bool, whether limits hold at knots and the pole margin at a few samples
 
 
@@ -95,7 +96,7 @@ class AdaptBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Effort, ...]:
-        """The efforts: a quick one, and a longer one."""
+        """The attempts: a quick one, then a longer one for the unsolved cases."""
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
@@ -103,7 +104,7 @@ class AdaptBlock(Planner):
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return the plan of one case."""
+        """Return the plan of one case: the first warped motion that passes the close check."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)
@@ -129,14 +130,14 @@ class AdaptBlock(Planner):
     def warp(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
     ) -> Warped:
-        """Return stored motions from a home, warped to end poses along the ball's trajectory."""
+        """Warp the stored motions that start at `home` to end poses along the ball's trajectory."""
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
         total = jnp.asarray(step_weights(pieces, (1.0,))[1][0], dtype)
         ends = case.angles + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
-        # The branch nearest to the stored end, modulo full turns.
+        # Select the branch nearest to the stored end pose; angles are equal modulo full turns.
         turn = angles - ends[:, None, None]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
         far = jnp.sum(jnp.asarray(_WEIGHTS, dtype) * turn**2, axis=-1)  # (N, P, 8)
@@ -170,12 +171,13 @@ class AdaptBlock(Planner):
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Return the motions stored for the cells around the ball's own cells.
+        """Return up to `num` motions stored for the cells around the cells that the ball passes.
 
         Returns:
-            steps: (N, K, 6) [rad]; zero without a motion.
-            away: (N,), squared distance in cells, summed over all directions.
-            found: (N,) bool.
+            steps: (N, K, 6) [rad], steps of the motions; zero if no motion is stored.
+            away: (N,), squared distance in cells from the ball's crossings to the centres of the
+                motion's two cells, summed.
+            found: (N,) bool, whether a motion is stored.
         """
         table = self.stored.library.table
         layout = table.layout
@@ -197,9 +199,9 @@ class AdaptBlock(Planner):
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
     def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return the shortfall of motions (C, K, 6) below the pole margin, (C,) [m].
+        """Return by how much motions (C, K, 6) come too close to the pole, (C,) [m].
 
-        A shortfall <= 0 keeps the margin at all samples.
+        The value is the pole margin minus the least distance, so that <= 0 keeps the margin.
         """
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
@@ -209,13 +211,13 @@ class AdaptBlock(Planner):
 
 
 def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
-    """Return the planner of a file that `planner-jax library build` wrote.
+    """Return the adapting planner for a file that `planner-jax library build` wrote.
 
     The table is read completely and stored on the default device.
 
     Raises:
-        ArgumentError: the file is not a complete library, or its motions have another number of
-            pieces than the planner's motions.
+        ArgumentError: the file is not a complete library, or its motions do not have as many
+            pieces as the motions of `OnlineBlock`.
     """
     library, own = load_library(file), OnlineBlock().pieces
     if (pieces := pieces_of(library.table.rows)) != own:

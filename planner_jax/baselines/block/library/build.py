@@ -1,4 +1,4 @@
-"""Building libraries, and repairing them after an obstacle has moved."""
+"""Build libraries of stored arm motions, and plan motions again after an obstacle has moved."""
 
 import dataclasses
 import functools
@@ -46,36 +46,37 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
-# Learned starts for pairs that have a motion already; pairs without one try all starts. In a repair
-# the old motion is mostly as good a start, and one learned start in addition suffices.
+# Indices of the learned starts, which are initial guesses of the least squares. A build tries
+# `STARTS` for pairs of cells that have a motion already, and all starts for pairs without one. A
+# repair starts from the old motion, which is mostly as good, and from one learned start.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
 _WORTH = 0.03  # [s], least possible gain that justifies a search for a better motion
-_CHECKED_AT_ONCE = 1024  # stored motions whose distances are computed at once
+_CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
 
 @dataclasses.dataclass(frozen=True)
 class Portions:
-    """Amounts of work at a time."""
+    """How many pairs of cells are planned at a time; tuned for a kind of device."""
 
-    pairs: int  # pairs of a part that is written
-    lanes: tuple[int, int]  # cases per device in a call, small and large
-    # Starts of one pair in a call. One start at a time saves work after the first success; all at
-    # once suit devices on which a few cases take as long as thousands.
+    pairs: int  # number of pairs that are planned and written to disk as one part
+    lanes: tuple[int, int]  # batch sizes per device, small and large, of one planner call
+    # Number of starts of a pair in one call. One start at a time saves work, since the search stops
+    # at the first success. A GPU takes many at once, since a large batch takes as long as a small.
     starts: int
 
 
 _ON_CPU = Portions(256, (16, 16), 1)
 _ON_GPU = Portions(32768, (512, 8192), 16)
-_FEW = 6  # small calls that take about as long as one large call
+_FEW = 6  # number of small calls that take about as long as one large call
 
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
-    """The best motions of P pairs so far."""
+    """The best motions found so far for P pairs of cells."""
 
-    point: np.ndarray  # (P, 6 K + 1)
-    entry: np.ndarray  # (P,) [s]; infinite without a motion
-    quickest: np.ndarray  # (P,) [s]
+    point: np.ndarray  # (P, 6 K + 1), unknowns of `OnlineBlock`: steps and duration
+    entry: np.ndarray  # (P,) [s], earliest entry of the ball; infinite without a motion
+    quickest: np.ndarray  # (P,) [s], entry time that the quickest motion would allow
 
 
 def build(
@@ -88,16 +89,16 @@ def build(
 ) -> Library:
     """Plan for all pairs of cells that a ball can pass through, and write the library.
 
-    Planned parts are stored in a folder next to the file, with the ending ".parts", until the
-    library is complete. The same call after an interruption resumes from there and builds the same
-    library.
+    Until the library is complete, the planned parts are stored in a folder next to the file, with
+    the ending ".parts". After an interruption, the same call continues from these parts and builds
+    the same library.
 
     Args:
-        path: of the file.
-        setting: NumPy leaves.
-        homes: (H, 6) [rad], where motions start, one or more.
-        layout: of the cells.
-        progress: show a bar on the standard error stream.
+        path: path of the library file.
+        setting: arm, limits and scene, with NumPy leaves.
+        homes: (H, 6) [rad], one or more poses at which motions start.
+        layout: the division of both boxes into cells.
+        progress: show a progress bar on the standard error stream.
 
     Raises:
         ArgumentError: the arm touches something at a home.
@@ -132,16 +133,16 @@ def build(
 def repair(
     library: Library, scene: Scene, *, retry: bool = False, progress: bool = True
 ) -> tuple[Library, np.ndarray]:
-    """Return the library for another scene: motions that collide there are planned again.
+    """Return the library for another scene, in which colliding motions are planned again.
 
     Args:
         library: library of a scene with the same boxes.
         scene: the new scene.
         retry: also plan for pairs that have no motion.
-        progress: show a bar on the standard error stream.
+        progress: show a progress bar on the standard error stream.
 
     Returns:
-        The library, NumPy leaves, and which motions were planned again, (H, P) bool. All other
+        The library with NumPy leaves, and which motions were planned again, (H, P) bool. All other
         motions are unchanged, bit for bit.
 
     Raises:
@@ -170,7 +171,7 @@ def repair(
 
 
 def portions() -> Portions:
-    """Return the numbers of pairs that this process's devices plan at a time."""
+    """Return how many pairs of cells are planned at a time on this process's devices."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
@@ -189,18 +190,19 @@ def plan_pairs(
     pairs: np.ndarray,
     old: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Return rows (N, 6 K + 10) of a table for pairs (N,), from one home.
+    """Plan motions from one home for N pairs of cells; return their table rows (N, 6 K + 10).
 
-    Straight motions come first. Then least squares start from one learned start after another, for
-    pairs that have no motion or might get an earlier one. Pairs that still have no motion go
-    through all of it again with a coarse tolerance.
+    Straight motions are tried first. Then the least squares of `BentPair` start from one learned
+    start after another, for pairs that have no motion or might get a motion that allows an earlier
+    entry of the ball. If a pair still has no motion, both steps are repeated with a coarse
+    tolerance.
 
     Args:
-        setting: NumPy leaves.
-        home: (6,) [rad].
-        tunnel: of all pairs.
-        pairs: numbers of the pairs to plan for.
-        old: their rows in another scene, used as additional starts.
+        setting: arm, limits and scene, with NumPy leaves.
+        home: (6,) [rad], where motions start.
+        tunnel: tunnels of all pairs.
+        pairs: (N,), numbers of the pairs to plan for.
+        old: (N, 6 K + 10), the pairs' rows in another scene, used as additional starts.
     """
     straight = StraightPair(setting, host_leaf(home))
     bent = BentPair(setting, host_leaf(home))
@@ -253,25 +255,25 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Split starts into groups, one per call."""
+    """Split the indices of starts into groups, each planned in one call."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
 
 def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
-    """Plan a batch in calls of a few sizes, so that few programs are compiled."""
+    """Plan a batch in calls of only two sizes, so that only two programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
     few, many = portions().lanes
     lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
-    # The last case pads the batch; on a CPU it is not solved again.
+    # The last case pads the batch; on a CPU the padding is not solved.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
     plans = plan(planner, filled, chunk=lanes)
     return jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Return rows of a table for motions; rows without a motion have an infinite duration."""
+    """Return table rows for the best motions; without a motion the row's duration is infinite."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
     steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
@@ -287,7 +289,7 @@ def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
 
 
 def _in_parts(array: np.ndarray) -> list[np.ndarray]:
-    """Split an array into equal parts along its first axis; the last row pads the last part."""
+    """Split an array into equal parts along its first axis; pad the last part with its last row."""
     num = -(-len(array) // _CHECKED_AT_ONCE) * _CHECKED_AT_ONCE
     filled = array[np.minimum(np.arange(num), len(array) - 1)]
     return list(filled.reshape(-1, _CHECKED_AT_ONCE, *array.shape[1:]))
@@ -295,7 +297,7 @@ def _in_parts(array: np.ndarray) -> list[np.ndarray]:
 
 @jax.jit
 def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
-    """Return rotations (N, 3, 3) and centres (N, 3) [m] of the shield at the ends of motions."""
+    """Return the shield's rotations (N, 3, 3) and centres (N, 3) [m] at the ends of N motions."""
 
     def end(steps: Array) -> tuple[Array, Array]:
         angles = angles_at(home, jnp.zeros_like(home), steps, (1.0,))[0]
@@ -305,7 +307,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which stored motions keep the planner's margin from everything, (N,) bool."""
+    """Return which stored motions keep the planner's margin from obstacles, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
@@ -314,26 +316,26 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
     near = [
         _nearest_on_motion(setting, home, some, shares) for some in _in_parts(np.asarray(steps))
     ]
-    # Tolerance for rounding.
+    # The margin has a tolerance of 1e-5 m for rounding.
     return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
 
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Return least distances (N,) [m] along motions with steps (N, K, 6)."""
+    """Return the least distance from obstacles along each of N motions (N, K, 6), (N,) [m]."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 
 
 @jax.jit
 def _nearest(setting: Setting, angles: Array) -> Array:
-    """Return least distances (N,) [m] at angles (N, S, 6)."""
+    """Return the least distance from obstacles over S poses (N, S, 6) each, (N,) [m]."""
     flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
     return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
-    """Return rows of a table without a motion."""
+    """Return a table's rows for all homes and pairs, without a stored motion."""
     pieces = planner.online.pieces
     rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
     rows[..., 6 * pieces] = np.inf
@@ -346,7 +348,7 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    """The planned parts of an incomplete library, one file each, written atomically."""
+    """The planned parts of an unfinished library on disk, one file per part, written atomically."""
 
     def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
         self._folder = folder
@@ -355,7 +357,7 @@ class _Parts:
             "fingerprint": fingerprint(setting),
             "homes": homes.tolist(),
             "layout": dataclasses.asdict(layout),
-            "device": jax.default_backend(),  # the size of a part depends on it
+            "device": jax.default_backend(),  # the number of pairs in a part depends on the device
         }
         text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"

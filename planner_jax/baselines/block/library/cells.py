@@ -1,9 +1,11 @@
-"""Cells on the faces of both boxes, tunnels between them, and the part that a shield covers.
+"""Cells on the faces of the two boxes around the arm, tunnels between cells, and their coverage.
 
-[Natarajan2024] calls the boxes domes (Section IV-C). It specifies neither the number of cells nor
-the faces that have cells; `LAYOUTS` has the layouts of this library. A pair is a cell of the outer
-box and one of the inner box, numbered `outer * num_inner + inner`. Cells are numbered face by face;
-on a face by its axes in the order x, y, z, the last one fastest. Robot base frame, z up, SI units.
+A ball passes one cell of the outer box and then one cell of the inner box. The two cells are a
+pair, with the number `outer * num_inner + inner`, and the space between them is a tunnel.
+[Natarajan2024, Section IV-C] calls the boxes domes. The paper specifies neither the number of cells
+nor the faces that have cells; `LAYOUTS` has the layouts of this library. Cells are numbered face by
+face, and on a face by its two axes in the order x, y, z, the last axis fastest. All positions are
+in the robot's base frame, z up, in SI units.
 """
 
 import dataclasses
@@ -18,32 +20,32 @@ from planner_jax.ball.flight import BallState
 from planner_jax.robot.arm import product
 from planner_jax.task.block.scene import Box
 
-SPEED = 8.0  # [m/s], of nominal balls
+SPEED = 8.0  # [m/s], speed of the nominal balls, each of which represents one tunnel
 GRAVITY = 9.81  # [m/s^2]
 
 
 @dataclasses.dataclass(frozen=True)
 class Face:
-    """A face of a box that is divided into equal cells; static."""
+    """A face of a box that is divided into equal rectangular cells; static."""
 
-    axis: int  # axis of its normal: 0 x, 1 y, 2 z
-    side: int  # 1 if its normal points along the axis, -1 if against it
-    cells: tuple[int, int]  # number along each of the two other axes
+    axis: int  # axis of the face's normal: 0 x, 1 y, 2 z
+    side: int  # 1 if the normal points along the axis, -1 if against it
+    cells: tuple[int, int]  # number of cells along each of the two other axes
 
     @property
     def num(self) -> int:
-        """The number of cells."""
+        """The number of cells of the face."""
         return self.cells[0] * self.cells[1]
 
     @property
     def across(self) -> tuple[int, int]:
-        """The two axes along the face."""
+        """The indices of the two axes along the face: 0 x, 1 y, 2 z."""
         first, second = (axis for axis in range(3) if axis != self.axis)
         return first, second
 
     @property
     def name(self) -> str:
-        """The name, such as +x."""
+        """The name: sign and axis of the normal, such as +x."""
         return f"{'-+'[self.side > 0]}{'xyz'[self.axis]}"
 
 
@@ -77,9 +79,9 @@ def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
     )
 
 
-# The paper's authors plan for 5,760 pairs (a constant of their code); A to C are three layouts with
-# this number. D has cells on all sides that balls from ahead can reach. The default "full" also has
-# cells on the top of the outer box, through which lobbed balls come.
+# The authors of [Natarajan2024] plan for 5,760 pairs of cells (a constant of their code). The
+# layouts A, B and C have this number of pairs. D has cells on all sides that balls from ahead can
+# reach. The default "full" also has cells on the top of the outer box, for lobbed balls.
 LAYOUTS = {
     "full": Layout(_faces("+x +y -y +z", (8, 8)), _faces("+x +y -y", (4, 7))),
     "A": Layout(_faces("+x +y -y", (8, 8)), _faces("+x +z", (3, 5))),
@@ -92,17 +94,17 @@ LAYOUTS = {
 def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
     """Return the cell that contains a point of a box's surface, in closed form.
 
-    The point belongs to the face towards which it is farthest out, relative to the size of the box.
-    On an edge, where these fractions are equal, it belongs to the face of the first axis. A point
-    between two cells belongs to the one with the greater coordinate.
+    The point belongs to the face towards which it is farthest from the box's centre, relative to
+    the size of the box. On an edge, where two of these fractions are equal, it belongs to the face
+    of the first axis. A point between two cells belongs to the cell with the greater coordinate.
 
     Args:
         faces: faces that have cells.
         box: the whole box.
-        point: three numbers () [m]; rounding may move it off the surface.
+        point: three numbers () [m]; rounding may move the point off the surface.
 
     Returns:
-        cell: () int32, its number; 0 without a cell.
+        cell: () int32, number of the cell; 0 if the face has no cells.
         found: () bool, whether the face has cells.
     """
     share = [(point[k] - box.lower[k]) / (box.upper[k] - box.lower[k]) for k in range(3)]
@@ -129,11 +131,11 @@ def cells_around(
     Args:
         faces: faces that have cells.
         box: the whole box.
-        point: three numbers () [m]; `cell_of` selects its face.
+        point: three numbers () [m]; `cell_of` selects the face of the point.
 
     Returns:
-        cells: (4,) int32, their numbers; repeated if a face has only one cell in a direction.
-        away: (4,), squared distance from the point to their centres, in cells.
+        cells: (4,) int32, numbers of the cells; repeated if a face has one cell in a direction.
+        away: (4,), squared distances from the point to the cells' centres, in units of cells.
         found: () bool, whether the face has cells.
     """
     own, found = cell_of(faces, box, point)
@@ -142,7 +144,7 @@ def cells_around(
     for face in faces:
         places = []
         for axis, count in zip(face.across, face.cells, strict=True):
-            place = share[axis] * count - 0.5  # in cells, from the centre of the first cell
+            place = share[axis] * count - 0.5  # in units of cells, from the first cell's centre
             lower = jnp.clip(jnp.floor(place), 0, max(count - 2, 0))
             pair = jnp.minimum(jnp.stack([lower, lower + 1.0]), count - 1.0)
             places.append((pair.astype(jnp.int32), (pair - place) ** 2))
@@ -157,21 +159,21 @@ def cells_around(
 
 @struct.dataclass
 class Tunnels:
-    """The tunnels of all pairs of a layout, NumPy float64 leaves."""
+    """The tunnels of all P pairs of cells of a layout, with NumPy float64 leaves."""
 
     outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass from one cell to the other
-    is_centred: np.ndarray  # (P,) bool, whether a ball from the centre of the outer cell can
+    is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
-    """Return the tunnels between the cells of two boxes.
+    """Return the tunnels between the cells of the outer and the cells of the inner box.
 
     A ball reaches an inner cell only from in front of that cell's face. The outer cell is therefore
-    cut off at the plane of this face. The remainder is a rectangle, and since both boxes are
-    convex, every straight line from it to the inner cell is free. A pair without a remainder is one
-    of the pairs that the paper discards: its tunnel "snaps to zero".
+    cut off at the plane of this face, and a rectangle remains. Since both boxes are convex, every
+    straight line from the rectangle to the inner cell stays outside the inner box. If nothing
+    remains of the outer cell, the pair is infeasible: in the paper its tunnel "snaps to zero".
     """
     from_outer, _ = _corners(layout.outer, outer)
     to_inner, of_face = _corners(layout.inner, inner)
@@ -182,7 +184,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
     rows = np.arange(len(begin))
     plane = end[rows, 0, axis]  # coordinate of the inner cell's face
     middle = begin.mean(axis=1)[rows, axis]
-    # The corner behind the plane is moved to the plane.
+    # A corner of the outer cell behind the plane is moved to the plane.
     near, far = np.where(side > 0, 0, 1), np.where(side > 0, 1, 0)
     begin[rows, near, axis] = side * np.maximum(side * begin[rows, near, axis], side * plane)
     feasible = side * (begin[rows, far, axis] - plane) > 1e-6
@@ -195,7 +197,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
 
 def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Return the extreme corners (N, 2, 3) [m] of all cells, and the indices (N,) of faces."""
+    """Return lowest and highest corners (N, 2, 3) [m] of all cells, and their faces' indices."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     found, of_face = [], []
     for place, face in enumerate(faces):
@@ -212,15 +214,15 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return the ball that represents a tunnel, from cell centre to cell centre.
+    """Return the nominal ball that represents a tunnel: it flies from cell centre to cell centre.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.
         inner: (2, 3) [m], corners of the inner cell.
 
     Returns:
-        ball: as it enters the outer box.
-        span: () [s], until it enters the inner box, at `SPEED` along the straight line.
+        ball: state of the ball as it enters the outer box.
+        span: () [s], time from the outer to the inner box, for `SPEED` along a straight line.
     """
     begin = jnp.mean(outer, axis=0)
     path = jnp.mean(inner, axis=0) - begin
@@ -230,29 +232,30 @@ def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
 
 
 def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array) -> Array:
-    """Return how far from a shield's centre the balls of a tunnel cross its plane at most.
+    """Return how far from a shield's centre the balls of a tunnel cross the shield's plane at most.
 
-    All straight lines from a rectangle to another one cross a plane between the two within the
-    convex hull of the crossings of the lines from corner to corner: for one fixed end, the crossing
-    is a projection of the other end, and projections keep convex sets convex. Balls are assumed to
-    be as far above these lines as the nominal ball is above its line.
+    Consider all straight lines from one rectangle to another, and a plane between the rectangles.
+    The crossings lie in the convex hull of the crossings of the corner-to-corner lines. The reason:
+    for one fixed end, the crossing is a projection of the other end, and projections keep convex
+    sets convex. Balls are assumed to be as far above these straight lines as the nominal ball is
+    above its own line.
 
     Args:
         outer: (2, 3) [m], corners of an axis-aligned rectangle, lowest and highest.
         inner: (2, 3) [m], corners of the other rectangle.
         middle: (3,) [m], centre of the shield's face.
-        rotation: (3, 3), of the shield: its normal and its edges are the columns.
+        rotation: (3, 3), orientation of the shield: its normal and its edges are the columns.
 
     Returns:
         () [m], the maximum over both edge directions of the shield; infinite if the plane is not
-        between the rectangles. A shield with a longer half edge blocks the whole tunnel.
+        between the rectangles. A shield whose half edge is longer blocks the whole tunnel.
     """
     ball, span = nominal_ball(outer, inner)
     path = jnp.mean(inner, axis=0) - ball.pos
     time = span * jnp.clip(jnp.sum((middle - ball.pos) * path) / jnp.sum(path**2), 0.0, 1.0)
     middle = middle.at[2].add(-0.5 * GRAVITY * time * (span - time))
     begin, end = ((_corners_of(each) - middle) for each in (outer, inner))
-    begin, end = (product(each, rotation) for each in (begin, end))  # (8, 3), along the shield's
+    begin, end = (product(each, rotation) for each in (begin, end))  # (8, 3), in the shield's frame
     between = jnp.all(begin[:, 0] > 0.0) & jnp.all(end[:, 0] < 0.0)
     share = begin[:, None, 0] / jnp.where(between, begin[:, None, 0] - end[:, 0], 1.0)
     crossings = begin[:, None, 1:] + share[..., None] * (end[:, 1:] - begin[:, None, 1:])

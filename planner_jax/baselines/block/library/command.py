@@ -1,4 +1,4 @@
-"""The command `planner-jax library`: builds, shows, checks and repairs libraries of blocks."""
+"""The command `planner-jax library`, which builds, shows, checks and repairs block libraries."""
 
 import dataclasses
 import math
@@ -29,7 +29,7 @@ from planner_jax.runs import style
 from planner_jax.runs.environment import require_backend
 from planner_jax.task.block.scene import Box, paper_scene
 
-_CASE_BYTES = 60_000  # memory per ball while the referee judges its motions
+_CASE_BYTES = 60_000  # [bytes], memory per ball while the referee judges stored motions
 
 
 def build_library(
@@ -44,12 +44,12 @@ def build_library(
     """Build a library in the scene of [Natarajan2024], or continue an interrupted build.
 
     Args:
-        path: file of the library.
-        layout: a key of `LAYOUTS`.
-        regime: a key of `REGIMES`.
-        pole: whether the scene has its pole.
+        path: path of the library file.
+        layout: a key of `LAYOUTS`, which divides the two boxes into cells.
+        regime: a key of `REGIMES`, which sets the joint limits.
+        pole: whether the scene contains the pole.
         arm: path of an MJCF file; by default the IRB 1600.
-        home: angles [rad], six for each home; by default the arm's own.
+        home: joint angles [rad] at which motions start, six for each home; by default the arm's.
 
     Raises:
         ArgumentError: an argument breaks a rule.
@@ -85,7 +85,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print the coverage of a library, and draw a map of it as PNG if a path is passed."""
+    """Print a library's coverage, and draw a map of the coverage as PNG if `map` is a path."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -95,7 +95,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Judge stored motions for random balls, `num` for each home."""
+    """Let the referee judge stored motions for random balls, `num` balls for each home."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
@@ -115,7 +115,7 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan again the motions that touch a moved pole at (2,) [m]; write a new file."""
+    """Plan again the motions that touch a pole moved to (x, y) [m], and write a new library."""
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
@@ -134,7 +134,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
-    """Print the contents of a library."""
+    """Print a library's layout, size, limits, scene and coverage."""
     table, setting = library.table, library.setting
     faces = [
         " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)
@@ -169,7 +169,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw each face with cells, coloured by the share of feasible pairs with a motion."""
+    """Draw each face that has cells, coloured by the fraction of feasible pairs with a motion."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)
@@ -204,7 +204,7 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
 
 
 def _ends(face: Face, box: Box) -> tuple[float, float, float, float]:
-    """Return the ends [m] of a face along its two axes."""
+    """Return the ends [m] of a face along its two axes: left, right, bottom, top."""
     (left, bottom), (right, top) = (
         (float(side[face.across[0]]), float(side[face.across[1]]))
         for side in (box.lower, box.upper)

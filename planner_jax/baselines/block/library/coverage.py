@@ -1,4 +1,4 @@
-"""Coverage of a library, and a check of its motions by the referee."""
+"""Coverage of a library by stored motions, and a check of these motions by the referee."""
 
 import dataclasses
 
@@ -19,26 +19,27 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
-_SPEEDS = (7.0, 10.0)  # [m/s], of balls between the boxes
-_SPARE = 2e-3  # [s], time from first sight to the outer box, beyond the motion's duration
+_SPEEDS = (7.0, 10.0)  # [m/s], range of the random balls' mean speed between the two boxes
+# [s], how much longer than the stored motion a random ball takes to reach the outer box.
+_SPARE = 2e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Properties of all pairs of cells, booleans (H, P), one row per home."""
+    """Properties of all P pairs of cells; arrays (H, P) bool have one row per home."""
 
-    is_feasible: np.ndarray  # (P,), whether a ball can pass through
-    is_centred: np.ndarray  # (P,), whether a ball from the centre of the outer cell can
-    found: np.ndarray  # whether a motion is stored
-    is_sure: np.ndarray  # whether its shield also blocks the whole tunnel
+    is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
+    is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
+    found: np.ndarray  # (H, P) bool, whether a motion is stored
+    is_sure: np.ndarray  # (H, P) bool, whether the stored shield pose blocks the whole tunnel
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction of selected pairs (P,) that have a motion, (H,)."""
+        """Return the fraction of the pairs selected by `of` (P,) that have a motion, (H,)."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
 def coverage(library: Library) -> Coverage:
-    """Return the coverage of a library."""
+    """Compute for which pairs of cells a library has motions, and which block whole tunnels."""
     scene, found = library.setting.scene, library.found
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
@@ -48,14 +49,14 @@ def coverage(library: Library) -> Coverage:
         is_feasible=tunnel.is_feasible,
         is_centred=tunnel.is_centred,
         found=found,
-        # With a tolerance of 0.1 mm.
+        # A shield counts as large enough with a tolerance of 0.1 mm.
         is_sure=found & (far <= half + 1e-4),
     )
 
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return `farthest_crossing` of every home's rows, (H, P) [m]."""
+    """Return `farthest_crossing` for the stored shield poses of every home and pair, (H, P) [m]."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
@@ -67,11 +68,11 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Random balls through pairs with a stored motion, each just late enough for the motion."""
+    """Random balls through pairs with a motion, which leave just enough time for the motion."""
 
     cases: BlockCase
-    pairs: np.ndarray  # (B,) int, their pairs of cells
-    claimed: np.ndarray  # (B,) bool, whether the planner reports a block
+    pairs: np.ndarray  # (B,) int, number of the pair of cells of each ball
+    claimed: np.ndarray  # (B,) bool, whether the planner reports that the ball is blocked
     verdict: BlockVerdict
 
 
@@ -79,10 +80,10 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
     """Let the referee judge stored motions against random balls through their tunnels.
 
     Args:
-        library: NumPy leaves.
+        library: the library, with NumPy leaves.
         num: number of balls. Pairs are drawn without replacement until all have been drawn.
-        seed: of pairs and balls.
-        home: index of a home.
+        seed: seed of the pairs and of the balls.
+        home: index of the home at which the arm starts.
 
     Raises:
         ArgumentError: no motion is stored from that home.
@@ -141,6 +142,6 @@ def _throw_balls(
 
 @jax.jit
 def _move_back(balls: BallState, times: Array) -> BallState:
-    """Trace balls (B,) back in time by times (B,) [s]."""
+    """Return the states of B balls traced back in time by times (B,) [s], without drag."""
     gravity = jnp.asarray(GRAVITY, times.dtype)
     return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

@@ -3,9 +3,10 @@
     planner-jax block library 1
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
-The second line is JSON: the hash of the setting, the faces and their cells, the links of the arm's
-capsules, type, shape and offset of every array by name, and the file's size. Blanks pad it to the
-first array. Arrays are little-endian, in C order, and start at multiples of 64 bytes.
+The second line is JSON. It holds the hash of the setting, the faces of both boxes and their cells,
+the links of the arm's capsules, the file's size, and type, shape and offset of every array by name.
+Blanks pad the second line to the first array. Arrays are little-endian, in C order, and start at
+multiples of 64 bytes.
 """
 
 import dataclasses
@@ -29,13 +30,14 @@ from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
-BUILD_VERSION = 1  # of the planning method; a build does not resume the parts of another version
+# Version of the planning method. A build does not continue from parts of another version.
+BUILD_VERSION = 1
 _MAGIC = "planner-jax block library"
-_ALIGNED, _LONGEST = 64, 1 << 20  # bytes
+_ALIGNED, _LONGEST = 64, 1 << 20  # [bytes], alignment of arrays, longest header line
 
 
 def save_library(path: str | os.PathLike, library: Library) -> None:
-    """Write a library atomically.
+    """Write a library to a file atomically, in the format of this module.
 
     Raises:
         OSError: the file cannot be written.
@@ -68,7 +70,7 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
 
 
 def load_library(path: str | os.PathLike) -> Library:
-    """Load the library that `save_library` wrote; its table is memory-mapped and read on access.
+    """Load a library that `save_library` wrote; its table is memory-mapped and read on access.
 
     Raises:
         ArgumentError: the file is missing, truncated, of another version, or not a library.
@@ -110,7 +112,7 @@ def load_library(path: str | os.PathLike) -> Library:
 
 
 def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
-    """Return the library that a header describes, with memory-mapped rows."""
+    """Return the library that the header of a file describes, with memory-mapped rows."""
     arrays: dict[str, PyTree] = {}
     for name, (kind, shape, place) in header["arrays"].items():
         mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))
@@ -128,7 +130,7 @@ def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
 
 
 def _to_stored(leaf: ArrayLike) -> np.ndarray:
-    """Convert a leaf to the array type of the file."""
+    """Convert an array of a setting to the file's type: float32, bool or int32."""
     value = np.ascontiguousarray(leaf)
     return value.astype({"f": "<f4", "b": "|b1"}.get(value.dtype.kind, "<i4")).reshape(
         np.shape(leaf)

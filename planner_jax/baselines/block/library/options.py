@@ -1,14 +1,16 @@
-"""Options of the commands on libraries; nothing here imports JAX."""
+"""Command-line options of `planner-jax library`; importing this module does not import JAX."""
 
 from collections.abc import Callable
 
 
 def add_commands(command: Callable[[str, str], Callable[..., None]]) -> None:
-    """Add the commands, named as the functions of `library.command` without "_library".
+    """Add the subcommands build, show, check and repair of `planner-jax library`.
+
+    Each subcommand calls the function of `library.command` with its name and "_library".
 
     Args:
-        command: adds a command with a name and a sentence, and returns the function that adds an
-            option to it, with the arguments of `argparse.ArgumentParser.add_argument`.
+        command: function that adds a subcommand from its name and help sentence. It returns a
+            function that adds an option, with the arguments of `ArgumentParser.add_argument`.
     """
     build = command("build", "plan for every pair of cells; continues an interrupted build")
     build("--layout", metavar="NAME", help="full, or A, B, C, D of fewer (default: full)")

@@ -1,9 +1,11 @@
-"""Least-time motions to the shield poses of one pair of cells [Natarajan2024, Algorithm 1].
+"""Motions of the arm that block the balls of one pair of cells [Natarajan2024, Algorithm 1].
 
-The paper plans to equidistant points of the centreline and stores the plan of least time. Here a
-nominal ball flies from the centre of one cell to the centre of the other. Of two motions the better
-one allows the earlier entry of the ball: a pose farther inside gives the arm more time. For an
-infinitely fast ball this equals the paper's least time.
+A pair is one cell of the outer and one cell of the inner box that a ball passes. `build` calls
+these planners for every pair. The paper plans to equidistant points of the centreline between the
+two cells and stores the plan of least time. Here a nominal ball flies from cell centre to cell
+centre, and the selected motion is the motion that allows the earliest entry of this ball into the
+outer box. A pose farther inside gives the arm more time. For an infinitely fast ball this criterion
+equals the paper's least time.
 """
 
 import dataclasses
@@ -36,15 +38,16 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
 from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 
-# Tolerance of a stored pose relative to the nominal ball, [m] and [rad]: the paper allows "a small
-# tolerance". If no pose is within it, a shield that blocks a part of the tunnel is better than no
-# shield.
+# Tolerances of a stored shield pose relative to the nominal ball, [m] and [rad]. The paper allows
+# "a small tolerance". The coarse tolerance is used if no pose is within the fine tolerance, since a
+# shield that blocks a part of the tunnel is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-_PATIENCE = 0.8  # [s], latest entry after the quickest motion without obstacles
+# [s], how much later than for the quickest motion without obstacles a ball's entry may be.
+_PATIENCE = 0.8
 _ROLL = np.deg2rad(1.0)  # [rad], greatest roll of a shield that must block a whole tunnel
 _TOUCHING = 10.0  # [s], added to the entry times of poses that collide, so that they come last
-# Least distance of a shield from both cells, as a fraction of the distance between them: fine and
-# coarse. In an oblique tunnel, planes closer to a cell would cut it.
+# Least distance of a shield from both cells, as a fraction of the distance between the cells, for
+# fine and coarse tolerances. In an oblique tunnel, a shield plane closer to a cell would cut it.
 _NEAREST = (0.1, 0.02)
 
 
@@ -55,9 +58,9 @@ class PairCase:
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
     is_coarse: Array  # () bool, whether blocking a part of the tunnel suffices
-    best: Array  # () [s], best entry time so far; infinite without a motion
-    start: Array  # () int32, number of a learned start; -1 starts from `given`
-    given: Array  # (6 K + 1,), unknowns of a motion that may collide
+    best: Array  # () [s], earliest entry time found so far; infinite without a motion
+    start: Array  # () int32, index of a learned start; with -1 the search starts from `given`
+    given: Array  # (6 K + 1,), steps and duration of a motion that may collide
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -67,31 +70,31 @@ class PairCase:
 
 @struct.dataclass
 class PairPlan(Plan):
-    """A motion to a pose of the shield; the cost is the ball's earliest entry time [s]."""
+    """A motion to a shield pose; the cost is the earliest entry time [s] of the ball."""
 
     point: Array  # (6 K + 1,), unknowns of `OnlineBlock`: steps and duration of the motion
-    quickest: Array  # () [s], entry time of the quickest motion without obstacles
+    quickest: Array  # () [s], entry time that the quickest motion without obstacles allows
 
 
 @struct.dataclass
 class PairPlanner(Planner):
-    """Base of both planners of pairs: the arm's start, and its surroundings.
+    """Base class of both planners for pairs of cells: arm, scene, and where motions start.
 
-    The shield's edges are parallel to the frame whose second axis is horizontal, as are the edges
-    of cells on upright faces. Of the four equivalent rolls the one nearest to the arm's own is
-    used.
+    One edge of the shield is horizontal, like an edge of every cell on an upright face. A square
+    shield can be rolled by quarter turns without a difference; of these four rolls the planner
+    takes the roll nearest to the arm's roll at its home.
     """
 
     setting: Setting
-    home: Array  # (6,) [rad]
+    home: Array  # (6,) [rad], joint angles at which motions start
     online: OnlineBlock = struct.field(pytree_node=False, default=OnlineBlock())
-    points: int = struct.field(pytree_node=False, default=5)  # points of the centreline
+    points: int = struct.field(pytree_node=False, default=5)  # number of points of the centreline
 
     case_type: ClassVar[type] = PairCase
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return the nominal ball, entering the outer box at a time () [s], as case and flight."""
+        """Return case and flight of the nominal ball if it enters the outer box at `entry` [s]."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -113,13 +116,14 @@ class PairPlanner(Planner):
         return case, flight
 
     def poses(self, pair: PairCase) -> EndPoses:
-        """Return eight poses at each point of the centreline, and the straight motions to them.
+        """Return eight end poses at each centreline point, and the straight motions to them.
 
         Returns:
-            Poses whose `time` is the duration of the quickest straight motion [s], and whose
-            `effort` is the entry time [s] that this motion allows. The effort is `_TOUCHING`
-            greater if the arm would touch something. It is infinite if the pose does not exist, or
-            if its shield does not block the whole tunnel as required.
+            End poses. Their `time` is the duration of the quickest straight motion [s], and their
+            `effort` is the entry time [s] of the ball that this motion allows. The effort is
+            `_TOUCHING` greater if the arm would touch something in this pose. The effort is
+            infinite if the pose does not exist, or if the shield must block the whole tunnel and
+            does not.
         """
         online, arm, limits = self.online, self.setting.arm, self.setting.limits
         ball, span = nominal_ball(pair.outer, pair.inner)
@@ -158,7 +162,12 @@ class PairPlanner(Planner):
         )
 
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return `OnlineBlock.model` plus a cost of the shield's roll relative to `face_ball`."""
+        """Return the quadratic model of a motion's cost and violation, for the least squares.
+
+        The model is `OnlineBlock.model` plus a cost of the shield's roll about its normal, relative
+        to a shield that faces the ball with one horizontal edge. The roll counts modulo quarter
+        turns. It is ignored if blocking a part of the tunnel suffices.
+        """
         online = self.online
         model = online.model(point, case, flight)
         moves, first, _ = online.decode(case, point)
@@ -183,7 +192,7 @@ class PairPlanner(Planner):
         )
 
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the plan of a point, with the checks of `OnlineBlock` and of the whole tunnel."""
+        """Return the plan of a motion `point`, checked for limits, collisions and whole tunnel."""
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)
@@ -203,18 +212,18 @@ class PairPlanner(Planner):
 
 @struct.dataclass
 class StraightPair(PairPlanner):
-    """A planner that selects the free straight joint motion with the earliest ball entry.
+    """A planner that selects the collision-free straight joint motion with the earliest ball entry.
 
-    It checks motions one after another, in the order of entry times.
+    The planner checks motions one after another, in the order of the ball's entry times.
     """
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One attempt, which checks all straight motions."""
+        """One attempt, which checks all straight motions in turn."""
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
-        """Return the plan of one pair."""
+        """Return the plan of one pair: the first straight motion that keeps all limits."""
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
         possible = jnp.sum(poses.effort < 0.5 * _TOUCHING)
@@ -252,13 +261,13 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """Return the entry time () [s] of a pose, ignoring collisions."""
+    """Return the entry time () [s] that a pose allows, without the penalty `_TOUCHING`."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """Repeated least squares with less or more time; static."""
+    """An attempt: rounds of least squares, each with another entry time of the ball; static."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -270,19 +279,20 @@ class Bends(Attempt):
 class BentPair(PairPlanner):
     """A planner that avoids obstacles by the least squares of `OnlineBlock` from a learned start.
 
-    It bisects the entry time between the best motion so far and the quickest motion without
-    obstacles. Without a motion so far, the upper bound is `_PATIENCE` after the quickest one.
+    The planner bisects the entry time of the ball. The lower bound is the entry time of the
+    quickest motion without obstacles. The upper bound is the entry time of the best motion so far,
+    or `_PATIENCE` after the lower bound if no motion has been found.
     """
 
     search: Bends = struct.field(pytree_node=False, default=Bends())
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """One attempt: the search."""
+        """One attempt: the bisection with the settings of `search`."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair from its start: the last solved round."""
+        """Return the plan of one pair: the result of the last round that found a motion."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -305,7 +315,7 @@ class BentPair(PairPlanner):
         first = jnp.where(none, high, 0.5 * (quickest + high))
 
         def shift(point: Array, old: Array, new: Array) -> Array:
-            """Shift a motion to a ball that enters at another time [s]."""
+            """Shift the end of a motion for a ball whose entry time changes from `old` to `new`."""
             return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
 
         def one_round(k: Array, state: tuple) -> tuple:

@@ -1,4 +1,4 @@
-"""The planner that looks up motions; see `planner_jax.baselines.block.library.table`."""
+"""The planner `LibraryBlock`, which looks up a stored motion in a library's table."""
 
 import os
 from typing import ClassVar
@@ -26,19 +26,21 @@ from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_SAME_START = 1e-4  # [rad] and [rad/s], tolerance of the arm's state at a home
+_SAME_START = 1e-4  # [rad] and [rad/s], tolerance within which the arm stands at a home
 
 
 @struct.dataclass
 class LibraryBlock(Planner):
-    """A planner that answers with the stored motion of a ball's pair of cells.
+    """A planner that returns the motion stored for the two cells that a ball passes.
 
-    The cost is the motion's duration [s]. The arm stands at a home of the library. A motion that
-    must end at rest starts as soon as the arm may start, and the shield then waits; any other
-    motion starts so late that it ends at the contact. The status is OUT_OF_REACH if nothing is
-    stored for a ball. It is BLOCKED if the arm does not stand at a home, or if arm, limits or scene
-    differ from the library's; `check` reports the same on the host. It is INFEASIBLE if the stored
-    motion is too late, or if the ball passes farther from the shield's centre than the case allows.
+    The cost is the motion's duration [s]. The arm must stand at a home, which is a start pose of
+    the library. If the arm must end at standstill, the motion starts as soon as the arm may start,
+    and the shield then waits. Any other motion starts so late that it ends at the contact.
+
+    The status is OUT_OF_REACH if nothing is stored for a ball. It is BLOCKED if the arm does not
+    stand at a home, or if arm, limits or scene differ from the library's; `check` reports these
+    differences on the host. It is INFEASIBLE if the stored motion is too late, or if the ball
+    passes farther from the shield's centre than the case allows.
     """
 
     library: Library
@@ -64,14 +66,14 @@ class LibraryBlock(Planner):
         require(bool(off <= _SAME_START), "angles", rule, shown=shown)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """Return the plan of one case; pure."""
+        """Return the stored motion of one case as a plan; a pure function."""
         home, fits = self.home_of(case)
         plan = _plan_from_answer(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
-        """Return the nearest home () int32 to the arm, and whether the library fits the case."""
+        """Return the home () int32 nearest to the arm, and whether the library fits the case."""
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
@@ -91,7 +93,7 @@ def _is_same(own: Setting, other: Setting) -> Array:
 
 
 def library_planner(file: str | os.PathLike) -> LibraryBlock:
-    """Return the planner of a file that `planner-jax library build` wrote.
+    """Return the lookup planner for a file that `planner-jax library build` wrote.
 
     Raises:
         ArgumentError: the file is not a complete library.
@@ -100,7 +102,7 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
 
 
 def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
-    """Return the plan of a case whose arm stands at a home."""
+    """Return the plan of a case whose arm stands at a home, from one lookup in the table."""
     answer = lookup(table, case.ball, case.gravity, home)
     row, stored = answer.row, answer.stored
     dtype = case.angles.dtype
@@ -112,7 +114,7 @@ def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     start = jnp.asarray(table.homes)[home].astype(dtype)
     motion = polynomial(start, jnp.zeros_like(start), steps, duration)
     waits = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(start)
-    # Arrival must be in time exactly; limits of the contact have a tolerance.
+    # The motion must arrive in time without a tolerance; limits of the contact have a tolerance.
     early = (1.0 + FEASIBILITY_TOLERANCE) * duration / jnp.maximum(contact - case.delay, 1e-6)
     beside = jnp.stack(answer.beside)
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))

@@ -1,9 +1,9 @@
-"""The library: a stored motion for every pair of cells, and the lookup of a ball's motion.
+"""The table of a library, with a stored motion for every pair of cells, and the lookup in it.
 
-A lookup intersects the ball's parabola with both boxes, which gives two cells, and reads one row of
-a table [Natarajan2024, Section IV-D2]. Its time is the same for every ball, without a search. In
-addition to the paper's lookup, this one computes when and where the ball crosses the plane of the
-shield.
+A lookup intersects the ball's parabola with both boxes. The two crossings give two cells, a pair,
+and the pair gives one row of the table [Natarajan2024, Section IV-D2]. The lookup contains no
+search, so that its time is the same for every ball. In addition to the paper's lookup, this lookup
+computes when and where the ball crosses the plane of the shield.
 """
 
 import dataclasses
@@ -27,7 +27,7 @@ from planner_jax.task.block.scene import Box, Scene, entry_time
 
 @struct.dataclass
 class Setting:
-    """Everything that motions are planned for, except the ball and the arm's start."""
+    """Arm, joint limits and scene for which motions are planned; without ball and start pose."""
 
     arm: Arm
     limits: ArmLimits
@@ -36,7 +36,7 @@ class Setting:
 
 
 def setting_of(case: BlockCase) -> Setting:
-    """Return the setting of a case, or of a batch."""
+    """Return arm, limits and scene of a case, or of a batch of cases."""
     return Setting(
         arm=case.arm, limits=case.limits, ends_at_rest=case.ends_at_rest, scene=case.scene
     )
@@ -55,10 +55,10 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """The data of a lookup. Row p of a home has the fields of `Row` for pair p."""
+    """The arrays of a lookup. Row p of a home has the fields of `Row` for the pair of cells p."""
 
     rows: Array | np.ndarray  # (H, P, 6 K + 10) float32
-    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions start, at rest
+    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions start, at standstill
     inner: Box
     outer: Box
     layout: Layout = struct.field(pytree_node=False)
@@ -67,23 +67,23 @@ class Table:
 class Row(NamedTuple):
     """A stored motion and the shield's pose at its end; also a batch, with leading axes.
 
-    `Row` and `Answer` are tuples, which are created on the host in a tenth of a dataclass's time.
+    `Row` and `Answer` are tuples, since the host creates a tuple ten times as fast as a dataclass.
     """
 
     steps: Array | np.ndarray  # (K, 6) [rad], see `planner_jax.task.block.motion`
     duration: Array | np.ndarray  # () [s]; infinite if no motion is stored
     middle: Array | np.ndarray  # (3,) [m], centre of the shield's face
-    normal: Array | np.ndarray  # (3,) unit
-    edge: Array | np.ndarray  # (3,) unit, along one of its edges
+    normal: Array | np.ndarray  # (3,) unit vector, normal of the shield
+    edge: Array | np.ndarray  # (3,) unit vector along one edge of the shield
 
 
 def pieces_of(rows: Array | np.ndarray) -> int:
-    """Return K of rows (..., 6 K + 10)."""
+    """Return K, the number of pieces of each motion, from table rows (..., 6 K + 10)."""
     return (rows.shape[-1] - 10) // 6
 
 
 def pack_rows(row: Row) -> np.ndarray:
-    """Pack rows into a table's format (..., 6 K + 10), float32."""
+    """Pack the fields of rows into the table's format (..., 6 K + 10), float32."""
     steps, duration = np.asarray(row.steps), np.asarray(row.duration)
     flat = steps.reshape(*steps.shape[:-2], -1)
     parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
@@ -104,28 +104,29 @@ def unpack_rows(values: Array | np.ndarray) -> Row:
 
 
 class Answer(NamedTuple):
-    """The table's entry for a ball, and where the ball crosses the shield at the motion's end."""
+    """The table's entry for a ball, and where the ball crosses the plane of the shield."""
 
     row: Row
     pair: Array | int  # () int32, number of the pair of cells; 0 without a pair
-    stored: Array | bool  # () bool, whether the ball goes through two cells with a stored motion
+    stored: Array | bool  # () bool, whether the ball passes two cells with a stored motion
     time: Array | float  # () [s], when the ball crosses the plane of the shield
-    slack: Array | float  # () [s], time since the outer or until the inner box, the lesser one
-    # () [m] each, distance of the crossing from the shield's centre along its edges
+    # () [s], the lesser of the times from the outer box to the crossing and on to the inner box.
+    slack: Array | float
+    # Two values () [m], distances of the crossing from the shield's centre along its two edges.
     beside: tuple[Array | float, Array | float]
     cosine: Array | float  # (), of the angle between shield normal and reversed ball velocity
 
 
 def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
-    """Look up one ball, in constant time and without a search; pure.
+    """Look up the motion for one ball, in constant time and without a search; pure.
 
-    It computes with scalars, so that the compiled program of one ball has few loops.
+    All computations are on scalars, so that the compiled program of one ball has few loops.
 
     Args:
-        table: of a library.
-        ball: at time 0.
+        table: table of a library.
+        ball: state of the ball at time 0.
         gravity: () [m/s^2], magnitude.
-        home: () int32, index of the home.
+        home: () int32, index of the home at which the arm stands.
     """
     layout = table.layout
 
@@ -143,7 +144,7 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     passes = enters & hits & is_first & is_last & (inside > outside)
     pair = jnp.where(passes, first * layout.num_inner + last, 0)
     row = unpack_rows(table.rows[home, pair])
-    # The earlier root of the distance to the plane, a parabola in time.
+    # The distance to the shield's plane is a parabola in time; take its earlier root.
     middle, normal, edge = (tuple(each) for each in (row.middle, row.normal, row.edge))
     away = _dot(normal, _minus(place, middle))
     toward = -_dot(normal, velocity)
@@ -178,36 +179,36 @@ def _dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 
 @struct.dataclass
 class Library:
-    """Stored motions with their setting."""
+    """A library: the table of stored motions, and the setting for which they were planned."""
 
     table: Table
     setting: Setting
 
     @property
     def found(self) -> np.ndarray:
-        """Mask of the pairs with a motion, (H, P) bool."""
+        """Mask of the pairs of cells with a stored motion, one row per home, (H, P) bool."""
         return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
     def num_bytes(self) -> int:
-        """The memory of the table in bytes."""
+        """The size of the table's arrays in bytes."""
         return sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(self.table))
 
 
 def library_of(
     rows: Array | np.ndarray, homes: Array | np.ndarray, layout: Layout, setting: Setting
 ) -> Library:
-    """Return a library of rows (H, P, 6 K + 10) from homes (H, 6)."""
+    """Return a library from table rows (H, P, 6 K + 10) and homes (H, 6) [rad]."""
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
 
 
 def with_scene(library: Library, scene: Scene) -> Library:
-    """Return the same motions with another scene that has the same boxes.
+    """Return a library with the same motions and another scene that has the same boxes.
 
     Raises:
-        ArgumentError: a box differs, so that the cells would differ.
+        ArgumentError: a box of the new scene differs, so that its cells would differ.
     """
     own = library.setting.scene
     for name, old, new in (("inner", own.inner, scene.inner), ("outer", own.outer, scene.outer)):
