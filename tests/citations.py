@@ -1,20 +1,24 @@
-"""The table of docs/equations.md: which function cites which equation of the four papers.
+"""The tables of docs/equations.md: which file implements or cites which equation of four papers.
 
-    python -m tests.citations            # fails if the table is stale
-    python -m tests.citations --write    # writes the table
+    python -m tests.citations            # fails if the page is stale
+    python -m tests.citations --write    # writes the page
 
 A citation is `[KEY, eq. N]`. A bare `eq. N` counts for the one paper that its file cites.
+`tests/data/equations.toml` states what each equation computes and, if several files cite the
+equation, which file implements it.
 """
 
 import ast
 import re
 import sys
+import tomllib
 from collections import defaultdict
 from collections.abc import Iterator
 
 from tests.tracked import ROOT, tracked_files
 
 PAGE = ROOT / "docs" / "equations.md"
+WORDS = ROOT / "tests" / "data" / "equations.toml"
 PAPERS = {
     "Yu2023catch": "Catch Planner",
     "Yu2023bat": "Bat Planner",
@@ -26,8 +30,13 @@ NUMBER = r"\d+[a-z]?"
 EQUATIONS = re.compile(rf"\b[Ee]qs?\.?\s+({NUMBER}(?:\s*(?:,|-|and|to)\s*{NUMBER})*)")
 HEAD = """# Where each equation is
 
-The functions and classes that cite an equation of the four papers of [references](references.md).
-This page is generated from the citations in the code by `python -m tests.citations --write`.
+The equations of the four papers of [references](references.md) that the code cites. The column
+"computes" says in a few words what an equation computes. The column "implemented in" has the file
+that computes it, and the functions or classes there whose docstrings cite it. The files in the last
+column use, check or discuss the equation.
+
+`python -m tests.citations --write` generates this page from the citations in the code and the words
+in `tests/data/equations.toml`.
 """
 
 
@@ -67,8 +76,8 @@ def name_at(tree: ast.Module, line: int) -> str:
     return names
 
 
-def table() -> str:
-    """Return the page with a table for each paper."""
+def find_places() -> dict[tuple[str, str], dict[str, set[str]]]:
+    """Return the files, each with its functions and classes, that cite each equation of a paper."""
     places: dict[tuple[str, str], dict[str, set[str]]] = defaultdict(lambda: defaultdict(set))
     for file in tracked_files("planner_jax/*.py", "sims/*.py", "policies/*.py"):
         path = ROOT / file
@@ -78,28 +87,55 @@ def table() -> str:
             for position, paper, number in equations_of(text):
                 name = name_at(tree, text.count("\n", 0, position) + 1)
                 places[paper, number][file].add(name)
+    return places
+
+
+def make_page() -> str:
+    """Return the page, with one table for each paper.
+
+    Raises:
+        LookupError: `equations.toml` lacks a cited equation or its implementing file, or has an
+            equation that the code does not cite.
+    """
+    places = find_places()
+    words = {
+        (paper, number): row
+        for paper, rows in tomllib.loads(WORDS.read_text()).items()
+        for number, row in rows.items()
+    }
+    if wrong := words.keys() ^ places.keys():
+        raise LookupError(f"{WORDS.name} and the citations in the code differ in {sorted(wrong)}")
     lines = [HEAD]
     for paper, title in PAPERS.items():
-        lines.append(f"## {title}, {paper}\n\n| equation | where |\n|---|---|")
+        lines.append(f"## {title}, {paper}\n")
+        lines.append("| equation | computes | implemented in | also cited in |\n|---|---|---|---|")
         rows = sorted(
             (key for key in places if key[0] == paper),
             key=lambda key: (int(re.sub(r"\D", "", key[1])), key[1]),
         )
         for key in rows:
-            where = []
-            for file, names in sorted(places[key].items()):
-                listed = ", ".join(f"`{name}`" for name in sorted(names) if name)
-                where.append(f"[{file}](../{file})" + (f": {listed}" if listed else ""))
-            lines.append(f"| {key[1]} | {'; '.join(where)} |")
+            files = sorted(places[key])
+            first = words[key].get("place", files[0])
+            if first not in files or len(files) > 1 and "place" not in words[key]:
+                raise LookupError(f"{WORDS.name} needs the `place` of {key}, one of {files}")
+            cited = {file: _write_place(file, places[key][file]) for file in files}
+            others = "; ".join(cited[file] for file in files if file != first)
+            lines.append(f"| {key[1]} | {words[key]['computes']} | {cited[first]} | {others} |")
         lines.append("")
     return "\n".join(lines)
+
+
+def _write_place(file: str, names: set[str]) -> str:
+    """Return the link to a file, followed by the names of its citing functions and classes."""
+    listed = ", ".join(f"`{name}`" for name in sorted(names) if name)
+    return f"[{file}](../{file})" + (f": {listed}" if listed else "")
 
 
 def main() -> int:
     """Write the page, or compare it with the code."""
     if "--write" in sys.argv:
-        PAGE.write_text(table())
-    stale = not PAGE.exists() or PAGE.read_text() != table()
+        PAGE.write_text(make_page())
+    stale = not PAGE.exists() or PAGE.read_text() != make_page()
     if stale:
         print("docs/equations.md is stale: run python -m tests.citations --write")
     return int(stale)
