@@ -1,26 +1,31 @@
 """Compute a lower bound on the time at which any car can meet its target.
 
-The body's middle is replaced by a point that may change direction instantly. Its speed is at most
-the speed of a car at full acceleration from the start, and it keeps half the body's width from all
-obstacles. The sets of cells over-approximate the points that can be reached: a cell counts as
-reached if any of its points is reached, and as free if any of its points is free. Hence, if these
-cells do not contain the target at the time of a layer, no car meets it then. Obstacles are checked
-after every half layer; in a half layer a car moves less than the thinnest wall, enlarged by half
-the body's width on both sides.
+`benchmarks.intercept_oracle` uses this bound to prove that cases are infeasible. The car is
+replaced by a point at the middle of its body, which may change its direction instantly. The point
+is never faster than a car at full acceleration from the start, and keeps half the body's width
+from all obstacles. So the point reaches every position that the middle of a car can reach.
+
+The plane is divided into square cells, and time into layers. A cell counts as reached if the point
+can be anywhere in it, and as free of obstacles if any part of it is free. Hence, if no reached cell
+contains the target at the time of a layer, no car meets the target then. Obstacles are checked
+twice per layer. Between two checks a car moves less than the thickness of the thinnest wall plus
+the body's width, so that the point cannot jump over a wall.
 """
 
 import numpy as np
 
 from planner_jax.benchmarks.intercept_lattice import Scene, as_integer, near, shift_bits
 
-CELL = 0.0125  # [m], side of a cell
-_SLACK = CELL * np.sqrt(0.5)  # [m], from a cell's middle to its farthest point
+CELL = 0.0125  # [m] Side of a square cell.
+_SLACK = CELL * np.sqrt(0.5)  # [m] Distance from the middle of a cell to its corners.
 
 
 def earliest_bound(scene: Scene) -> tuple[bool, float]:
-    """Return whether the bound permits a meeting at the case's time, and its first meeting.
+    """Return whether a car may meet the target at the case's time, and the earliest such time.
 
-    The first meeting is the time of a layer [s], inf if there is none.
+    False means that a meeting at the case's time is impossible. The earliest time is the time of a
+    layer [s]: at every earlier layer a meeting is impossible. It is infinite if no layer permits
+    a meeting.
     """
     middle = scene.start[:2] + scene.middle * np.array(
         [np.cos(scene.start[2]), np.sin(scene.start[2])]
@@ -30,7 +35,8 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     origin = middle - first * CELL
     radius = 0.5 * scene.width - _SLACK
     columns, rows = (origin[k] + CELL * np.arange(count[k]) for k in (0, 1))
-    # The position of a mover is rounded to whole cells, so its set shrinks by as much once more.
+    # The position of a moving obstacle is rounded to whole cells. Its set of blocked cells is
+    # therefore smaller than a wall's by the greatest rounding error, so that no free cell is lost.
     movers = [_draw_polygon(corners, radius - _SLACK) for corners in scene.movers]
     steps = _limit_steps(scene)
     guard = max([int(steps.max() / CELL) + 2, *(drawn.shape[1] for _, drawn in movers)])
@@ -57,9 +63,10 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
 def _limit_steps(scene: Scene) -> np.ndarray:
     """Return upper bounds (2 L,) [m] on the distance that the body's middle covers per half layer.
 
-    Its speed is sqrt(v^2 + (b v kappa)^2), b ahead of the rear axle. (v kappa)^2 is the product of
-    kappa and v^2 kappa, and both have limits. The speed is convex in v, so the trapezoid rule
-    for linearly increasing v is not below the integral.
+    The middle is at a distance b ahead of the rear axle, whose speed is v on a path of curvature
+    kappa. The middle's speed is sqrt(v^2 + (b v kappa)^2). The term (v kappa)^2 is the product of
+    kappa and v^2 kappa, and both factors are limited. The speed is convex in v, so for linearly
+    increasing v the trapezoid rule is an upper bound of the distance.
     """
     step = 0.5 * scene.dt
     times = step * np.arange(2 * len(scene.target) - 1)
@@ -71,7 +78,7 @@ def _limit_steps(scene: Scene) -> np.ndarray:
 
 
 def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return first cell (2,) and cells (Y, X) that a polygon forbids to the body's middle."""
+    """Return the cells within `radius` [m] of a polygon: first cell (2,) int, and mask (Y, X)."""
     low = np.floor((corners.min(axis=0) - radius) / CELL).astype(int)
     high = np.ceil((corners.max(axis=0) + radius) / CELL).astype(int)
     x, y = (CELL * np.arange(low[k], high[k] + 1) for k in (0, 1))
@@ -79,7 +86,10 @@ def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
 
 
 def _grow(plane: int, distance: float, stride: int) -> int:
-    """Return the cells with a point at most `distance` cells from a point of a plane's cells."""
+    """Return all cells that the point can reach from a set of cells by moving `distance` cells.
+
+    Sets of cells are the bits of an integer, with rows of cells `stride` bits apart.
+    """
     grown, wide, width = 0, plane, 0
     for row in range(int(distance) + 1, -1, -1):
         reach = int(np.sqrt(distance**2 - max(row - 1, 0) ** 2)) + 1
@@ -91,7 +101,10 @@ def _grow(plane: int, distance: float, stride: int) -> int:
 
 
 def _draw_goal(scene: Scene, layer: int, origin: np.ndarray, count: np.ndarray, stride: int) -> int:
-    """Return the cells that hold a point within the tolerance of the target."""
+    """Return, as bits of an integer, the cells that contain a meeting point at a layer.
+
+    A meeting point is within the case's tolerance of the target.
+    """
     place = (scene.target[layer] - origin) / CELL
     reach = scene.tolerance / CELL
     side = np.arange(-int(reach) - 2, int(reach) + 3)

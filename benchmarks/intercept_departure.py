@@ -1,33 +1,37 @@
-"""Check by sampling whether a car can leave its start without a collision at all.
+"""Check by sampling whether a car can leave the neighbourhood of its start without a collision.
 
-A car that starts at speed can neither turn on the spot nor reverse. With an obstacle close ahead,
-all of its motions may collide, although a lattice finds one, because lattice cars turn instantly
-and lattice positions are rounded. Here states have exact values, and only states in the same small
-cell are merged. Nothing is shared with the planners. World frame in the plane, SI units.
+`benchmarks.intercept_oracle` uses this check. A car that starts with a speed can neither turn on
+the spot nor reverse. If an obstacle is close ahead, all of its motions may collide. The lattice
+search (`intercept_lattice`) may find a motion in spite of this, because its cars turn instantly and
+its positions are rounded. This search does not round states. It only merges states that lie in the
+same small cell. It shares no code with the planners. Positions are in the plane of the world frame,
+in SI units.
 
-In a step the steering angle changes at one of five rates and the speed at one of three, up to the
-limits. Steering that would exceed a limit of curvature or lateral acceleration is clipped, even if
-the wheels could not be turned back in time, which may accept an infeasible motion. Merged and
-discarded states may miss a feasible motion. Obstacles are checked every 0.02 s, as by the referee.
+In each time step the steering angle changes at one of five rates, and the speed at one of three
+accelerations. Steering that would exceed a limit of curvature or lateral acceleration is clipped,
+even if real wheels could not turn back in time. So the search may accept an infeasible motion.
+Because states are merged and discarded, it may also miss a feasible motion. Obstacles are checked
+every 0.02 s, as by the referee.
 """
 
 import numpy as np
 
 from planner_jax.benchmarks.intercept_lattice import Scene
 
-STEP = 0.1  # [s]
-_PARTS = 5  # of a step; obstacles are checked after each part
-_CELL = np.array([0.015, 0.015, 0.03, 0.08, 0.15])  # x, y [m], heading [rad], speed, steering
-_MOST = 20_000  # maximum number of states; more are thinned at random
-_RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # of the steering rate limit
-_PEDALS = np.array([-1.0, 0.0, 1.0])  # of the acceleration limit
+STEP = 0.1  # [s] Time step with constant steering rate and acceleration.
+_PARTS = 5  # Number of parts of a step; obstacles are checked after each part.
+# Sides of a cell: x [m], y [m], heading [rad], speed [m/s] and steering angle [rad].
+_CELL = np.array([0.015, 0.015, 0.03, 0.08, 0.15])
+_MOST = 20_000  # Maximum number of states. A random subset of this size is kept.
+_RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # Steering rates, relative to their limit.
+_PEDALS = np.array([-1.0, 0.0, 1.0])  # Accelerations, relative to their limit.
 
 
 def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2.0) -> bool:
-    """Return whether some collision-free motion gets `far` [m] from the start in `until` [s].
+    """Return whether some collision-free motion gets `far` [m] away from the start in `until` [s].
 
-    If the target is to be met nearer or sooner, it is enough to be collision-free for `alive` [s],
-    or until the meeting.
+    If the meeting is nearer to the start or earlier, it suffices that a motion is free of
+    collisions for `alive` [s], or until the meeting.
     """
     random = np.random.default_rng(0)
     steering = np.arctan(scene.wheelbase * scene.initial_curvature)
@@ -49,7 +53,10 @@ def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2
 
 
 def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
-    """Return all collision-free states (M, 5) one step after states (N, 5) at a time [s]."""
+    """Return all collision-free states (M, 5) that are reached one step after N states at `time`.
+
+    A state has x [m], y [m], heading [rad], speed [m/s] and steering angle [rad].
+    """
     x, y, heading, speed, steering = (
         np.repeat(column, len(_RATES) * len(_PEDALS)) for column in states.T
     )
@@ -77,7 +84,7 @@ def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
 def is_free(
     scene: Scene, x: np.ndarray, y: np.ndarray, heading: np.ndarray, time: float
 ) -> np.ndarray:
-    """Return which cars at (N,) poses are collision-free and on the map at a time [s]."""
+    """Return which cars at N poses of the rear axle are on the map and touch nothing at `time`."""
     cos, sin = np.cos(heading), np.sin(heading)
     x, y = x + scene.middle * cos, y + scene.middle * sin
     free = (x >= scene.lower[0]) & (x <= scene.upper[0])
@@ -98,7 +105,7 @@ def is_free(
 
 
 def _is_apart(scene: Scene, corners, x, y, cos, sin) -> np.ndarray:
-    """Return which bodies with middles (N,) do not overlap a polygon (V, 2), by separating axes."""
+    """Return which bodies of N cars do not overlap a polygon (V, 2) [m], by separating axes."""
     half = 0.5 * np.array([scene.length, scene.width])
     from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N)
     along, across = cos * from_x + sin * from_y, cos * from_y - sin * from_x

@@ -1,21 +1,24 @@
-"""Compare methods to order three targets for one car, beside a lower bound on the time.
+"""Compare methods to decide in which order one car meets three targets.
 
     python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
 
-The first three targets of groups of the suite `group` are met in four orders: the best of all six
-orders, each planned; the best of the three orders with the lowest estimates; the greedy order,
-which continues with the target of the earliest estimated meeting; and the order in which the
-targets were drawn, which is random. Success is judged by the referee. Times of the last meeting are
-over groups that all four solve.
+A case is a group of the suite `group`, of which the first three targets are used. Four methods are
+compared:
+* plan all six orders, and use the best plan;
+* plan the three orders with the earliest estimated last meeting, and use the best plan;
+* the greedy order, which continues with the target that can be met next, by an estimate;
+* the order in which the targets were drawn, which is random.
 
-No plan meets all targets earlier than the bound, the minimum over all orders for a point that moves
-straight in any direction at once, through obstacles. Its speed is at most the middle's speed
-at full acceleration from the start. It meets targets within the case's tolerance, and may start the
-next leg this tolerance away on the other side. Early meetings are optimal for this point, because
-it is faster than its targets and can stay with them.
+Success is judged by the referee. Times of the last meeting are over groups that all four methods
+solve. They are compared with a lower bound, which no plan can beat. For the bound, the car is
+replaced by a point that moves in a straight line to each target, through obstacles, and that
+changes its direction instantly. Its speed is at most the speed of the middle of a car at full
+acceleration from the start. It meets a target as soon as their distance is within the case's
+tolerance. The bound is the earliest last meeting over all orders.
 
-Planning times are of a second call for all groups at once. The first listed decision compiles most
-programs, and the others share them. The summary's success is for the best of all orders.
+Planning times are for a second call, which compiles nothing, with all groups at once. The compile
+time of the first listed method is the longest, because the other methods use the same programs. The
+summary's success is for the best of all six orders.
 """
 
 import argparse
@@ -41,11 +44,11 @@ DECISIONS = {
     "greedy": "greedy",
     "random": "given",
 }
-STEP = 0.005  # [s], time step of the bound
+STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting.
 
 
 def draw(num: int, seed: int) -> InterceptGroup:
-    """Draw groups of three targets, with NumPy leaves."""
+    """Draw `num` groups of the suite `group` and keep their first three targets, NumPy leaves."""
     groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
@@ -54,13 +57,16 @@ def draw(num: int, seed: int) -> InterceptGroup:
 @jax.jit
 @jax.vmap
 def _places(paths: PlanePath, times: jax.Array) -> jax.Array:
-    """Return positions (N, T, 2) [m] of targets with a leading axis N at times (T,) [s]."""
+    """Return the positions (N, T, 2) [m] of N targets at times (T,) [s]."""
     at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
     return jax.vmap(at, (0, None))(paths, times)
 
 
 def limit_times(groups: InterceptGroup) -> np.ndarray:
-    """Return lower bounds (B,) [s] on the time of the last of three meetings; inf if impossible."""
+    """Return lower bounds (B,) [s] on the time at which a car has met all three targets.
+
+    The bound is infinite if no car can meet all targets.
+    """
     shared = groups.shared
     num = int(np.ceil(shared.time.max() / STEP)) + 1
     times = np.broadcast_to(
@@ -68,9 +74,9 @@ def limit_times(groups: InterceptGroup) -> np.ndarray:
     )
     places = np.asarray(_places(shared.target, times), float)
     limits, ahead = shared.limits, np.asarray(shared.body.middle)
-    # The middle's speed is sqrt(v^2 + (ahead v kappa)^2), and (v kappa)^2 is the product of kappa
-    # and v^2 kappa, and both have limits. It never decreases, so it is greatest at the end of
-    # a step.
+    # On a path of curvature kappa the speed of the body's middle is sqrt(v^2 + (ahead v kappa)^2).
+    # The term (v kappa)^2 is the product of kappa and v^2 kappa, and both factors are limited. The
+    # bound on the speed never decreases with time, so it is greatest at the end of a step.
     v = np.minimum(
         limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
     )
@@ -94,15 +100,17 @@ def _meet_in_order(
     places: np.ndarray,
     tolerance: np.ndarray,
 ) -> np.ndarray:
-    """Return when (B,) [s] the bound's point meets the last target of an order; inf if never.
+    """Return the times (B,) [s] at which a fast point has met all targets in a given order.
+
+    The point replaces the car for the lower bound. The time is infinite if it cannot meet them.
 
     Args:
         order: indices of the targets.
         place: (B, 2) [m], position of the point at time 0.
-        travel: (B, T) [m], greatest distance covered up to each time.
-        times: (B, T) [s].
+        travel: (B, T) [m], greatest distance that the point has covered at each time.
+        times: (B, T) [s], times at which meetings are checked.
         places: (B, N, T, 2) [m], positions of the targets.
-        tolerance: (B,) [m].
+        tolerance: (B,) [m], greatest distance of a meeting from the target.
     """
     lanes, at, slack = np.arange(len(travel)), np.zeros(len(travel), int), tolerance
     met = np.ones(len(travel), bool)
@@ -111,14 +119,15 @@ def _meet_in_order(
         meets = far <= travel - travel[lanes, at, None] + slack[:, None]
         meets &= np.arange(travel.shape[1]) >= at[:, None]
         met &= meets.any(axis=1)
-        # It may meet the target between the time step before and this one.
+        # The meeting may lie between the previous time step and the first step that permits it, so
+        # the bound uses the previous step.
         at = np.maximum(meets.argmax(axis=1) - 1, at)
         place, slack = places[lanes, target, at], 2.0 * tolerance
     return np.where(met, times[lanes, at], np.inf)
 
 
 def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan, float, float]:
-    """Return plans, and the durations [s] of the first and the second call."""
+    """Plan all groups twice; return the plans, and the durations [s] of both calls."""
     planner, began = pj.group.planner(decide=decide), time.perf_counter()
     pj.plan(planner, groups)
     between = time.perf_counter()
@@ -127,7 +136,7 @@ def time_planning(groups: InterceptGroup, decide: str | Best) -> tuple[GroupPlan
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan the groups with all four decisions, and print a row for each."""
+    """Plan the groups with all four methods to order targets, and print a row for each."""
     groups = draw(options.num, options.seed)
     least, found = limit_times(groups), {}
     for name, decide in DECISIONS.items():
@@ -170,7 +179,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Print a row for every decision, and the bound."""
+    """Parse the arguments, and print the table of all methods and the lower bound."""
     parser = argument_parser("intercept_group", __doc__, num=20, seed=1)
     options = parser.parse_args()
     with begin(parser, options) as bench:

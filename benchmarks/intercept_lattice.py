@@ -1,15 +1,19 @@
-"""Compute what a car can reach in space and time: a lattice of pose and speed, layer by layer.
+"""Compute which states a car can reach at each time, by exhaustive search on a lattice.
 
-A state is the rear axle's cell, one of 64 headings and a speed. All cells of one heading and speed
-are the bits of one Python integer, so a motion is a bit shift, and obstacles are masks. Nothing is
-shared with the planners. World frame in the plane, SI units.
+`benchmarks.intercept_oracle` uses the lattice to tell infeasible interceptions from failures of a
+planner. A state has the position of the rear axle, as the cell of a grid, one of 64 headings, and
+one of several speed levels. All reached cells with one heading and one speed are the bits of one
+Python integer. A motion is then a shift of the bits, and a check for obstacles is a bit mask. No
+code is shared with the planners. Positions are in the plane of the world frame, in SI units.
 
-In a layer of `dt` a car first moves for half of it. Then its speed changes by at most one level
-(the acceleration limit), and its heading by at most as many steps as curvature and lateral
-acceleration allow at the new speed. Then it moves for the other half. The distance along a heading
-is rounded from its total since time 0, so that slow and oblique motion is not lost. The start is
-exactly a cell, its heading is one of the headings, and its speed is the nearest level. Obstacles
-are checked after every half layer, with positions rounded to 1/8 of a cell's side.
+Time is divided into layers of length `dt`. In each layer a car first moves straight for half of the
+layer. Then its speed changes by at most one level, as the acceleration limit permits. Its heading
+changes by at most the number of steps that the limits of curvature and lateral acceleration permit
+at the new speed. Finally the car moves straight for the other half. Displacements are rounded to
+whole cells. To avoid an accumulation of rounding errors, the total displacement since time 0 along
+a heading is rounded, and a shift is the difference of two totals. The start is exactly the middle
+of a cell and has one of the headings. Its speed is rounded to the nearest level. Obstacles are
+checked after every half layer, with positions rounded to 1/8 of a cell's side.
 """
 
 import dataclasses
@@ -18,16 +22,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
-CELL = 0.05  # [m], side of a cell
-HEADINGS = 64
-LAYER = 0.25  # [s], longest layer
-FINER = 4  # number of parts of a cell's side, for drawing obstacles
-_FINE = CELL / FINER
+CELL = 0.05  # [m] Side of a square cell of the lattice.
+HEADINGS = 64  # Number of headings, equally spaced over a full turn.
+LAYER = 0.25  # [s] Greatest length of a layer of time.
+FINER = 4  # Obstacles are drawn on a grid whose cells are this factor smaller.
+_FINE = CELL / FINER  # [m] Side of a cell of the grid for obstacles.
 
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One interception as plain numbers, with positions of the target at the layers."""
+    """One interception as plain numbers, with the target's position at the end of each layer."""
 
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
@@ -55,11 +59,13 @@ class Scene:
 
 @dataclasses.dataclass(frozen=True)
 class Rules:
-    """Rounding of turns, and the part of the body that a lattice checks for collisions."""
+    """Settings of a lattice: how turns are rounded, and which discs replace the car's body."""
 
-    discs: int  # 1: half the width around the middle, inside of the body; 2: they cover the body
+    # 1: one disc inside of the body, whose radius is half the body's width. 2: two discs that cover
+    # the body.
+    discs: int
     # Whether a fractional limit on the number of heading steps is rounded up in every layer. If
-    # not, fractions accumulate: over many layers a car turns by at most one step more than it can.
+    # not, fractions accumulate over the layers until they permit another whole step.
     turns_up: bool
 
 
@@ -69,7 +75,7 @@ STRICT = Rules(discs=2, turns_up=False)
 
 @dataclasses.dataclass(frozen=True)
 class Reach:
-    """Result of a lattice for one scene."""
+    """Result of a lattice search for one scene: whether and when the target can be met."""
 
     at_end: bool  # whether the target can be met at the case's time
     earliest: float  # [s], first layer at which it can be met; inf if there is none
@@ -77,7 +83,7 @@ class Reach:
 
 
 def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
-    """Return the positions of discs ahead of the rear axle [m], and their radius [m]."""
+    """Return where discs that replace the body are ahead of the rear axle [m], and their radius."""
     half = 0.5 * scene.width
     if rules.discs == 1:
         return [scene.middle], half
@@ -87,13 +93,13 @@ def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
 
 
 def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np.ndarray:
-    """Return whether (Y, X) points of a grid are within a radius [m] of a convex polygon.
+    """Return which points of a grid, (Y, X) bool, are within a radius of a convex polygon.
 
     Args:
-        x: (X,) [m].
-        y: (Y,) [m].
-        corners: (V, 2) [m], counter-clockwise; they may be repeated.
-        radius: [m].
+        x: (X,) [m], x coordinates of the grid's columns.
+        y: (Y,) [m], y coordinates of the grid's rows.
+        corners: (V, 2) [m], corners of the polygon, counter-clockwise; they may be repeated.
+        radius: [m], greatest distance from the polygon.
     """
     inside = np.ones((len(y), len(x)), bool)
     close = np.zeros_like(inside)
@@ -114,7 +120,7 @@ def _round(value: np.ndarray) -> np.ndarray:
 
 
 class Lattice:
-    """Lattice of one scene and one set of rules."""
+    """Search of all states that a car can reach in one scene, with given settings (`Rules`)."""
 
     def __init__(self, scene: Scene, rules: Rules):
         if not np.isfinite([*scene.lower, *scene.upper, scene.speed, scene.acceleration]).all():
@@ -132,7 +138,7 @@ class Lattice:
         self.free = functools.cache(self._free)
 
     def _lay_grid(self) -> None:
-        """Define cells for all positions of the rear axle, with one cell exactly at the start."""
+        """Define a grid of cells for the rear axle. The start is the middle of one cell."""
         scene = self.scene
         first = np.ceil((scene.start[:2] - scene.lower + scene.middle) / CELL).astype(int)
         last = np.ceil((scene.upper + scene.middle - scene.start[:2]) / CELL).astype(int)
@@ -140,14 +146,14 @@ class Lattice:
         self.origin = scene.start[:2] - first * CELL
 
     def _draw_movers(self) -> None:
-        """Store bits of each mover for every offset within a cell, with first cell and size."""
+        """Store each moving obstacle's blocked cells as bits, for every offset within a cell."""
         drawn = []
         for corners in self.scene.movers:
             low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
             high = np.ceil((corners.max(axis=0) + self.radius) / _FINE).astype(int)
             x, y = (_FINE * np.arange(low[k], high[k] + 1) for k in (0, 1))
             drawn.append((low, near(x, y, corners, self.radius)))
-        # Empty columns separate the rows, so that a shifted bit never enters the next row.
+        # Empty columns separate the rows of cells, so that a shifted bit never enters another row.
         farthest = int(np.ceil(self.scene.speed * self.scene.dt / CELL)) + 2
         guard = max([farthest, *(-(-cells.shape[1] // FINER) for _, cells in drawn)])
         self.stride = int(self.count[0]) + guard
@@ -192,12 +198,12 @@ class Lattice:
         return free
 
     def _list_moves(self) -> tuple[np.ndarray, list, list]:
-        """Return the speed levels and the moves.
+        """Compute the lattice's speed levels, and all moves between its states.
 
         Returns:
-            levels: (S,) [m/s].
-            shifts: bit shifts by half layer, speed and heading.
-            turns: number of heading steps by layer and speed.
+            levels: (S,) [m/s], speed levels.
+            shifts: bit shifts of a straight move, indexed by half layer, speed and heading.
+            turns: greatest numbers of heading steps of a turn, indexed by layer and speed.
         """
         scene = self.scene
         level = scene.acceleration * scene.dt
@@ -217,7 +223,7 @@ class Lattice:
         return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
-        """Return stencils of movers with their bit shifts, by half layer and heading."""
+        """Return blocked cells and bit shifts of moving obstacles, by half layer and heading."""
         scene, num = self.scene, 2 * self.layers + 1
         times = 0.5 * scene.dt * np.arange(num)
         drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]
@@ -235,7 +241,7 @@ class Lattice:
         return drawn
 
     def _free(self, half: int, heading: int) -> int:
-        """Return the cells at which a car of one heading is free of collision at a half layer."""
+        """Return the cells where a car with one heading touches nothing at a half layer's time."""
         blocked = 0
         for stencil, shift in self.placed[half][heading]:
             blocked |= shift_bits(stencil, shift)
@@ -260,7 +266,10 @@ class Lattice:
         ]
 
     def sets(self) -> Iterator[list[list[int]]]:
-        """Yield the reached cells after 0, 1, ... L layers, by speed and heading."""
+        """Yield the reached cells after 0, 1, ... L layers of time.
+
+        Each item is indexed by speed level and heading, and holds cells as bits of integers.
+        """
         num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
         planes = [[0] * HEADINGS for _ in range(num)]
         rise = self.scene.acceleration * self.scene.dt
@@ -279,12 +288,16 @@ class Lattice:
             yield planes
 
     def _neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
-        """Return the reached cells of a speed level, and of the next lower and higher level."""
+        """Return the reached cells of speed level k, and of the next lower and higher level."""
         last = len(planes) - 1
         return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
 
     def _move(self, planes: list[list[int]], half: int) -> list[list[int]]:
-        """Return the reached cells after another half layer."""
+        """Move all reached states straight ahead for half a layer, and remove those that collide.
+
+        `planes` has the reached cells by speed level and heading, as bits of integers. `half` is
+        the number of half layers since time 0.
+        """
         return [
             [
                 shift_bits(plane, shift) & self.free(half + 1, heading) if plane else 0
@@ -294,7 +307,10 @@ class Lattice:
         ]
 
     def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
-        """Return bit, level and heading of states at the target, at most one for each plane."""
+        """Return states that meet the target at a layer, at most one per speed level and heading.
+
+        A state is (bit of the cell, index of the speed level, index of the heading).
+        """
         goal = self._goal(layer)
         found = [
             (plane & goal[heading], level, heading)
@@ -304,7 +320,7 @@ class Lattice:
         return [(bits.bit_length() - 1, level, h) for bits, level, h in found if bits]
 
     def reach(self, keep_path: bool = False) -> Reach:
-        """Return whether and when the target can be met; `keep_path` adds a path to it."""
+        """Return whether and when the target can be met; with `keep_path`, also a path to it."""
         earliest, at_end, kept, path = np.inf, False, [], None
         for layer, planes in enumerate(self.sets()):
             if keep_path and path is None:
@@ -317,7 +333,10 @@ class Lattice:
         return Reach(at_end=at_end, earliest=earliest, path=path)
 
     def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """Trace a path (2 n + 1, 5) back from a state through n layers; see `Reach.path`."""
+        """Return a path to a state, found backwards through the reached cells of n layers.
+
+        The rows of the path, (2 n + 1, 5), are described at `Reach.path`.
+        """
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):
             bit, level, heading = state
@@ -342,7 +361,7 @@ class Lattice:
         return np.array(rows[::-1])
 
     def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Return time [s], x [m], y [m], heading [rad] and speed [m/s] of a state."""
+        """Convert a state at a half layer to time [s], x, y [m], heading [rad] and speed [m/s]."""
         bit, level, heading = state
         row, column = divmod(bit, self.stride)
         x, y = self.origin + CELL * np.array([column, row])
@@ -351,20 +370,25 @@ class Lattice:
 
 
 def as_integer(cells: np.ndarray, stride: int) -> int:
-    """Pack cells (Y, X) into the bits of an integer, with rows `stride` bits apart."""
+    """Pack a mask of cells (Y, X) into the bits of an integer, with rows `stride` bits apart."""
     padded = np.zeros((len(cells), stride), bool)
     padded[:, : cells.shape[1]] = cells
     return int.from_bytes(np.packbits(padded, bitorder="little").tobytes(), "little")
 
 
 def shift_bits(plane: int, shift: int) -> int:
-    """Shift bits up, or down if `shift` is negative."""
+    """Shift the bits of an integer to higher positions, or to lower ones if `shift` is negative."""
     return plane << shift if shift >= 0 else plane >> -shift
 
 
 def _spread(row: list[int], turn: int) -> list[int]:
-    """Unite each plane of a ring with up to `turn` neighbours on either side, by doubling."""
-    target, width, spread = 2 * turn + 1, 1, row  # spread[h] unites row[h:h + width]
+    """Add to each heading's cells the cells of up to `turn` neighbouring headings on either side.
+
+    `row` has the reached cells of every heading. The width of the united range doubles in each
+    step.
+    """
+    # In the loop, spread[h] is the union of row[h:h + width].
+    target, width, spread = 2 * turn + 1, 1, row
     while width < target:
         step = min(width, target - width)
         spread = [spread[h] | spread[(h + step) % HEADINGS] for h in range(HEADINGS)]

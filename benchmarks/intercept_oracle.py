@@ -3,35 +3,34 @@
     python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
         [--planner spacetime] [--failed | --early] [--workers N] [--out FILE.npz]
 
-Three searches in space and time, which share no code with the planners, answer for each case
-whether the target can be met at the case's time, and at which layer, of 0.25 s, it can be met
-first:
+Three searches determine for each case whether the target can be met at the case's time. They divide
+time into layers of 0.25 s, and also find the first layer at which the target can be met. They share
+no code with the planners:
 
-* `strict`: a lattice of pose and speed (`intercept_lattice`) with two discs that cover the body.
-What
-  it reaches is feasible up to the grid: a cell is 0.05 m, a heading step 5.6 degrees, obstacles are
-  checked every 0.125 s, and the steering rate is ignored. Lattice cars turn instantly and may leave
-  starts that no real car can leave. Therefore a search without a grid and with a steering rate
-  (`intercept_departure`) must be able to leave the start as well.
-* `minimal`: the same lattice with one disc inside of the body, and turns rounded up in every layer.
-It
-  reaches what any car reaches, except that rounding to cells may close paths as well as open them.
-  A
-  target that it does not reach is therefore strong evidence of infeasibility, but no proof.
-* `bound`: a point that moves in any direction, no faster than the car (`intercept_bound`). It is
-sound:
-  no car meets a target at the time of a layer at which this point does not.
+* `strict`: an exhaustive search of pose and speed on a lattice (`intercept_lattice`), with two
+  discs that cover the car's body. A motion that it finds is feasible except for discretisation
+  errors: a cell has a side of 0.05 m, headings are 5.6 degrees apart, obstacles are checked every
+  0.125 s, and the steering rate is ignored. Cars on the lattice turn instantly, so they may leave
+  starts that no real car can leave. Therefore a second search without a grid and with a limited
+  steering rate (`intercept_departure`) must also find a motion away from the start.
+* `minimal`: the same lattice with one disc inside of the body, and with turns rounded up in every
+  layer. Except for rounding to cells, it reaches every target that a car can reach. Rounding
+  may both close and open gaps. A target that this search does not reach is therefore very likely
+  infeasible, but this is no proof.
+* `bound`: a point that moves in any direction, no faster than the car (`intercept_bound`). If this
+  point cannot meet the target at the time of a layer, no car can. This is a proof.
 
-Hence a case is proven infeasible if `bound` fails, and very likely infeasible if `minimal` fails.
-If `strict` succeeds, it is feasible up to the grid. Cases that only `minimal` reaches are
-undecided. Meetings are checked at the times of layers only, with the case's tolerance, which
-lattices increase by half the diagonal of a cell.
+In short, a case is infeasible if `bound` fails, and very likely infeasible if `minimal` fails. If
+`strict` succeeds, the case is feasible except for discretisation errors. Cases in which `minimal`
+succeeds and `strict` fails are undecided. Meetings are checked only at the times of layers. The two
+lattices add half the diagonal of a cell to the case's tolerance.
 
-A planner, `spacetime` by default, plans the same cases. Cases that `strict` reaches or that the
-planner solves count as feasible. The share of them that the planner solves, by the referee, is its
-success. With `--failed` only unsolved cases are searched, which gives the same success much sooner.
-With `--early` the default planner also meets every target as early as possible, for comparison with
-the earliest meeting of `strict`.
+A planner, `spacetime` by default, plans the same cases. A case counts as feasible if `strict`
+succeeds or the planner solves it. The planner's success rate is the share of feasible cases that it
+solves, judged by the referee. With `--failed` only cases that the planner does not solve are
+searched. This gives the same success rate in much less time. With `--early` the default planner
+also plans to meet every target as early as possible, and its times are compared with the earliest
+meetings of `strict`.
 """
 
 import argparse
@@ -61,7 +60,7 @@ SEARCHES = ("bound", "minimal", "strict")
 
 
 def scenes(cases: InterceptCase) -> list[Scene]:
-    """Convert the cases of a batch to plain numbers."""
+    """Convert a batch of cases to scenes: plain numbers, with target positions at all layers."""
     ends = np.asarray(cases.time, float)
     layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
     times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)
@@ -106,18 +105,22 @@ def scenes(cases: InterceptCase) -> list[Scene]:
 @jax.jit
 @jax.vmap
 def _places(path: PlanePath, times: jax.Array) -> jax.Array:
-    """Return positions (T, 2) [m] of a target at times (T,) [s]."""
+    """Return the positions (T, 2) [m] of a target at times (T,) [s]."""
     return jax.vmap(lambda time: path.at(time).pos)(times)
 
 
 def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
-    """Return corners (V, 2) [m] of the obstacles that are present, and velocities (N, 2) [m/s]."""
+    """Return corners (V, 2) [m] of the obstacles that are present, and their velocities (N, 2)."""
     corners, present = group.vertices(0.0), np.asarray(group.present)
     return tuple(np.asarray(corners)[present]), np.asarray(group.velocity)[present]
 
 
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
-    """Return for each of `SEARCHES` whether it meets at the case's time, and the earliest [s]."""
+    """Run all `SEARCHES` on one scene.
+
+    Returns for each search whether the target is met at the case's time, and the earliest meeting
+    [s].
+    """
     of_bound = earliest_bound(scene)
     minimal, strict = (Lattice(scene, rules).reach() for rules in (MINIMAL, STRICT))
     of_strict = (strict.at_end, strict.earliest) if departs(scene) else (False, np.inf)
@@ -126,7 +129,10 @@ def search(scene: Scene) -> tuple[list[bool], list[float]]:
 
 
 def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Search B scenes; return both results of `search` as (B, 3) arrays."""
+    """Run all searches on B scenes in `workers` processes; return the results of `search`.
+
+    Returns whether targets are met at the case's time (B, 3), and the earliest meetings (B, 3) [s].
+    """
 
     def gather(results: Iterator) -> tuple[np.ndarray, np.ndarray]:
         pairs = list(tqdm(results, total=len(found), unit="case"))
@@ -140,12 +146,16 @@ def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray
 
 
 def format_indices(indices: np.ndarray) -> str:
-    """Format indices of cases as text."""
+    """Format the indices of cases as comma-separated text; "none" if there are no indices."""
     return ", ".join(map(str, indices)) or "none"
 
 
 def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.ndarray) -> None:
-    """Print the results of B cases: at the case's time (B, 3), and the earliest (B, 3) [s]."""
+    """Print the results of the three searches on B cases.
+
+    `at_end` (B, 3) bool states whether targets are met at the case's time. `earliest` (B, 3) [s]
+    has the earliest meetings. `index` (B,) has the numbers of the cases in the suite.
+    """
     bench.say(
         "| search | solved at the case's time | at any time up to it | earliest median | p95 "
         "| not at the case's time |",
@@ -178,7 +188,11 @@ def report(bench: Bench, index: np.ndarray, at_end: np.ndarray, earliest: np.nda
 
 
 def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.ndarray) -> None:
-    """Print how many of the feasible ones of B cases are solved, (B,) bool each."""
+    """Print the share of feasible cases that the planner solves.
+
+    A case is feasible if the search `strict` reaches its target (`reached`, (B,) bool), or if the
+    planner solves it (`solved`, (B,) bool).
+    """
     feasible = reached | solved
     good, num = int(solved.sum()), int(feasible.sum())
     low, high = wilson_interval(good, num)
@@ -193,7 +207,7 @@ def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.nda
 
 
 def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> None:
-    """Print how early the planner meets the targets of B cases, beside a lattice's (B,) [s]."""
+    """Plan B cases to meet early, and compare with the earliest meetings (B,) [s] of `strict`."""
     plans = pj.plan(pj.intercept.planner(meet="early"), cases)
     solved = np.asarray(pj.intercept.judge(cases, plans).success)
     met = np.where(solved, plans.time, np.inf)
@@ -209,7 +223,7 @@ def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> No
 
 
 def main() -> None:
-    """Search one suite's cases, and plan them."""
+    """Plan the cases of one suite, run the searches on them, and print and save the results."""
     parser = argparse.ArgumentParser(
         "python -m benchmarks.intercept_oracle", description=(__doc__ or "").partition("\n")[0]
     )

@@ -1,15 +1,19 @@
-"""Compare path searches among static walls, Hybrid A* and a published one, and measure smoothing.
+"""Compare this library's Hybrid A* with a published one, and measure the smoothing of its paths.
 
     python -m benchmarks.intercept_paths [--num 50] [--seed 0] [--out DIR]
 
-Walls, starts and meetings are from the suites `hard` and `maze`, without moving obstacles. First
-the heading at the meeting is free. Then the heading that this search found is prescribed, because
-the peer needs one: fastsim-navigation (C++, extra `peers`), which gets the same poses and the exact
-rectangle of the body. The peer represents walls by cells of 0.1 m, this library by a distance field
-and by discs that cover the body. Times are of one search, compiled before, from walls to poses, the
-fastest of three calls. A path is clear if the body's rectangle meets no wall at any of its poses.
-Lengths are means over the searches for which every row of the table has found a path. The last
-table smooths paths that were searched with nine tenths of the curvature limit.
+The problems are paths among static walls. Walls, starts and meeting points are from the suites
+`hard` and `maze`, without their moving obstacles. First this library searches paths with any
+heading at the meeting. Then the headings that it found are prescribed, because the published
+planner fastsim-navigation (C++, extra `peers`) needs a heading at the goal. Both planners get the
+same start and goal poses. This library represents walls by a distance field, and the car by discs
+that cover its body. fastsim-navigation represents walls by cells of 0.1 m, and the car by the exact
+rectangle of its body.
+
+A time is for one search without compilation, from walls to poses, the fastest of three calls. A
+path is clear if the body's rectangle touches no wall at any of its poses. Lengths are means over
+the problems for which every planner of the table has found a path. The last table is about
+smoothing. Its paths were searched with nine tenths of the curvature limit.
 """
 
 import dataclasses
@@ -33,29 +37,35 @@ from planner_jax.plane.obstacles import distances, separation
 from planner_jax.task.intercept.api import draw, positions
 
 SUITES = ("hard", "maze")
-CURVATURE_SHARE = 0.9  # factor of the curvature limit, for paths that are smoothed
-REPEATS = 3
+CURVATURE_SHARE = 0.9  # Paths that are smoothed were searched with this share of the limit.
+REPEATS = 3  # The fastest of this number of calls is reported.
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Results of all searches with one planner."""
+    """Results of one planner on B path problems, for one row of the table."""
 
-    found: np.ndarray  # (B,) bool
-    clear: np.ndarray  # (B,) bool
-    length: np.ndarray  # (B,) [m]
-    ms: np.ndarray  # (B,), NaN if there was no answer
+    found: np.ndarray  # (B,) bool, whether the planner has found a path
+    clear: np.ndarray  # (B,) bool, whether the body touches no wall at any pose of the path
+    length: np.ndarray  # (B,) [m], length of the path
+    ms: np.ndarray  # (B,) [ms], time of the search; NaN if the planner has aborted
     note: str = ""
 
 
 def body_of(case: Any) -> tuple[float, float, float]:
-    """Return the ends of the body behind and ahead of the rear axle, and half its width [m]."""
+    """Return the coordinates of the body's rear and front end, and half its width [m].
+
+    The coordinates are along the car, and zero at the rear axle.
+    """
     behind = -float(case.body.rear_overhang)
     return behind, behind + float(case.body.length), 0.5 * float(case.body.width)
 
 
 def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -> HybridPath:
-    """Search the path of one case, whose leaves are NumPy arrays."""
+    """Search a path from the start of one case to its meeting point (2,) [m] by Hybrid A*.
+
+    `share` is a factor of the curvature limit. The case has NumPy leaves.
+    """
     return hybrid_astar(
         case.start,
         meeting,
@@ -69,7 +79,7 @@ def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -
 
 
 def time_fastest(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Return the result of a function, and the duration of its fastest call [ms]."""
+    """Call a function `REPEATS` times; return its result, and the fastest call's duration [ms]."""
     seconds, result = [], None
     for _ in range(REPEATS):
         began = time.perf_counter()
@@ -86,14 +96,17 @@ def _gap(poses: jax.Array, walls: Any, body: jax.Array) -> jax.Array:
 
 
 def is_clear(case: Any, poses: np.ndarray, num: int = 513) -> bool:
-    """Return whether the body is clear of walls at poses (N, 3); at most `num` are checked."""
+    """Return whether the body touches no wall at poses (N, 3) of the rear axle.
+
+    At most `num` of the poses, equally spaced, are checked.
+    """
     places = np.linspace(0, len(poses) - 1, num).astype(int)
     body = jnp.asarray(body_of(case), jnp.float32)
     return bool(_gap(jnp.asarray(poses[places], jnp.float32), case.walls, body) > 0.0)
 
 
 def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
-    """Return the row of this library's paths."""
+    """Build the table row of this library's paths and their search times (B,) [ms]."""
     found = np.array([path.found for path in paths])
     pairs = zip(cases, paths, strict=True)
     clear = [path.found and is_clear(case, path.poses) for case, path in pairs]
@@ -103,7 +116,10 @@ def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
 
 
 def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
-    """Return the row of this library's search; a heading of None is free."""
+    """Search paths with this library, and return their table row.
+
+    A heading [rad] at the meeting point is prescribed, or arbitrary if it is None.
+    """
     results = [
         time_fastest(functools.partial(search, case, meeting, end_heading=heading))
         for case, meeting, heading in zip(cases, meetings, headings, strict=True)
@@ -113,7 +129,7 @@ def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) 
 
 
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
-    """Return the row of fastsim-navigation."""
+    """Search paths with fastsim-navigation to prescribed headings, and return their table row."""
     searches = []
     for case, meeting, heading in zip(cases, meetings, headings, strict=True):
         behind, ahead, half = body_of(case)
@@ -146,7 +162,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
 
 
 def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
-    """Print the rows of a table."""
+    """Print the rows of all planners for one suite, with means over problems that all solve."""
     together = np.logical_and.reduce([row.found for row in rows.values()])
     for name, row in rows.items():
         ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3
@@ -161,7 +177,7 @@ def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> No
 
 
 def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: np.ndarray) -> None:
-    """Print the effect of smoothing on paths that were searched with a reduced curvature limit."""
+    """Search paths with a reduced curvature limit, smooth them, and print lengths and times."""
     pairs = zip(cases, meetings, strict=True)
     paths = [search(case, meeting, CURVATURE_SHARE) for case, meeting in pairs]
 
@@ -195,7 +211,7 @@ def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: n
 
 
 def main() -> None:
-    """Print the tables."""
+    """Search and smooth the paths of both suites, and print the tables."""
     parser = argument_parser("intercept_paths", __doc__, num=50, seed=0)
     options = parser.parse_args()
     with begin(parser, options) as bench:
@@ -217,7 +233,7 @@ def main() -> None:
             row = search_row(cases, meetings, [None] * options.num)
             say_rows(bench, suite, "free", {"this library": row})
             bench.count(row.clear)
-            # If no path was found, any heading will do.
+            # The heading is arbitrary for problems without a path.
             headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
             rows = {"this library": search_row(cases, meetings, list(headings))}
             if is_installed():

@@ -1,18 +1,21 @@
-"""Compare all intercept planners on the same cases, beside Tables II and III of [Qu2022].
+"""Compare all planners of interceptions on the same cases, beside Tables II and III of [Qu2022].
 
     python -m benchmarks.intercept_peers [--suite hard] [--num 200] [--timed 50] [--out DIR]
 
-Success is judged by the referee, whatever a planner reports. Accelerations along the trajectory are
-means over successes: the root mean square over the horizon, and the peak. Pairs are compared on the
-cases where both succeed; `lattice, best path` and `em` drive along the same path.
+Success is judged by the referee, whatever a planner reports. The tables list the root mean square
+and the greatest acceleration along the trajectory, as means over successful plans. Two planners of
+a pair are compared on the cases where both succeed. The planners `lattice, best path` and `em`
+drive along the same path, so that only their speeds differ.
 
-Times are of one case at a time, compiled before, from arrays to arrays, the fastest of three calls
-for each of --timed cases: the path search, then the speed along the path. The first call of a
-process is reported separately. It compiles, unless JAX's cache holds the compiled program. Without
-the extra `baselines` the planner `paper`, whose search is compiled by numba, is left out.
+Times are for one case at a time, from arrays to arrays, without compilation. For each of --timed
+cases the fastest of three calls counts. Planners that first search a path and then plan the speed
+along it have a time for each part. The first call of a process is reported separately. It includes
+compilation, unless JAX's compile cache holds the program. The planner `paper`, whose search is
+compiled by numba, is left out if the extra `baselines` is not installed.
 
-The paper's tables are for one scenario, which it does not specify, on another computer. The columns
-of its Table II must have been swapped: a root mean square cannot exceed the peak.
+The paper's tables are for one scenario, which the paper does not specify, on another computer. The
+columns "Max Acc." and "Ave. Acc." of its Table II are presumably swapped, because the printed
+average values exceed the maximum values.
 """
 
 import dataclasses
@@ -34,7 +37,9 @@ from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.task.intercept.spec import SUITES
 
 BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the planner paper"
-SOFT_END = 3.0 * 10.0**3 / 10.0  # w_2 T^3 / w_1 of the paper's weights, 3 and 10, and T = 10 s
+# Weight of the end of the speed profile: w_2 T^3 / w_1 with w_1 = 10, w_2 = 3 and T = 10 s, as in
+# the paper.
+SOFT_END = 3.0 * 10.0**3 / 10.0
 PAIRS = (
     ("spacetime", "em"),
     ("best", "lattice"),
@@ -43,7 +48,7 @@ PAIRS = (
     ("lattice", "em"),
     ("paper", "em"),
 )
-# Table II, as printed: "Max Acc.", "Ave. Acc." [m/s^2] and the mean time [ms].
+# Table II of [Qu2022] as printed: "Max Acc." and "Ave. Acc." [m/s^2], and the mean time [ms].
 TABLE_II = {"EM": (0.327, 1.653, 2.883), "theirs": (0.296, 1.559, 2.175)}
 TABLE_III = {
     "path": 150.0,
@@ -53,7 +58,7 @@ TABLE_III = {
 
 
 def planners() -> dict[str, Any]:
-    """Return every planner by name."""
+    """Return the planners of interceptions by name, with `paper` only if numba is installed."""
     named = {
         **{name: pj.intercept.planner(name) for name in ("spacetime", "best", "quick")},
         "lattice": pj.intercept.planner("lattice"),
@@ -69,15 +74,15 @@ def planners() -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Results of one planner on all cases."""
+    """Verdicts, statuses and the time of the first call of one planner on all cases."""
 
     verdict: InterceptVerdict
-    status: np.ndarray  # (B,)
-    first_call: float  # [s], of the first batch
+    status: np.ndarray  # (B,), the planner's own report for each case
+    first_call: float  # [s], duration of the first call, with compilation
 
 
 def run_planner(planner: Any, cases: Any) -> Outcome:
-    """Plan a batch and judge the plans."""
+    """Plan a batch of cases in one call, time the call, and judge the plans."""
     began = time.perf_counter()
     plans = jax.tree.map(np.asarray, pj.plan(planner, cases))
     seconds = time.perf_counter() - began
@@ -85,7 +90,10 @@ def run_planner(planner: Any, cases: Any) -> Outcome:
 
 
 def split_planner(planner: Any) -> dict[str, Callable]:
-    """Return the parts of a planner as functions; each takes the result of the part before."""
+    """Return the parts of a planner as functions, such as the path search and the speed planner.
+
+    Each function takes the result of the function before it; the first takes a case.
+    """
     if isinstance(planner, PathThenSpeed):
         attempt = planner.attempts[0]
         return {
@@ -109,7 +117,10 @@ def split_planner(planner: Any) -> dict[str, Callable]:
 
 
 def time_parts(planner: Any, lanes: list) -> dict[str, np.ndarray]:
-    """Return the durations (N,) [s] of every part of a planner, and of all parts together, warm."""
+    """Plan N cases one by one; return durations (N,) [s] of each part and of all parts together.
+
+    Everything is compiled before, and the fastest of three calls counts.
+    """
     parts = split_planner(planner)
     best = {name: np.full(len(lanes), np.inf) for name in (*parts, "total")}
     given = lanes[0]
@@ -129,12 +140,12 @@ def time_parts(planner: Any, lanes: list) -> dict[str, np.ndarray]:
 
 
 def mean_of(values: np.ndarray) -> float:
-    """Return the mean, or NaN if there are no values."""
+    """Return the mean of an array, or NaN if the array is empty."""
     return float(values.mean()) if len(values) else np.nan
 
 
 def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """Print one row a planner: success, reasons of failures, accelerations."""
+    """Print a row for each planner: success rate, accelerations, and statuses of failures."""
     bench.say(
         "| planner | success | solved by status, rejected | rms acc. [m/s2] | peak acc. [m/s2] "
         "| failures | first call [s] |",
@@ -162,7 +173,10 @@ def table_of_outcomes(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
-    """Print Table II: accelerations of pairs where both succeed, beside the paper's values."""
+    """Print Table II: accelerations of pairs of planners, on cases where both succeed.
+
+    The paper's values are printed in the first row.
+    """
     bench.say(
         "",
         "| Table II | both succeed | rms acc. [m/s2] | reference | less | peak acc. "
@@ -193,7 +207,10 @@ def table_of_accelerations(bench: Bench, outcomes: dict[str, Outcome]) -> None:
 
 
 def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
-    """Print Table III: times of the parts of every planner, beside the paper's values."""
+    """Print Table III: planning times of each planner for path, speed and both.
+
+    The paper's values are printed in the first row.
+    """
     bench.say(
         "",
         "| Table III, p50 / p95 / p99 [ms] | path | speed | total |",
@@ -213,7 +230,7 @@ def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Plan the drawn cases with every planner, and print all tables."""
     parser = argument_parser("intercept_peers", __doc__, num=200, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="hard", help="default: hard")
     parser.add_argument("--timed", type=at_least(1), default=50, help="timed cases; default: 50")
