@@ -1,1 +1,1 @@
-"""Finished experiments, which are not part of the public interface."""
+"""Experiments that extend a task, such as a simulated camera; not part of the public interface."""

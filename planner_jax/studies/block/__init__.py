@@ -1,1 +1,1 @@
-"""Experiments with blocks."""
+"""Experiments with arms that block balls: camera observations, repeated and timed planning."""

@@ -1,8 +1,9 @@
-"""A pinhole camera: from world points to pixels with depths, and back.
+"""A pinhole camera that projects world points to pixels with depths, and pixels back to points.
 
-A pixel is (column, row), and whole numbers are the centres of pixels. The camera's axes are x to
-the right and y down in the image, and z forward. Depth is measured along z, as in depth images, not
-along the ray. Points and pixels may have any leading axes.
+A pixel is (column, row); whole numbers are the centres of pixels. In the camera frame x points to
+the right of the image, y down in the image, and z forward. The depth of a point is its z coordinate
+in the camera frame, as in depth images, and not its distance. Points and pixels may have any
+leading axes.
 """
 
 import functools
@@ -22,34 +23,34 @@ Kind = TypeVar("Kind")
 
 @struct.dataclass
 class Camera:
-    """Position, orientation, focal length and image size of a camera."""
+    """A pinhole camera: its position, orientation, focal length and image size."""
 
     rotation: Array  # (3, 3), its columns are the camera's axes in the world frame
-    position: Array  # (3,) [m], world frame
-    focal: Array  # () [px]
-    size: tuple[int, int] = struct.field(pytree_node=False)  # columns and rows of the image
+    position: Array  # (3,) [m], pinhole in the world frame
+    focal: Array  # () [px], focal length
+    size: tuple[int, int] = struct.field(pytree_node=False)  # numbers of columns and rows
 
     @property
     def centre(self) -> Array:
-        """The pixel (2,) [px] of the optical axis."""
+        """Pixel (2,) [px] of the optical axis, which is the centre of the image."""
         return jnp.asarray(0.5 * (np.array(self.size) - 1.0), jnp.result_type(self.focal))
 
 
 def from_numbers(kind: Callable[..., Kind], **leaves: ArrayLike) -> Kind:
-    """Make a dataclass with NumPy float32 leaves."""
+    """Create an object of a dataclass whose fields are converted to NumPy float32 arrays."""
     return kind(**{name: np.asarray(leaf, np.float32) for name, leaf in leaves.items()})
 
 
 def looking_at(
     position: ArrayLike, target: ArrayLike, *, size: tuple[int, int], field_of_view: float
 ) -> Camera:
-    """Create a camera that points at a target, with a level image; NumPy float32 leaves.
+    """Create a camera that points at a target and has no roll; its leaves are NumPy float32.
 
     Args:
-        position: (3,) [m].
-        target: (3,) [m], neither above nor below the camera.
-        size: columns and rows of the image.
-        field_of_view: [rad], of the image's width, between 0 and pi.
+        position: (3,) [m], position of the camera in the world frame.
+        target: (3,) [m], point on the optical axis, neither straight above nor below the camera.
+        size: numbers of columns and rows of the image.
+        field_of_view: [rad], horizontal opening angle, between 0 and pi.
 
     Raises:
         ArgumentError: an argument is out of its range.
@@ -70,7 +71,10 @@ def looking_at(
 
 
 def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
-    """Return a camera at a pose (4, 4), such as the result of a calibration."""
+    """Return the camera at another pose (4, 4), the homogeneous camera-to-world transform.
+
+    Such a pose is the result of a calibration.
+    """
     moved = functools.partial(Camera, focal=camera.focal, size=camera.size)
     return from_numbers(moved, rotation=pose[:3, :3], position=pose[:3, 3])
 
@@ -91,9 +95,9 @@ def project(camera: Camera, points: Array) -> tuple[Array, Array]:
     """Project world points (..., 3) [m] into the image.
 
     Returns:
-        pixels: (..., 2) [px], inside or outside the image; arbitrary finite numbers for points that
-            are not in front of the camera.
-        depths: (...) [m], negative behind the camera.
+        pixels: (..., 2) [px], inside or outside the image. For points that are not in front of the
+            camera they are finite numbers without meaning.
+        depths: (...) [m], z coordinates in the camera frame; negative behind the camera.
     """
     point_in_camera = to_camera(camera, points)
     depths = point_in_camera[..., 2]
@@ -102,7 +106,7 @@ def project(camera: Camera, points: Array) -> tuple[Array, Array]:
 
 
 def back_project(camera: Camera, pixels: Array, depths: Array) -> Array:
-    """Return the world points (..., 3) [m] at pixels (..., 2) with depths (...) [m]."""
+    """Return the world points (..., 3) [m] seen at pixels (..., 2) [px] with depths (...) [m]."""
     across = (pixels - camera.centre) / camera.focal
     ray = jnp.concatenate([across, jnp.ones_like(across[..., :1])], axis=-1)
     return to_world(camera, ray * depths[..., None])

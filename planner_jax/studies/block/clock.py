@@ -1,4 +1,7 @@
-"""Planning by the clock: a motion that is planned too late starts later."""
+"""Planning in measured time: a motion whose planning takes too long starts later.
+
+The setting `planning_budget` of a sweep of blocks uses this module.
+"""
 
 import dataclasses
 from typing import ClassVar
@@ -18,25 +21,25 @@ from planner_jax.task.block.plan import BlockPlan
 
 @struct.dataclass
 class TimedPlan(BlockPlan):
-    """A plan with the time that planning took."""
+    """A plan of a block, and how long the planner took to find it."""
 
-    planning_time: Array  # () [s]
+    planning_time: Array  # () [s], without compilation
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class CountedPlanner(Planner[BlockCase, TimedPlan]):
-    """Planner of one case after another that counts its own planning time.
+    """A planner that plans cases one after another with another planner, and measures its time.
 
-    A motion starts later by the time that planning exceeds `allowed`.
+    If planning a case takes longer than `allowed`, its motion starts later by the excess.
     """
 
     case_type: ClassVar[type] = BlockCase
     planner: Planner
-    allowed: float  # [s] of planning, included in the delay
+    allowed: float  # [s] planning time that the delay of every case already contains
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Return plans of a batch, up to the contact with the ball."""
+        """Plan each case of a batch, delay late motions, and cut each at its contact."""
         plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)

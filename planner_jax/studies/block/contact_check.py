@@ -1,8 +1,8 @@
-"""Contacts of plans with a ball that differs a little from the planned ball.
+"""True contacts of motions that were planned for an estimated ball.
 
-A plan contains the time of its contact. The true ball arrives at the shield a little earlier or
-later, and at a slightly different point. `end_at_contact` computes the true time, so that the
-referee judges the true contact. Robot base frame, z up, SI units.
+A plan contains the time at which the estimated ball meets the shield. The true ball arrives at a
+slightly different time and point. `end_at_contact` computes the true time, so that the referee
+judges the true contact. Positions are in the robot's base frame with z up, in SI units.
 """
 
 import dataclasses
@@ -20,39 +20,39 @@ from planner_jax.task.block.motion import append_braking
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_SAMPLES = 256  # times at which ball and shield are compared
-_HALVINGS = 24  # bisections between two of these times
+_SAMPLES = 256  # number of times at which the positions of ball and shield are compared
+_HALVINGS = 24  # number of bisections of the interval between two of the sampled times
 
 
 def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
-    """Return the motions up to their contacts with the balls of these cases.
+    """Return the plans cut at their contacts with the true balls.
 
-    An arm that need not be at rest at the contact brakes after its motion with constant
-    deceleration, as fast as its limits allow; the contact may happen while it brakes or after it
-    has stopped. If a ball crosses the shield's plane several times, the crossing nearest to the
-    shield's centre is the contact. A plan whose ball never crosses the plane is returned unchanged,
-    and the referee rejects it.
+    A motion that ends with a velocity is followed by braking with constant deceleration, as fast as
+    the limits allow. The contact may happen while the arm brakes or after it has stopped. If a ball
+    crosses the shield's plane several times, the crossing nearest to the shield's centre is the
+    contact. If a ball never crosses the plane, the planned contact time is kept, and the referee
+    rejects the plan.
 
     Args:
-        cases: a batch of B, with the true balls, and the delays of the plans.
-        plans: plans of these cases for other balls; polynomials of degree 2 or more.
+        cases: a batch of B cases with the true balls, and with the delays of the plans.
+        plans: plans for estimated balls of these cases; polynomials of degree 2 or more.
 
     Returns:
-        Plans with one more piece, of zero duration if the contact comes before it.
+        Plans with one more piece for braking; its duration is zero if the contact comes before.
     """
     return _end_each_at_contact(cases, plans)
 
 
 def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockPlan:
-    """Return the motions with a later start, up to their contacts by `end_at_contact`.
+    """Return the plans with later starts, cut at their contacts as `end_at_contact` does.
 
     Args:
-        cases: a batch of B, of arms at rest.
+        cases: a batch of B cases in which the arms start at rest.
         plans: plans of these cases.
-        late: (B,) [s], delays, >= 0. A plan with a delay of 0 keeps its motion and its contact.
+        late: (B,) [s], additional delay of each start, >= 0. A plan with 0 is not changed.
 
     Returns:
-        Plans with two more pieces.
+        Plans with two more pieces: one for waiting before the motion, one for braking after it.
     """
     return _delay_each(cases, plans, late)
 
@@ -75,11 +75,14 @@ def _delay_each(case: BlockCase, plan: BlockPlan, late: Array) -> BlockPlan:
 
 
 def _find_contact(case: BlockCase, plan: BlockPlan) -> BlockPlan:
-    """Cut one plan at its contact with the ball."""
+    """Cut one plan at the time at which the ball of its case crosses the shield's plane."""
     motion = append_braking(case, plan.motion)
 
     def above(time: Array) -> tuple[Array, Array]:
-        """Return the ball's height () [m] above the shield's plane and its squared distance."""
+        """Return the ball's signed distance () [m] from the shield's plane at a time () [s].
+
+        The second result is its squared distance () [m^2] from the shield's centre.
+        """
         ends = jnp.sum(motion.durations)
         angles = evaluate(motion, jnp.clip(time - case.delay, 0.0, ends))
         rotation, middle = shield_pose(case.arm, angles)
@@ -107,9 +110,9 @@ _end_each_at_contact = jax.jit(jax.vmap(_find_contact))
 
 
 def _cut(motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Cut a motion at a time () [s] after its start; a motion that ends earlier stays complete.
+    """Cut a motion at a time () [s] after its start; a motion that ends earlier is not cut.
 
-    Later pieces get a duration of 0 s and start at the state of the cut.
+    Pieces after the cut get zero duration, and start with the angles and rates at the cut.
     """
     starts = jnp.cumsum(motion.durations) - motion.durations
     last = jnp.minimum(time, jnp.sum(motion.durations))

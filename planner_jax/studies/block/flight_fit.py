@@ -1,13 +1,14 @@
 """Least-squares fit of a ball's flight to its observations [Natarajan2024, eqs 5 to 8].
 
-After the known fall is subtracted, a drag-free flight is linear in the ball's position and velocity
-at any one time: the least squares are six linear equations. The equations are centred and scaled by
-the observations' own mean and spread, and solved twice, the second time for the residuals of the
-first solution. This makes float32 sufficient even if depths are a hundred times less certain than
-the other coordinates. World frame, z up, SI units, one ball; use `jax.vmap` for a batch.
+Without drag, after gravity's known term is added back, the position is linear in the six unknowns:
+the ball's position and velocity at one time. The normal equations are therefore a linear system of
+size six. It is centred and scaled by the mean and spread of the observations, and solved a second
+time for the residuals of the first solution. Float32 then suffices even if depths are a hundred
+times less certain than other coordinates. Positions are in the world frame with z up, in SI units.
+The functions treat one ball; use `jax.vmap` for a batch.
 
-Nothing is stored between fits. Every fit uses all observations so far, in one buffer with NaN for
-later observations, and takes constant time.
+Every fit uses all observations up to its time, from an array of fixed size in which later
+observations are NaN. No state is stored between fits, and every fit takes the same time.
 """
 
 import enum
@@ -22,7 +23,7 @@ from planner_jax.ball.flight import BallState, drag_free_flight
 
 
 class Sight(enum.IntEnum):
-    """The outcome of observing one ball."""
+    """Whether a ball was observed often enough to fit its flight."""
 
     SEEN = 0
     NEVER_SEEN = 1
@@ -30,7 +31,7 @@ class Sight(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """A sentence for the user that also names the remedy."""
+        """Explanation of the outcome for the user, with a remedy if the flight is unknown."""
         return _MESSAGES[self]
 
 
@@ -43,34 +44,34 @@ _MESSAGES = {
 
 @struct.dataclass
 class FlightFit:
-    """A fitted flight and its uncertainty; NaN if the ball was not seen at two times."""
+    """A fitted flight and its uncertainty; NaN if the ball was seen at fewer than two times."""
 
-    belief: EkfState  # about position and velocity at `time`
-    time: Array  # () [s], weighted middle of the observations
-    misfit: Array  # () root mean square residual in standard deviations; 1 is expected
+    belief: EkfState  # mean and covariance of the ball's position and velocity at `time`
+    time: Array  # () [s], weighted mean of the times of the observations
+    misfit: Array  # () root mean square residual in standard deviations, about 1 for a good fit
     num: Array  # () int32, number of fitted observations
     status: Array  # () int32, a `Sight`
 
     @property
     def ball(self) -> BallState:
-        """The ball at `time`."""
+        """Estimated position and velocity of the ball at `time`."""
         return self.belief.ball
 
 
 def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Array) -> FlightFit:
-    """Return the least-squares free flight through observations; pure, so jit and vmap it.
+    """Fit a drag-free flight to observed positions by least squares; usable with jit and vmap.
 
-    Minimises  sum_k e_k' W_k e_k,  e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights
-    this is [Natarajan2024, eq. 8]. The covariance is correct if every W_k is the inverse covariance
-    of its observation.
+    The fit minimises  sum_k e_k' W_k e_k  over the position p and the velocity v, where
+    e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights this is [Natarajan2024, eq. 8].
+    The covariance is correct if every W_k is the inverse covariance of its observation.
 
     Args:
-        times: (N,) [s], in any order.
-        places: (N, 3) x_k [m]. A position that is not finite counts as absent, so that shapes stay
-            fixed.
+        times: (N,) [s], times t_k in any order.
+        places: (N, 3) [m], observed positions x_k. A position that is not finite is ignored, so
+            that arrays keep a fixed shape whatever the number of observations.
         information: W_k [1/m^2], (N, 3, 3); or (N,) or () for isotropic noise. An observation with
-            zero information is absent too.
-        gravity: () [m/s^2], magnitude.
+            zero information is ignored too.
+        gravity: () [m/s^2], magnitude g.
     """
     dtype = places.dtype
     weights = jnp.asarray(information, dtype)
@@ -105,15 +106,15 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
             ],
         ]
     )
-    # Without a flight the identity is solved instead.
+    # If there are too few observations, the singular matrix is replaced by the identity.
     normal = jnp.where(enough, normal, jnp.eye(6, dtype=dtype))
 
     def residuals(unknowns: Array) -> Array:
-        """Return the residuals of the observations, (N, 3) [m]."""
+        """Return the observed minus the predicted positions (N, 3) [m] for unknowns (6,)."""
         return seen - unknowns[:3] - steps[:, None] * unknowns[3:]
 
     def refine(unknowns: Array) -> Array:
-        """Return the solution after one step of iterative refinement."""
+        """Return the unknowns (6,) after one step of iterative refinement of the linear system."""
         pull = jnp.einsum(
             "nij,nj->ni", weights, residuals(unknowns), precision=lax.Precision.HIGHEST
         )
@@ -142,7 +143,10 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
 
 
 def belief_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
-    """Return the estimate of the ball at a time () [s], before or after its observations."""
+    """Return mean and covariance of position and velocity at a time () [s], from a fitted flight.
+
+    The time may lie before, between or after the observations.
+    """
     ahead = jnp.asarray(time, fit.time.dtype) - fit.time
     ball = drag_free_flight(fit.ball, ahead, gravity)
     P = fit.belief.covariance
@@ -156,10 +160,10 @@ def belief_at(fit: FlightFit, time: Array, gravity: Array) -> EkfState:
 
 
 def across_std(belief: EkfState) -> Array:
-    """Return the standard deviation () [m] of the ball's position normal to its estimated velocity.
+    """Return the standard deviation () [m] of the ball's position normal to its velocity.
 
-    It is the root of the summed variances of both normal directions. An error along the velocity is
-    only an error in time.
+    It is the square root of the summed variances along both directions normal to the estimated
+    velocity. An error along the velocity does not count, because it only shifts the contact time.
     """
     place, vel = belief.covariance[:3, :3], belief.mean[3:]
     along = jnp.einsum("i,ij,j->", vel, place, vel, precision=lax.Precision.HIGHEST)
@@ -168,10 +172,10 @@ def across_std(belief: EkfState) -> Array:
 
 
 def error_across(belief: EkfState, ball: BallState) -> Array:
-    """Return the distance () [m] of the estimate from the true ball, normal to the ball's velocity.
+    """Return the estimated position's error () [m] normal to the true ball's velocity.
 
-    To first order in the error, it is the distance between expected and true contact on a shield
-    that faces the ball.
+    To first order in the error, this is the distance between the expected and the true contact
+    point on a shield that faces the ball.
     """
     off = belief.mean[:3] - ball.pos
     along = jnp.sum(off * ball.vel) / jnp.maximum(jnp.sum(ball.vel**2), 1e-12)
@@ -179,7 +183,7 @@ def error_across(belief: EkfState, ball: BallState) -> Array:
 
 
 def _root(square: Array) -> Array:
-    """Return the square root () of a square; zero with slope zero if rounding makes it negative."""
+    """Return the square root (); zero with derivative zero if rounding made the square negative."""
     there = square > 0.0
-    # NaN, for a ball that was not seen, stays NaN.
+    # The product with the square keeps NaN, which marks a ball that was not seen.
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0 * square)

@@ -1,9 +1,10 @@
 """Measurement noise of a camera that observes a ball.
 
-A stereo camera measures the disparity  d = f b / z  of two images with a baseline b. An error of
-the disparity causes an error of the depth z that is  z^2 / (f b)  times as large. The depth noise
-thus grows with the square of the distance, and the noise normal to the ray grows linearly.
-Isotropic noise, equal in all directions and at all distances, serves for comparisons.
+A stereo camera with focal length f [px] and baseline b [m] measures the disparity  d = f b / z  of
+a point at depth z. An error of the disparity causes an error of the depth that is  z^2 / (f b)
+times as large. The depth noise thus grows with the square of the depth, and the noise normal to the
+line of sight grows linearly. Isotropic noise, which is equal in all directions and at all depths,
+serves for comparisons.
 """
 
 import jax
@@ -24,21 +25,21 @@ from planner_jax.studies.block.camera import (
 
 @struct.dataclass
 class StereoNoise:
-    """Errors of a stereo camera, independent between frames."""
+    """Parameters of a stereo camera's measurement errors, which are independent between frames."""
 
-    baseline: Array  # () [m]
-    pixel_std: Array  # () [px], of the ball's centre in the image, in each direction
-    disparity_std: Array  # () [px], of the ball's mean disparity
-    speckle_std: Array  # () [px], of one pixel's disparity, in addition to `disparity_std`
+    baseline: Array  # () [m], distance between the two lenses
+    pixel_std: Array  # () [px], standard deviation of the ball's centre along each image axis
+    disparity_std: Array  # () [px], standard deviation of the ball's mean disparity
+    speckle_std: Array  # () [px], additional standard deviation of the disparity of one pixel
     dropout: Array  # () probability that a pixel, or in `sightings` a frame, has no depth
     mismatch: Array  # () probability that a pixel has the depth of another object
 
 
 @struct.dataclass
 class IsotropicNoise:
-    """Isotropic errors, independent between frames."""
+    """Measurement errors that are equal in all directions and independent between frames."""
 
-    std: Array  # () [m], of each coordinate
+    std: Array  # () [m], standard deviation of each coordinate
 
 
 Noise = StereoNoise | IsotropicNoise
@@ -53,11 +54,12 @@ def stereo_noise(
     dropout: float = 0.05,
     mismatch: float = 0.05,
 ) -> StereoNoise:
-    """Create the errors of a stereo camera as NumPy float32 leaves.
+    """Create the error parameters of a stereo camera, with NumPy float32 leaves.
 
-    The baseline of 0.12 m is the one of the ZED 2i, the camera of [Natarajan2024], by its maker's
-    documentation. A fifth of a pixel is a usual estimate for the matching error of one pixel. Half
-    of it is assumed to remain in the mean over a ball; the other numbers are assumptions too.
+    The default baseline is 0.12 m, the documented baseline of the ZED 2i, the camera of
+    [Natarajan2024]. A matching error of 0.2 px is a usual estimate for one pixel. The other
+    defaults are assumptions; for example the mean disparity over a ball is assumed to have half the
+    error of one pixel.
 
     Raises:
         ArgumentError: a number is out of its range.
@@ -72,15 +74,16 @@ def stereo_noise(
 
 
 def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
-    """Return the standard deviations (...) [m] of a ball's depths (...) [m], to first order."""
+    """Return the standard deviations (...) [m] of measured depths (...) [m], to first order."""
     return depths**2 * noise.disparity_std / (camera.focal * noise.baseline)
 
 
 def information(camera: Camera, noise: Noise, points: Array) -> Array:
-    """Return the inverse covariances (..., 3, 3) [1/m^2] of observed balls at points (..., 3) [m].
+    """Return inverse covariances (..., 3, 3) [1/m^2] of observed positions, in the world frame.
 
-    A stereo camera has a pixel error along the image and a depth error along the ray. World frame;
-    to first order in the errors. Observed positions may replace the true ones.
+    `points` (..., 3) [m] are the true or the observed positions of the ball. A stereo camera has a
+    pixel error within the image and a depth error along the line of sight. The covariances are
+    correct to first order in both errors.
     """
     if isinstance(noise, IsotropicNoise):
         isotropic = jnp.eye(3, dtype=points.dtype) / noise.std**2
@@ -90,7 +93,7 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
     sharp = camera.focal / (depth * noise.pixel_std)
     blurred = 1.0 / depth_std(camera, noise, depth)
     none = jnp.zeros_like(depth)
-    # Rows that whiten the error in the camera frame.
+    # The matrix W of these rows whitens the error e in the camera frame: W e has unit covariance.
     rows = [
         jnp.stack([sharp, none, -sharp * point_in_camera[..., 0] / depth], axis=-1),
         jnp.stack([none, sharp, -sharp * point_in_camera[..., 1] / depth], axis=-1),
@@ -102,14 +105,14 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
 
 
 def sightings(key: Array, camera: Camera, noise: Noise, points: Array) -> Array:
-    """Return observed positions of balls at points (N, 3) [m], one per frame.
+    """Simulate the observed positions of a ball whose true positions in N frames are `points`.
 
-    This simulates the result of `sims.segment.sighting` without images. A ball outside the image is
-    not seen; occlusion is ignored. A stereo camera's pixels and disparities have Gaussian errors,
-    and some frames are lost.
+    No images are rendered; `sims.segment.sighting` computes observed positions from images. A ball
+    outside the image is not seen, and occlusion is ignored. A stereo camera's pixels and
+    disparities have Gaussian errors, and some frames have no depth at random.
 
     Returns:
-        (N, 3) [m], world frame; NaN if the ball is not seen.
+        (N, 3) [m], observed positions in the world frame; NaN in frames without the ball.
     """
     if isinstance(noise, IsotropicNoise):
         seen = points + noise.std * jax.random.normal(key, points.shape, points.dtype)

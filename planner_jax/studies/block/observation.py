@@ -1,8 +1,8 @@
-"""Camera observations of throws, and the cases that planners get from them.
+"""Simulated camera observations of thrown balls, and the cases that planners get from them.
 
-A ball is first seen at a case's time 0, then in every frame. The observations until some moment are
-fitted. Planners get a case with the fitted ball, the referee gets the true ball. Robot base frame,
-z up, SI units.
+The first frame is at a case's time 0. A flight is fitted to the observations up to some moment. The
+planner gets a case with the fitted ball, and the referee gets the case with the true ball.
+Positions are in the robot's base frame with z up, in SI units.
 """
 
 import dataclasses
@@ -38,20 +38,21 @@ from planner_jax.task.block.scene import RIG_HALF, Box
 
 @struct.dataclass
 class Eye:
-    """A camera in the scene, its noise and its frame rate."""
+    """A camera in the scene, with its measurement noise and its frame rate."""
 
     camera: Camera
     noise: Noise
-    rate: float = struct.field(pytree_node=False)  # [Hz], frames
+    rate: float = struct.field(pytree_node=False)  # [Hz] frame rate
 
 
 def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
-    """Return a camera 1.6 m above the base, on a mast on the rig's beam behind the arm.
+    """Return a camera 1.6 m above the arm's base, on a mast on the rig's beam behind the arm.
 
-    [Natarajan2024] mounts its camera on the rig's beams, its authors' model in front of the arm,
-    from where 110 degrees do not cover throws from 60 degrees to either side. From the mast 120
-    degrees cover the throws of the suites until shortly before the outer box, over the arm and, 0.3
-    m to the left, past the pole. Position and field of view are assumptions.
+    Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
+    throws of all suites almost until they enter the outer box. From the mast it looks over the arm;
+    0.3 m to the left of the arm's axis it looks past the pole. [Natarajan2024] mounts its camera on
+    the beams of the rig. Its authors' model has the camera in front of the arm, where 110 degrees
+    do not cover throws that come from up to 60 degrees to either side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])
@@ -59,12 +60,13 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
 
 
 def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None = None) -> Eye:
-    """Return a stereo camera with the noise of `stereo_noise`, by default on the mast.
+    """Return a camera in the scene with measurement noise and a frame rate.
 
     Args:
-        rate: [Hz], of frames.
-        std: [m], standard deviation of each coordinate, for isotropic noise instead.
-        camera: in the scene.
+        rate: [Hz], frame rate.
+        std: [m], standard deviation of each coordinate, for isotropic noise; None selects the noise
+            of a stereo camera, `stereo_noise()`.
+        camera: the camera; by default `mast_camera()`.
 
     Raises:
         ArgumentError: a number is not positive.
@@ -79,23 +81,23 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
 
 
 def frame_times(eye: Eye, seconds: float) -> np.ndarray:
-    """Return the times (N,) [s] of the frames until a moment [s], the first at 0."""
-    # A frame at the moment itself counts despite rounding.
+    """Return the times (N,) [s] of all frames from time 0 up to and including `seconds` [s]."""
+    # The small term keeps a frame exactly at `seconds`, which rounding could exclude.
     return np.arange(int(np.floor(seconds * eye.rate + 1e-6)) + 1) / eye.rate
 
 
 @jax.jit
 def watch(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
-    """Return the observed positions of a batch of balls at times (N,) [s]; pure.
+    """Simulate the observed positions of a batch of flying balls in N frames; compiled by jit.
 
     Args:
-        cases: a batch of B, with the true balls.
-        eye: the camera.
-        times: (N,) [s], of frames.
-        key: of the noise, or one key per case, (B,).
+        cases: a batch of B cases with the true balls.
+        eye: the camera, its noise and its frame rate.
+        times: (N,) [s], times of the frames.
+        key: random key of the noise, or one key for each case, (B,).
 
     Returns:
-        (B, N, 3) [m]; NaN if a ball is not seen.
+        (B, N, 3) [m], observed positions; NaN where a ball is not seen.
     """
 
     def one(ball: BallState, gravity: Array, key: Array) -> Array:
@@ -107,14 +109,14 @@ def watch(cases: BlockCase, eye: Eye, times: Array, key: Array) -> Array:
 
 
 def fit_until(eye: Eye, times: Array, places: Array, gravity: Array, until: Array) -> FlightFit:
-    """Fit the flight of one ball to its observations until a moment; pure.
+    """Fit the flight of one ball to its observations up to a time; usable with jit and vmap.
 
     Args:
-        eye: the camera of the observations.
-        times: (N,) [s].
-        places: (N, 3) [m].
+        eye: the camera that made the observations; its noise determines their weights.
+        times: (N,) [s], times of the observations.
+        places: (N, 3) [m], observed positions.
         gravity: () [m/s^2], magnitude.
-        until: () [s]; later observations are ignored.
+        until: () [s], time after which observations are ignored.
     """
     known = jnp.where((times <= until + 1e-4)[:, None], places, jnp.nan)
     return fit_flight(times, known, information(eye.camera, eye.noise, known), gravity)
@@ -124,7 +126,12 @@ def fit_until(eye: Eye, times: Array, places: Array, gravity: Array, until: Arra
 def fit_throws(
     cases: BlockCase, eye: Eye, times: Array, places: Array, moment: Array
 ) -> tuple[BallState, FlightFit]:
-    """Return balls at time 0 and fits of a batch, from the observations until a moment."""
+    """Fit the flights of a batch of B balls to their observations (B, N, 3) up to `moment` [s].
+
+    Returns:
+        balls: estimated states of the balls at time 0, leaves (B, 3).
+        fits: the fits, leaves (B, ...).
+    """
     fits = jax.vmap(fit_until, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
     start = jnp.zeros((), times.dtype)
     return jax.vmap(belief_at, (0, None, 0))(fits, start, cases.gravity).ball, fits
@@ -132,28 +139,28 @@ def fit_throws(
 
 @struct.dataclass
 class SeenThrows:
-    """A batch of throws as estimated at some moment."""
+    """A batch of thrown balls as estimated from their observations up to some moment."""
 
-    cases: BlockCase  # with the fitted balls; planners get them
-    fits: FlightFit  # leaves (B, ...)
+    cases: BlockCase  # cases for a planner, with the estimated balls
+    fits: FlightFit  # the fitted flights, leaves (B, ...)
 
 
 def see(
     cases: BlockCase, eye: Eye, seconds: float, *, seed: int = 0, overhead: float = 0.0
 ) -> SeenThrows:
-    """Return a batch of throws as estimated after some seconds of flight.
+    """Simulate the observation of a batch of throws, and return cases with the estimated balls.
 
-    Plan with the returned cases, made `cautious`. To judge the plans, set the delay of the true
-    cases to the returned delay, and pass cases and plans through
+    Pass the returned cases through `cautious` and then to a planner. To judge the plans, set the
+    delay of the true cases to the returned delay, and pass true cases and plans to
     `studies.block.contact_check.end_at_contact`. A ball that was seen at fewer than two times is
-    NaN, and `fits.status` gives the reason.
+    NaN, and `fits.status` states the reason.
 
     Args:
-        cases: a batch of B, with the true balls.
-        eye: the camera.
-        seconds: [s], from a case's time 0 until the fit, >= 0.
-        seed: of the noise.
-        overhead: [s], from the fit until the arm may start, >= 0.
+        cases: a batch of B cases with the true balls.
+        eye: the camera, its noise and its frame rate.
+        seconds: [s], duration of the observation, from a case's time 0 until the fit, >= 0.
+        seed: seed of the noise.
+        overhead: [s], time from the fit until the arm may start to move, >= 0.
 
     Raises:
         ArgumentError: a time is negative.
@@ -175,21 +182,22 @@ def cautious(
     edge: float = 0.0,
     at_rest: bool = False,
 ) -> BlockCase:
-    """Return a batch of observed cases with reserves for the error of the fit, for a planner.
+    """Return cases with stricter requirements, so that plans also block balls with fit errors.
 
-    A planner takes the fitted ball as exact. Contact near the shield's centre leaves the rest of
-    the shield for the error of the fit. A ball that is estimated to miss the protected box may
-    still hit it: for such a ball the box is enlarged.
+    A planner treats the fitted ball as exact. If it must meet the ball near the shield's centre,
+    the shield still blocks a true ball that passes at some distance. A ball that is estimated to
+    miss the protected inner box may still hit it. For such a ball the box is enlarged, so that the
+    planner blocks the ball as well.
 
     Args:
-        cases: a batch with fitted balls.
-        offset: [m], greatest distance of the contact from the shield's centre, unless the case has
-            less.
-        grow: [m], enlargement of that box on its sides and at its top.
-        edge: [m], distance from both ends of the ball's trajectory between the boxes, a reserve for
-            the error along the trajectory.
-        at_rest: whether the arm must be at rest at the contact even if the case does not require
-            it; then a late ball is blocked too.
+        cases: a batch of cases with fitted balls.
+        offset: [m], greatest allowed distance of the contact from the shield's centre; a smaller
+            value in a case is kept.
+        grow: [m], enlargement of the inner box at its sides and its top for balls that miss it.
+        edge: [m], length by which the ball's path between outer and inner box is shortened at both
+            ends, as a reserve for errors along the path.
+        at_rest: whether the arm must be at rest at the contact in every case. An arm at rest also
+            blocks a ball that comes later than estimated.
     """
     inner, outer = cases.scene.inner, cases.scene.outer
     passes = ~jax.jit(jax.vmap(flight_of))(cases).comes
@@ -207,11 +215,17 @@ def cautious(
 
 @jax.jit
 def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
-    """Return errors of fits normal to the flight, midway between the boxes of the true balls.
+    """Return the position errors of fits at the middle of the time in which a ball can be blocked.
+
+    The ball can be blocked between its entries into the outer and the inner box.
+
+    Args:
+        cases: a batch of B cases with the true balls.
+        fits: fits of these balls.
 
     Returns:
-        error: (B,) [m].
-        std: (B,) [m], their estimated standard deviations.
+        error: (B,) [m], distance of the estimated from the true ball, normal to its velocity.
+        std: (B,) [m], estimated standard deviations of these errors.
     """
 
     def one(case: BlockCase, fit: FlightFit) -> tuple[Array, Array]:

@@ -1,11 +1,12 @@
-"""Receding horizon: the motion is decided again as more of the ball's flight is observed.
+"""Receding-horizon planning of blocks: a motion is planned again as more observations arrive.
 
-At given moments all observations so far are fitted. A motion that would still meet the newly fitted
-ball near the intended contact continues. Otherwise a new motion is planned from the state that the
-arm will have when it can start. If no new motion meets the ball closer to the shield's centre, the
-old motion continues and brakes after its contact. The pieces of all executed motions form one plan,
-which the referee judges against the true ball. With a single moment the arm decides once. Robot
-base frame, z up, SI units.
+At specified moments the ball's flight is fitted to all observations so far. If the current motion
+still meets the newly fitted ball near the shield's centre, the arm continues it. Otherwise a new
+motion is planned from the state that the arm will have when the new motion can start. If no new
+motion meets the ball closer to the shield's centre, the arm continues its current motion and brakes
+after the contact. The pieces of all executed motions form one plan, which the referee judges
+against the true ball. With a single moment the arm plans once. Positions are in the robot's base
+frame with z up, in SI units.
 """
 
 import dataclasses
@@ -42,21 +43,22 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_NEAR = 0.02  # [m], contacts this near to the shield's centre need no improvement
-_EXCESS = 0.05  # relative excess over contact limits up to which a motion continues
-_LONG = 100.0  # [s], standstill after a motion
+_NEAR = 0.02  # [m] A contact within this distance of the shield's centre needs no new motion.
+_EXCESS = 0.05  # Relative excess over the limits of a contact up to which a motion is continued.
+_LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer than any flight.
 
 
 @dataclasses.dataclass(frozen=True)
 class Aim:
-    """Reserves for meeting a ball that is not known exactly; see `cautious`."""
+    """Stricter requirements on a contact with an estimated ball: arguments of `cautious`."""
 
-    offset: float  # [m], greatest distance of the contact from the shield's centre
-    at_rest: bool = False
-    edge: float = 0.0  # [m], reserve at both ends of the ball's trajectory between the boxes
+    offset: float  # [m] greatest distance of the contact from the shield's centre
+    at_rest: bool = False  # whether the arm must be at rest at the contact
+    edge: float = 0.0  # [m] length cut from both ends of the ball's path between the boxes
 
 
-# Each aim is tried for the balls that the previous aims left without a plan.
+# Requirements in the order in which they are tried, the strictest first. Each is tried for the
+# balls for which no plan meets the previous requirements.
 AIMS = (
     Aim(0.005, at_rest=True, edge=0.05),
     Aim(0.005, edge=0.05),
@@ -67,30 +69,39 @@ AIMS = (
 
 @struct.dataclass
 class Decided:
-    """A batch of throws, and the motions of arms that decided while observing."""
+    """A batch of B throws, and the motions of arms that planned while observing the balls.
 
-    cases: BlockCase  # the true balls, and the delay at which the motions start
-    plans: BlockPlan  # pass them to `end_at_contact`, then to the referee, with these cases
-    fits: FlightFit  # leaves (M, B, ...), one per moment
-    start: Array  # (B,) [s], when the first motion started; infinite without a motion
+    To judge the motions, pass `cases` and `plans` to `end_at_contact` and then to the referee.
+    """
+
+    cases: BlockCase  # cases with the true balls, and with the delay at which the motions start
+    plans: BlockPlan  # all executed and planned pieces of each arm's motion
+    fits: FlightFit  # fits of the flights at M moments, leaves (M, B, ...)
+    start: Array  # (B,) [s], start of the arm's first motion; infinite if it never moves
     motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return the errors (B,) [m] of the fits at a moment, and their standard deviations."""
+        """Return errors and estimated standard deviations (B,) [m] of the fits at one moment.
+
+        `place` is the index of the moment.
+        """
         return fit_errors(self.cases, take(self.fits, place))
 
 
 def plan_with_aims(
     planner: Planner, cases: BlockCase | Replanning, aims: Sequence[Aim] = AIMS
 ) -> BlockPlan:
-    """Plan for a batch with fitted balls, by the first aim that leads to a plan."""
+    """Plan cases with estimated balls; each case gets the plan of the first aim that is solved.
+
+    Aims are increasingly lenient requirements. If no aim is solved, the last plan is returned.
+    """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
     for aim in aims:
         some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
-        # NumPy arrays, since their programs are compiled already.
+        # Convert to NumPy arrays, because JAX's programs for NumPy inputs are compiled already.
         aimed = jax.tree.map(np.asarray, aimed)
         asked = dataclasses.replace(some, case=aimed) if is_again else aimed
         found = jax.tree.map(np.array, plan(planner, asked))
@@ -115,22 +126,22 @@ def decide(
     patient: bool = False,
     again: bool = True,
 ) -> Decided:
-    """Simulate arms that observe their balls and decide at given moments.
+    """Simulate a batch of arms that observe their balls, and plan motions at specified moments.
 
     Args:
-        planner: planner of the first motion, and of motions without a predecessor. A planner other
-            than `OnlineBlock` decides once.
-        cases: a batch of B, with the true balls; arms stay in the cases' states until the first
-            moment.
-        eye: the camera.
-        moments: [s], increasing times of the fits; earlier frames count.
-        overhead: [s], from a moment until its motion may start, planning included, >= 0.
-        seed: of the noise; or one seed per throw, (B,).
-        aims: reserves, tried in this order; offsets must not decrease.
-        shortest: [s], least remaining time for a new motion.
-        patient: whether an arm at rest waits for more observations while it could still meet the
-            ball by the first aim when starting at the next moment.
-        again: whether motions are decided again; if not, an arm starts one motion.
+        planner: planner of the motions that are not refined from an arm's current motion. A planner
+            other than `OnlineBlock` requires a single moment.
+        cases: a batch of B cases with the true balls, and with the arms' initial states.
+        eye: the camera, its noise and its frame rate.
+        moments: [s], increasing times at which the flights are fitted to all frames so far.
+        overhead: [s], time from a moment until a new motion may start, which includes the planning
+            time, >= 0.
+        seed: seed of the noise, or one seed for each throw, (B,).
+        aims: requirements on the contact, tried in this order; offsets must not decrease.
+        shortest: [s], time before the latest possible contact in which no new motion is started.
+        patient: whether an arm that has not started waits for more observations as long as a motion
+            from the next moment would still meet the first aim.
+        again: whether an arm may replace its motion; if not, it starts one motion only.
 
     Raises:
         ArgumentError: moments that do not increase from 0 or later, or a negative overhead.
@@ -179,7 +190,7 @@ def decide(
 
 
 class _Arms:
-    """The arms of a batch: their current motions, and the pieces they have executed."""
+    """The arms of a batch: their current motions, and the pieces that they have executed."""
 
     def __init__(self, cases: BlockCase):
         num, dtype = cases.batch_shape[0], cases.gravity.dtype
@@ -196,9 +207,10 @@ class _Arms:
         self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """Count the aims (B,) with a smaller offset than the currently expected contact.
+        """Count for each arm the aims (B,) that would bring the contact nearer to the centre.
 
-        All aims count for an arm whose motion misses the ball, or that has no motion.
+        `known` holds the newly estimated balls. All aims count for an arm without a motion, and for
+        an arm whose motion misses its ball.
         """
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
@@ -215,10 +227,10 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Switch to new motions for all arms that get one.
+        """Plan new motions where some aims are useful, and switch to those that are solved.
 
-        `known` has the balls as estimated, and when motions may start. `useful` (B,) is the number
-        of aims worth trying, in the order of increasing offsets.
+        `known` holds the estimated balls, and in its delays the times at which new motions may
+        start. `useful` (B,) is the number of aims that are tried for each arm, from the first.
         """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
@@ -230,18 +242,19 @@ class _Arms:
             found = plan_with_aims(warm, some, aims[:num])
             self._begin(begin, lanes, found)
             useful[lanes[is_solved(found.status)]] = 0
-        # A search from scratch takes long, so that only missed balls get one.
+        # Planning from scratch takes long. It is done only for arms that would miss their balls.
         lanes = np.flatnonzero(useful == len(aims))
         if lanes.size:
             self._begin(begin, lanes, plan_with_aims(planner, take(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
-        """Switch some lanes (N,) to their new plans, if these are solved."""
+        """Switch the arms with indices `lanes` (N,) to the plans `found` that are solved."""
         good = is_solved(found.status)
         if not good.any():
             return
         lanes, found = lanes[good], take(found, good)
-        if not self.motions.any():  # the first motions determine the shape
+        # The first plans determine the numbers of pieces and powers of all arms' motions.
+        if not self.motions.any():
             still = _still(self.cases, found.motion.coeffs.shape[1:3])
             self.plans = dataclasses.replace(self.plans, motion=still)
         until = np.array(self.since)
@@ -268,7 +281,7 @@ class _Arms:
         motions = [*self.done, self.plans.motion]
         coeffs = np.concatenate([motion.coeffs for motion in motions], axis=1)
         durations = np.concatenate([motion.durations for motion in motions], axis=1)
-        # Pieces of zero duration go to the end and continue the final state.
+        # Move pieces of zero duration to the end, and let them hold the final angles and rates.
         order = np.argsort(durations <= 0.0, axis=1, kind="stable")
         num = max(int((durations > 0.0).sum(axis=1).max()), 1)
         coeffs = np.take_along_axis(coeffs, order[:, :num, None, None], axis=1)
@@ -289,7 +302,7 @@ class _Arms:
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Return zero-duration motions of a shape (pieces, powers) at the arms' initial states."""
+    """Return motions of zero duration at the arms' initial states; `shape` is (pieces, powers)."""
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
     coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
@@ -298,7 +311,7 @@ def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
 
 
 def _keys(seed: int | np.ndarray) -> Array:
-    """Return a random key, or (B,) keys."""
+    """Return the random key of a seed, or keys (B,) of seeds (B,)."""
     return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
 
 
@@ -310,7 +323,7 @@ def _latest(case: BlockCase) -> Array:
 
 @jax.jit
 def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
-    """Return whether motions meet the balls of cases within the limits of the cases, (B,) bool."""
+    """Return whether motions meet their balls within the limits plus 5 %, (B,) bool."""
 
     def one(case: BlockCase, plan: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
@@ -325,7 +338,7 @@ def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
 @jax.jit
 @jax.vmap
 def _cut_executed(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Return a motion's pieces, its braking and the standstill after it, up to a time () [s]."""
+    """Return a motion with braking and standstill appended, cut at a time () [s] from its start."""
     motion = append_braking(case, motion)
     end = jnp.sum(motion.durations)
     stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))

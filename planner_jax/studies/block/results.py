@@ -1,4 +1,7 @@
-"""Planner, columns, counts and findings of runs with a camera or a clock."""
+"""Parts of a sweep of blocks that simulates a camera or the planning time.
+
+It wraps the planner, and adds columns, counts and sentences of the report.
+"""
 
 import numpy as np
 import pyarrow as pa
@@ -15,15 +18,21 @@ from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.studies.block.settings import StudySettings
 from planner_jax.task.block.default_planner import OnlineBlock
 
-_ROOM = 0.1  # [m], tolerance of a contact beside the shield's middle
+_ROOM = 0.1  # [m] The summary counts fits whose error is at most this distance.
 
 
-# Settings that are arguments of `SeeingArms`.
+# Names of the settings that are passed to `SeeingArms` as keyword arguments.
 _SEEING = ("observe", "overhead", "replan", "observe_longer", "noise", "frame_rate", "seed")
 
 
 def follow_study(planner: Planner, settings: StudySettings) -> Planner:
-    """Return a planner of blocks behind the camera or the clock of a run, if it has one."""
+    """Wrap a planner so that it plans from camera observations, or in measured planning time.
+
+    Without such settings the planner is returned unchanged.
+
+    Raises:
+        ArgumentError: the planner does not work with a camera, or cannot plan repeatedly.
+    """
     if settings.perception:
         for name in ("replan", "observe_longer"):
             value = vars(settings)[name]
@@ -57,12 +66,15 @@ _TIMED_COLUMNS = leaves_of("plans", ("planning_time", "s", "of this plan"))
 
 
 def columns_of(plans: object) -> list[Column]:
-    """Return the columns of plans that a camera or a clock adds, by the class of the plans."""
+    """Return the additional columns for plans with camera observations or planning times."""
     return {SeenPlan: _SEEN_COLUMNS, TimedPlan: _TIMED_COLUMNS}.get(type(plans), [])
 
 
 class StudyCounts:
-    """Errors of fits and planning times of a run; empty without a camera or a clock."""
+    """Errors of flight fits, and planning times, collected from the rows of a run.
+
+    Rows of runs that simulate neither a camera nor the planning time add nothing.
+    """
 
     READS = ("fit_error", "planning_time")
 
@@ -70,13 +82,13 @@ class StudyCounts:
         self._errors, self._seconds = [], []
 
     def add(self, rows: pa.Table) -> None:
-        """Count some rows of the run."""
+        """Collect the values in some rows of the run."""
         for name, values in zip(self.READS, (self._errors, self._seconds), strict=True):
             if name in rows.column_names:
                 values.append(rows[name].to_numpy())
 
     def summary(self) -> Entries:
-        """Return the median error [m], the share of small errors, and quantiles of times [s]."""
+        """Return median fit error [m], share of errors up to 0.1 m, and quantiles of times [s]."""
         found = {}
         if self._errors:
             errors = np.concatenate(self._errors)
@@ -90,7 +102,7 @@ class StudyCounts:
 
 
 def describe_study(summary: Entries) -> list[str]:
-    """Return sentences on fits of the flight and on planning time, if a run has them."""
+    """Return sentences on the errors of flight fits and on planning times, if the run has any."""
     found = []
     if (error := summary.get("fit_error_median")) is not None:
         found.append(

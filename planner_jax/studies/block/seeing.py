@@ -1,4 +1,4 @@
-"""Arms that block balls which they observe with a camera, and records of the observations."""
+"""A planner of blocks that knows the balls only from simulated camera observations."""
 
 import dataclasses
 import zlib
@@ -21,30 +21,34 @@ from planner_jax.task.block.plan import BlockPlan
 
 @struct.dataclass
 class SeenPlan(BlockPlan):
-    """The executed motion of an arm up to the true contact, and the quality of its observations."""
+    """The executed motion of an arm up to the true contact, and the quality of its observations.
 
-    sight: Array  # () int32, a `Sight`, of the first fit
+    Errors of fits are normal to the ball's velocity, at the middle of the time in which it can be
+    blocked.
+    """
+
+    sight: Array  # () int32, a `Sight`: whether the first fit had enough observations
     sightings: Array  # () int32, number of observations in the first fit
-    fit_error: Array  # () [m], of the first fit, normal to the flight midway between the boxes
-    fit_std: Array  # () [m], its estimated standard deviation
-    last_fit_error: Array  # () [m], of the last fit
-    motions: Array  # () int32, number of started motions
+    fit_error: Array  # () [m], error of the first fit
+    fit_std: Array  # () [m], estimated standard deviation of this error
+    last_fit_error: Array  # () [m], error of the last fit
+    motions: Array  # () int32, number of motions that the arm started
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SeeingArms(Planner[BlockCase, SeenPlan]):
-    """Arms that plan from camera observations, once or repeatedly."""
+    """A planner that simulates camera observations, and plans from them once or repeatedly."""
 
     case_type: ClassVar[type] = BlockCase
-    planner: Planner
-    observe: float  # [s], until the first fit
-    overhead: float  # [s], from a fit until its motion may start
-    replan: float  # [Hz], rate of later fits; 0 for no later fit
-    observe_longer: float  # [s], greatest delay of the first motion for more observations
-    noise: float  # [m], isotropic; 0 for the noise of a stereo camera
-    frame_rate: float  # [Hz]
-    seed: int
+    planner: Planner  # planner of the cases with estimated balls
+    observe: float  # [s] time from a case's time 0 until the first fit
+    overhead: float  # [s] time from a fit until a motion planned from it may start
+    replan: float  # [Hz] rate of later fits and plans; 0 plans once
+    observe_longer: float  # [s] greatest delay of the first motion to collect more observations
+    noise: float  # [m] standard deviation of isotropic noise; 0 selects a stereo camera's noise
+    frame_rate: float  # [Hz] frame rate of the camera
+    seed: int  # seed of the noise
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> SeenPlan:
         """Return the executed motions of a batch, up to their contacts with the true balls."""
@@ -66,7 +70,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def decide_batch(self, cases: BlockCase) -> Decided:
-        """Return the decisions of a batch of arms, without their contacts."""
+        """Return the motions of a batch of arms, not yet cut at their contacts with the balls."""
         return decide(
             self.planner,
             cases,
@@ -79,7 +83,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """Return the times of the fits [s], repeated until the last ball of a batch arrives."""
+        """Return the times [s] of the flight fits, up to the arrival of the batch's last ball."""
         moments = [self.observe]
         if self.observe_longer:
             num = int(self.observe_longer * self.frame_rate + 1e-6)
@@ -91,6 +95,6 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:
-        """Return a seed (B,) for each throw's noise, independent of the batch."""
+        """Return seeds (B,) of the noise, which depend on each ball but not on its batch."""
         balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
         return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)

@@ -1,4 +1,4 @@
-"""Settings of runs with a camera or a clock; nothing here imports JAX."""
+"""Settings of sweeps that simulate a camera or the planning time; nothing here imports JAX."""
 
 import dataclasses
 import math
@@ -6,32 +6,32 @@ import math
 from planner_jax.core.choices import require
 from planner_jax.runs.settings import SweepSettings, option
 
-_LONGEST = 60.0  # [s], or [m] of noise; greatest value
-_FASTEST = 1000.0  # [Hz], greatest rate
+_LONGEST = 60.0  # greatest accepted value of a time [s] or of the noise [m]
+_FASTEST = 1000.0  # [Hz] greatest accepted rate of frames or of planning again
 
 
 def require_moderate(name: str, value: float | None, most: float = _LONGEST) -> None:
-    """Raise `ArgumentError` unless a value is None, or from 0 to `most`."""
+    """Raise `ArgumentError` unless the setting `name` is None or a number from 0 to `most`."""
     if value is not None:
         require(0.0 <= value < math.inf, name, "finite and >= 0", value)
         require(value <= most, name, f"<= {most:g}", value)
 
 
 def require_frame_rate(value: float) -> None:
-    """Raise `ArgumentError` unless the argument `frame_rate` is possible for a camera."""
+    """Raise `ArgumentError` unless the setting `frame_rate` is a number from 1 to 1000 Hz."""
     require(0.0 < value < math.inf, "frame_rate", "finite and > 0", value)
     require(1.0 <= value <= _FASTEST, "frame_rate", f"from 1 to {_FASTEST:g}", value)
 
 
 @dataclasses.dataclass(frozen=True)
 class StudySettings(SweepSettings):
-    """Settings of blocks that are planned by the clock, or by observations of a camera."""
+    """Settings of a sweep of blocks that simulates camera observations or the planning time."""
 
     planning_budget: float | None = option(
         None,
         "S",
-        "seconds after the delay at which motions start; planning runs by the clock, one case "
-        "after another, and a motion starts later by what planning took beyond the budget",
+        "seconds after the delay at which motions start; cases are planned one after another, and "
+        "a motion starts later if planning takes longer than this budget, by the excess",
     )
     perception: bool = option(
         False, "", "plan with a camera's observations of the ball; the referee uses the true ball"
@@ -68,12 +68,12 @@ class StudySettings(SweepSettings):
 
     @property
     def is_study(self) -> bool:
-        """True if the run has a camera or a clock."""
+        """True if the run simulates a camera or the planning time."""
         return self.perception or self.planning_budget is not None
 
     @property
     def first_motion(self) -> float:
-        """Time [s] from which an arm may start until its first motion starts."""
+        """Duration [s] from the moment at which an arm may move until its first motion starts."""
         if self.perception:
             return self.observe + self.overhead
         return self.planning_budget or 0.0
