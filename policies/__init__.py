@@ -1,1 +1,1 @@
-"""Learned decisions: Brax environments, Flax networks and their training."""
+"""Policies that decide the order and times of catches: Flax networks, trained with Brax's PPO."""

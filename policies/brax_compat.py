@@ -1,7 +1,7 @@
 """A replacement for `jax.device_put_replicated`, which JAX 0.10 removed and Brax 0.14 calls.
 
-The training loops of Brax call the function once when a training starts. Call `install()` before
-the first `train`.
+Brax calls this function once when a training starts. `training.train` calls `install()` first, so
+that Brax finds the replacement.
 """
 
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
-    """Copy a pytree to each device, stacked along a new leading axis.
+    """Copy a pytree to each device, and stack the copies along a new leading axis.
 
-    The stack has to be sharded, because Brax reads a replica back as the first addressable shard
-    of every leaf.
+    The stack is sharded with one copy on each device, because Brax reads a copy back as the first
+    addressable shard of every leaf.
 
     Args:
         tree: pytree of array-likes; a leaf has any shape `(...)`.

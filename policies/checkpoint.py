@@ -1,8 +1,8 @@
-"""Checkpoints of trained policies: reading and writing, without pickle.
+"""Files of trained policies (checkpoints), which are read and written without pickle.
 
-A checkpoint is a NumPy archive. It has one array for each weight, named by the weight's path in
-the network, and `about`, a line of JSON with the format, the network and its sizes, the number of
-features, the suites and the seed.
+A checkpoint is a NumPy archive (`.npz`). It has one array for each weight, named by the weight's
+path in the network. Its entry `about` is a line of JSON with the version number of the format, the
+network and its sizes, the number of features, and the suites and seed of the training.
 """
 
 import dataclasses
@@ -21,30 +21,31 @@ from planner_jax.host.files import open_plain, replacing
 from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
-FORMAT = 2
-SHIPPED = ("catch", "rush6")  # trained on eight suites, and on `rush6` alone
-_OF_FLAX = ("parent", "name")  # fields of every Flax module
+FORMAT = 2  # version number of the format of checkpoints
+# Policies that are part of the package: "catch" is trained on eight suites, "rush6" on `rush6`.
+SHIPPED = ("catch", "rush6")
+_OF_FLAX = ("parent", "name")  # fields of every Flax module, which are not sizes of the network
 
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """A trained policy as read from a file."""
+    """The contents of a checkpoint, the file of a trained policy."""
 
-    params: Any  # weights, NumPy leaves
-    network: Any  # a module from `networks`
-    about: dict[str, Any]  # suites and seed of the training
+    params: Any  # weights of the network, a pytree of NumPy arrays
+    network: Any  # a Flax module from `networks`
+    about: dict[str, Any]  # entry `about` of the file: format, sizes, suites and seed
 
 
 def save_checkpoint(
     path: str | os.PathLike, params: Any, network: Any, about: dict[str, Any]
 ) -> None:
-    """Write a checkpoint atomically.
+    """Write the weights of a policy to a file, atomically.
 
     Args:
         path: path of the file.
-        params: weights of the network.
-        network: a module from `networks`.
-        about: suites and seed of the training, plain JSON.
+        params: weights of the network, a pytree of arrays.
+        network: a Flax module from `networks`.
+        about: suites and seed of the training, as values that JSON can represent.
     """
     name, sizes = name_and_sizes(network)
     head = {"format": FORMAT, "features": FEATURES, "network": name, "sizes": sizes, **about}
@@ -55,14 +56,14 @@ def save_checkpoint(
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
-    """Return the name of a network and the fields that determine its shape."""
+    """Return a network's key in `NETWORKS`, and the fields that determine its shapes, by name."""
     (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
     fields = (field.name for field in dataclasses.fields(network))
     return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}
 
 
 def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
-    """Read the policy in a file.
+    """Read a trained policy from a checkpoint file.
 
     Raises:
         ArgumentError: the file is missing, is not a checkpoint, or has another format.
@@ -102,11 +103,11 @@ def load_checkpoint(path: str | os.PathLike) -> Checkpoint:
 
 
 def checkpoint_of(file: str | os.PathLike) -> Checkpoint:
-    """Read a file, or one of `SHIPPED` by its name; raises as `load_checkpoint`."""
+    """Read a policy: by its name in `SHIPPED`, or from a file with `load_checkpoint`."""
     return load_shipped_checkpoint(os.fspath(file)) if file in SHIPPED else load_checkpoint(file)
 
 
 def load_shipped_checkpoint(name: str) -> Checkpoint:
-    """Read a policy that is shipped with the library, one of `SHIPPED`."""
+    """Read a policy that is part of the package; `name` is one of `SHIPPED`."""
     with resources.as_file(resources.files("planner_jax.policies") / f"{name}.npz") as path:
         return load_checkpoint(path)

@@ -1,9 +1,9 @@
-"""Learning curves of one training run, or the mean and spread of several runs.
+"""Draw the learning curves of one training run, or the mean curves of several runs.
 
     python -m planner_jax.policies.curves RUN [RUN ...] [--out curves.png]
 
-Several runs must differ in their seed only. A line then shows their mean, and the band one standard
-deviation to each side, up to the decisions of the shortest run.
+The runs must have equal settings except for the seed. Each line shows the mean over the runs, and
+the shaded band is one standard deviation wide to each side. Curves end with the shortest run.
 """
 
 import argparse
@@ -27,17 +27,17 @@ _TERMS = {
     "ratio": ("Optimal time ratio", "mean of solved cases", 1.0),
     "violation": ("Violation", "mean of other cases", 1.0),
 }
-_OF_RUN = ("digest", "code", "version")  # runs may differ in these entries as well
+_OF_RUN = ("digest", "code", "version")  # entries of `training.json` in which runs may differ
 _COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.GREY)
 Rows = list[dict[str, Any]]
 
 
 def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -> None:
-    """Draw the learning curves of runs and write the picture atomically.
+    """Draw the learning curves of training runs, and write the picture atomically.
 
     Args:
-        folders: folders of trainings, at least one.
-        path: path of the picture, a PNG.
+        folders: folders of training runs, at least one.
+        path: path of the PNG file.
 
     Raises:
         ArgumentError: a folder does not hold a training, or runs differ in more than their seed.
@@ -48,7 +48,10 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
 
 
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
-    """Draw reward and terms over decisions, and the evaluation of each suite after every part."""
+    """Draw the mean reward and its terms over the number of decisions in training.
+
+    If the rows contain evaluations, further panels show the results of each suite after each part.
+    """
     curve = [[row for row in rows if "reward" in row] for rows in runs]
     evaluated = [[row for row in rows if "suites" in row] for rows in runs]
     evaluations = all(evaluated)
@@ -70,7 +73,10 @@ def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
 
 
 def _draw_evaluations(panels: Sequence[Axes], evaluated: Sequence[Rows]) -> None:
-    """Draw success, relative last catch and optimal time ratio, one line for each suite."""
+    """Draw success rate, time of the last catch and optimal time ratio, one line for each suite.
+
+    The time of the last catch is drawn in percent of its first value.
+    """
 
     def value_of(suite: str, name: str) -> Any:
         return lambda row: row["suites"][suite][name]
@@ -94,7 +100,11 @@ def _line(
     relative: bool = False,
     **look: Any,
 ) -> None:
-    """Draw the mean and spread of a value over decisions, or relative to its first value."""
+    """Draw the mean over runs of a quantity, with a band of one standard deviation if several.
+
+    The x axis is the number of decisions. `value` extracts the quantity from a row, and `scale`
+    multiplies it. With `relative` each run is drawn relative to its first value.
+    """
     num = min(len(rows) for rows in runs)
     values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)
     if relative:
@@ -122,7 +132,7 @@ def _require_alike(folders: Sequence[Path]) -> None:
 
 
 def main() -> None:
-    """Draw the learning curves of the runs on the command line."""
+    """Draw the learning curves of the runs whose folders are given on the command line."""
     parser = argparse.ArgumentParser("python -m planner_jax.policies.curves", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.add_argument("runs", metavar="RUN", nargs="+", type=Path, help="folder of a training")

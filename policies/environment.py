@@ -1,11 +1,12 @@
-"""A Brax environment for decisions about catches: one step is one decision.
+"""A Brax environment in which a policy learns to decide the order and times of catches.
 
-The reward of a step follows from the plan that the decision leads to. As in
-[Yu2023catch, Section IV-B], an episode has one step, and each step draws new cases.
+One step is one decision for one case. Its reward is computed from the plan for which the decision
+is the first guess. As in [Yu2023catch, Section IV-B], an episode has one step, and each step draws
+new cases.
 
-The environment is batched: `reset` takes a batch of keys and `step` a batch of actions, so that
-one call of the planner solves all cases. The batch is divided evenly among the suites, and the
-cases of each suite keep their own number of targets.
+`reset` takes a batch of keys and `step` a batch of actions, so that one call of the planner solves
+all cases. The batch is divided evenly among the suites (families of cases). The suites may have
+different numbers of targets.
 """
 
 import functools
@@ -31,23 +32,23 @@ from planner_jax.task.catch.estimate import earliest_next, shortfall, timetable
 from planner_jax.task.catch.spec import SUITES
 from planner_jax.task.catch.suites import draw_by_key
 
-# These terms count for solved cases only. Otherwise a policy would be rewarded for early catches
-# that no plan achieves. The term `violation` counts for the other cases only.
+# Terms of the reward that count for solved cases only. If they counted for all cases, a policy
+# would be rewarded for early catches that no plan achieves. Unsolved cases get only `violation`.
 _GATED = ("solved", "last", "ratio", "caught")
 
 
 class CatchEnv(Env):
-    """An environment that rewards decisions by plans of `ExactCatch`, or by an estimate.
+    """An environment that rewards decisions by the planner's results, or by a cheap estimate.
 
-    Suites with the same shapes of cases and the same number of iterations share one call of the
-    planner, which starts from one guess a case.
+    The planner is `ExactCatch` with one start per case. Suites whose cases have equal shapes and
+    the same number of iterations are planned in one call.
 
     Args:
         suites: names of the suites from which cases are drawn.
-        iterations: number of planner iterations for each suite; zero replaces the planner by the
-            estimate of `task.catch.estimate`.
-        weights: weights of the terms of `evaluate_actions` by name, each a number or one number
-            for each suite.
+        iterations: number of planner iterations for each suite. For zero, the estimate of
+            `task.catch.estimate` is used instead of the planner.
+        weights: weights of the reward terms of `evaluate_actions`, by name. A weight is one number,
+            or one number for each suite.
     """
 
     def __init__(
@@ -64,7 +65,11 @@ class CatchEnv(Env):
         self.size = max(SUITES[suite].num_targets for suite in suites)
 
     def reset(self, rng: Array) -> State:
-        """Return the first states for keys (B, 2); B is a multiple of the number of suites."""
+        """Draw the first cases of B environments, and return their state.
+
+        `rng` are keys (B, 2), of which only the first is used. B must be a multiple of the number
+        of suites.
+        """
         num = rng.shape[0]
         if num % len(self.suites):
             raise ArgumentError(
@@ -84,7 +89,7 @@ class CatchEnv(Env):
         return State(None, self._observe(cases), zero, zero, {}, info)
 
     def step(self, state: Any, action: Array) -> State:
-        """Reward the actions (B, size * PER_TARGET) and draw the next cases."""
+        """Plan the cases with the actions (B, size * PER_TARGET), reward them, draw new cases."""
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
         actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
@@ -103,7 +108,10 @@ class CatchEnv(Env):
         return state.replace(obs=self._observe(cases), reward=reward, done=one, info=info)
 
     def _evaluate(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
-        """Return the unweighted reward terms (B,) of actions (S, B / S, size, PER_TARGET)."""
+        """Return the unweighted reward terms (B,) by name, for the actions of S suites.
+
+        `actions` has the shape (S, B / S, size, PER_TARGET).
+        """
         alike: dict[Any, list[int]] = {}
         for k, some in enumerate(cases):
             key = (*map(jnp.shape, jax.tree.leaves(some)), jax.tree.structure(some))
@@ -126,7 +134,10 @@ class CatchEnv(Env):
         return tuple(draw_by_key(k, share, s) for k, s in zip(keys, self.suites, strict=True))
 
     def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
-        """Return the observations (B, size * FEATURES), zero for absent targets."""
+        """Return the policy's observations (B, size * FEATURES) of all cases, flattened.
+
+        The features of absent targets are zero.
+        """
 
         def of_suite(cases: CatchCase) -> Array:
             seen = jax.vmap(lambda case: observe(case, timetable(case)))(cases)
@@ -138,37 +149,39 @@ class CatchEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Number of features in the observation of one case."""
+        """Number of features in the observation of one case, over all its targets."""
         return self.size * FEATURES
 
     @property
     def action_size(self) -> int:
-        """Number of components in the action for one case."""
+        """Number of components in the action for one case, over all its targets."""
         return self.size * PER_TARGET
 
     @property
     def backend(self) -> str:
-        """Name of the backend; plans are rewarded without a physics simulation."""
+        """Name of the physics backend, which Brax requires; there is no physics simulation."""
         return "planner_jax"
 
 
 def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array]:
-    """Return the unweighted reward terms (B,) of actions (B, N, PER_TARGET).
+    """Return the unweighted reward terms (B,) of a batch of actions, by name.
+
+    `Greedy` is the decision that always catches next the target that can be caught earliest.
 
     Args:
-        cases: batch of B cases.
-        actions: components from -1 to 1.
-        iterations: number of planner iterations; zero replaces the planner by the estimate.
+        cases: batch of B cases with N targets each.
+        actions: (B, N, PER_TARGET), components from -1 to 1.
+        iterations: number of planner iterations; for zero an estimate is used, not the planner.
 
     Returns:
-        solved: 1 for a solved case, else 0.
-        last: (t_greedy - t) / t_greedy for the time t of the last catch and its estimate under
-            the decision `Greedy`; zero in suites with optional targets.
-        caught: (n - n_greedy) / n_greedy for the number n of targets taken; zero in suites
-            without optional targets.
+        solved: 1 if the plan meets all limits, else 0.
+        last: (t_greedy - t) / t_greedy, where t is the time of the last catch, and t_greedy its
+            estimate for the decision `Greedy`; zero in suites with optional targets.
+        caught: (n - n_greedy) / n_greedy, where n is the number of targets that the decision
+            includes; zero in suites without optional targets.
         ratio: optimal time ratio [Yu2023catch, eq. 29]; zero with the estimate.
-        violation: violation of the plan, at most 2; with the estimate log(1 + d) for the distance
-            d [m] that the quadrotor falls short of the targets.
+        violation: largest relative excess over a limit, at most 2. With the estimate log(1 + d),
+            where d [m] is the summed distance by which the quadrotor misses the targets.
     """
     tables = jax.vmap(timetable)(cases)
     choices = jax.vmap(choice_of)(cases, tables, actions)
@@ -196,7 +209,7 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
         "caught": caught,
         "violation": violation,
     }
-    # A case whose terms overflow gets a poor reward and does not spoil the batch.
+    # Clip the terms, so that one case with huge or undefined terms cannot spoil a whole update.
     return {
         name: jnp.clip(jnp.nan_to_num(jnp.asarray(term, jnp.float32), nan=2.0), -2.0, 2.0)
         for name, term in terms.items()
@@ -204,7 +217,11 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
-    """Plan the choices (B, N); with optional targets keep the longest solved prefix."""
+    """Plan a batch of decisions; return the decisions that were planned, and their plans.
+
+    With optional targets, each decision is also planned without its last few catches. The longest
+    solved version is returned.
+    """
     if not cases.optional:
         return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
     several = jax.vmap(in_several_lengths)(cases, jax.tree.map(lambda x: x[:, None], choices))
@@ -213,7 +230,7 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
     found = solve_batch(ExactCatch(), _attempt(iterations), tried)
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
-    # Lengths decrease along the axis: the first solved choice is the longest.
+    # Versions are sorted by falling number of catches: the first solved version is the longest.
     best = jnp.argmax(is_solved(each[1].status), axis=1)
     return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
 
@@ -224,11 +241,14 @@ def _attempt(iterations: int) -> Round:
 
 
 def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:
-    """Return the reward (B,): weighted terms of solved cases, weighted violation of the others.
+    """Return the rewards (B,) of a batch of decisions.
+
+    A solved case is rewarded by the weighted sum of the terms in `_GATED`, an unsolved case by its
+    weighted violation.
 
     Args:
-        terms: unweighted terms from `evaluate_actions`.
-        weights: weight of each term, () or (B,).
+        terms: unweighted terms (B,) from `evaluate_actions`, by name.
+        weights: weight of each term, () or (B,), by name.
     """
     good = sum(weights[name] * terms[name] for name in _GATED)
     bad = weights["violation"] * terms["violation"]

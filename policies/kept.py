@@ -1,4 +1,7 @@
-"""Parameters after each part of a training, stored by Orbax, each with a digest."""
+"""Storage of the network parameters after each part of a training, so that it can be resumed.
+
+Orbax writes the parameters. A digest in a separate file detects incomplete or damaged parameters.
+"""
 
 import hashlib
 import json
@@ -16,9 +19,7 @@ from planner_jax.runs.manifest import JsonError, parse_written, to_write
 
 
 class KeptParts:
-    """Storage of the parameters after every part: a folder and a file with the digest for each.
-
-    Parameters that do not match their digest are ignored, with a message on standard error.
+    """The stored parameters of a training: for each part a folder, and a file with their digest.
 
     Args:
         folder: folder of the storage; it is created if it does not exist.
@@ -29,7 +30,7 @@ class KeptParts:
         folder.mkdir(parents=True, exist_ok=True)
 
     def save(self, number: int, params: Any) -> None:
-        """Store the parameters after a part."""
+        """Store the parameters `params` after part `number`, and their digest."""
         place = self._place(number)
         if place.exists():
             shutil.rmtree(place)
@@ -40,11 +41,13 @@ class KeptParts:
             scratch.write_text(text + "\n", encoding="utf-8")
 
     def restore(self, number: int, like: Any) -> Any | None:
-        """Return the stored parameters after a part; None if they are missing or damaged.
+        """Read the stored parameters after a part; return None if they are missing or damaged.
+
+        Damaged parameters are also reported on standard error.
 
         Args:
             number: number of the part.
-            like: parameters with the same shapes.
+            like: any parameters with the shapes and types of the stored parameters.
         """
         try:
             with open_plain(self._note(number)) as file:
@@ -57,7 +60,7 @@ class KeptParts:
             return None
         except JsonError as error:
             why = f"its note {error}"
-        except Exception as error:  # Orbax and its readers raise many kinds
+        except Exception as error:  # Orbax raises many classes of exceptions for damaged files
             why = type(error).__name__
         place = self._place(number)
         print(

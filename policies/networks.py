@@ -1,8 +1,9 @@
-"""Neural networks of a policy: the distribution of its actions, and the value of an observation.
+"""Neural networks for decisions about catches: policy networks and a value network, in Flax.
 
-A policy network maps features (..., N, F) of N targets to (..., N, 4): the means of the two action
-components before tanh, and two numbers whose softplus gives the standard deviations. The modules
-are frozen and hashable, so that a planner can hold one as a static field.
+A policy network maps features (..., N, F) of N targets to the parameters (..., N, 4) of a normal
+distribution of actions. An action has two components per target. The first two parameters are the
+means before tanh; the softplus of the other two gives the standard deviations. The networks are
+immutable and hashable, so that a JAX pytree can hold one as a static field.
 """
 
 from typing import Any
@@ -14,26 +15,30 @@ from jax import Array
 
 from planner_jax.policies.observation import PER_TARGET
 
-LEAST_STD = 0.03  # least standard deviation before tanh, which keeps the policy exploring
-_FIRST_STD = 0.15
+LEAST_STD = 0.03  # least standard deviation of actions before tanh; it ensures exploration
+_FIRST_STD = 0.15  # standard deviation of actions before tanh at the start of training
 
 
 def _head(features: Array) -> Array:
-    """Apply the last layer, which starts at zero means and the standard deviation `_FIRST_STD`."""
+    """Apply the last layer; its initial weights give means of 0 and the deviation `_FIRST_STD`."""
     raw = float(np.log(np.expm1(_FIRST_STD - LEAST_STD)))
     first = lambda *_: jnp.repeat(jnp.array([0.0, raw]), PER_TARGET)  # noqa: E731
     return nn.Dense(2 * PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=first)(features)
 
 
 class Mlp(nn.Module):
-    """Two hidden layers of 64 with ReLU, for up to `size` targets [Yu2023catch, Section IV-B]."""
+    """A multilayer perceptron: two hidden layers with ReLU [Yu2023catch, Section IV-B]."""
 
-    size: int = 6
-    width: int = 64
+    size: int = 6  # greatest number of targets
+    width: int = 64  # number of units in each hidden layer
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Map targets (..., N, F) to parameters (..., N, 4) of actions; N is at most `size`."""
+        """Map features (..., N, F) of targets to distribution parameters (..., N, 4) of actions.
+
+        Raises:
+            ValueError: there are more than `size` targets.
+        """
         num = seen.shape[-2]
         if num > self.size:
             raise ValueError(f"this network takes up to {self.size} targets, got {num}")
@@ -47,31 +52,31 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Self-attention over the targets, for any number of targets in any order.
+    """Self-attention over the targets; their number and order are arbitrary.
 
     Absent targets are masked.
     """
 
-    width: int = 64
-    heads: int = 4
+    width: int = 64  # number of features of each target within the network
+    heads: int = 4  # number of attention heads
     layers: int = 2
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Map targets (..., N, F) to parameters (..., N, 4) of actions."""
+        """Map features (..., N, F) of targets to distribution parameters (..., N, 4) of actions."""
         return _head(_apply_attention(self, seen))
 
 
 class Value(nn.Module):
-    """The value network: one layer of self-attention, and a mean over the present targets."""
+    """The value network of PPO: self-attention over the targets, then a mean over those present."""
 
-    width: int = 64
-    heads: int = 4
+    width: int = 64  # number of features of each target within the network
+    heads: int = 4  # number of attention heads
     layers: int = 1
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Return the expected rewards (...) of targets (..., N, F)."""
+        """Return expected rewards (...) of cases, from features (..., N, F) of their targets."""
         present = seen[..., -1:]
         num = jnp.maximum(jnp.sum(present, axis=-2), 1.0)
         mean = jnp.sum(present * _apply_attention(self, seen), axis=-2) / num
@@ -80,9 +85,9 @@ class Value(nn.Module):
 
 
 def _apply_attention(module: Any, seen: Array) -> Array:
-    """Apply the attention layers of a module; return targets (..., N, width)."""
+    """Apply a module's attention layers to targets (..., N, F); return features (..., N, width)."""
     present = seen[..., -1] > 0.5
-    # The diagonal gives a row something to attend to if no target is present.
+    # Each target attends to itself even if it is absent. A row without any entry would give NaN.
     mask = (present[..., None, :] | jnp.eye(seen.shape[-2], dtype=bool))[..., None, :, :]
     hidden = nn.Dense(module.width)(seen)
     for _ in range(module.layers):
@@ -93,10 +98,10 @@ def _apply_attention(module: Any, seen: Array) -> Array:
 
 
 def _attend(module: Any, hidden: Array, mask: Array) -> Array:
-    """Return the attention output for targets (..., N, width) under a mask (..., 1, N, N).
+    """Apply multi-head attention to targets (..., N, width) under a mask (..., 1, N, N).
 
-    One matrix product computes queries, keys and values. With few targets the number of products
-    determines the run time.
+    One matrix product computes queries, keys and values together. The matrices are so small that
+    the run time depends on the number of products rather than on their sizes.
     """
     width, heads = module.width, module.heads
     every = nn.Dense(3 * width)(hidden).reshape(*hidden.shape[:-1], 3, heads, width // heads)

@@ -1,15 +1,15 @@
-"""Observations and actions of a policy that decides about catches.
+"""Observations and actions of a policy that decides the order and times of catches.
 
-The observation has one row of features for each target, as [Yu2023catch, eq. 6], extended by the
-target's predicted path. A network can therefore process any number of targets. The action has two
-components for each target:
+The observation has one row of features for each target, as in [Yu2023catch, eq. 6], extended by
+the target's predicted path. A network can therefore process any number of targets. The action has
+two components for each target:
 
-* a handicap [s], added to the earliest time at which the target can be caught, which changes the
-  order of the targets;
+* a handicap [s], added to the earliest time at which the target can be caught. It changes the order
+  of the targets.
 * a stretch, the logarithm of a factor on the estimated time of the catch.
 
-With both at zero the decision equals `Greedy`. Every action is valid: it gives an order and
-increasing times.
+If all components are zero, the decision equals `Greedy`, which always catches next the target that
+can be caught earliest. Every action gives a valid decision: an order and increasing times.
 """
 
 import dataclasses
@@ -22,17 +22,18 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.context import targets_at
 from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
-HANDICAP = 4.0  # [s], greatest handicap
-STRETCH = 0.5  # greatest logarithm of the factor on an estimated time
-_SHARES = 8  # number of times over the horizon at which a target's position is a feature
+HANDICAP = 4.0  # [s] handicap of an action component of 1
+STRETCH = 0.5  # natural logarithm of the factor on a time, for an action component of 1
+_SHARES = 8  # number of future times at which a target's predicted position is a feature
 FEATURES = 3 + 3 + 3 + 1 + 3 * _SHARES + 3 + 1  # per target; the last is 1 for a present target
 PER_TARGET = 2  # components of the action per target
 
 
 def observe(case: CatchCase, table: Timetable) -> Array:
-    """Return the features of the targets of one case, (N, FEATURES), zero for absent targets.
+    """Return the features (N, FEATURES) of the N targets of one case; zero for absent targets.
 
-    Lengths are in units of 4 m, speeds of 4 m/s, times of 5 s.
+    Lengths are divided by 4 m, speeds by 4 m/s and times by 5 s. `table` holds the sampled possible
+    catches of the targets.
     """
     num = case.num_targets
     place, velocity = case.head_state[0], case.head_state[1]
@@ -56,13 +57,19 @@ def observe(case: CatchCase, table: Timetable) -> Array:
 
 
 def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
-    """Return the order and times of one case for an action (N, PER_TARGET) from -1 to 1."""
+    """Return the order and times of catches for one case, from an action of a policy.
+
+    Args:
+        case: one case with N targets.
+        table: sampled possible catches of the targets, from `timetable`.
+        action: (N, PER_TARGET), components from -1 to 1.
+    """
     action = jnp.where(case.present[:, None], action, 0.0)
     choice = earliest_next(case, table, HANDICAP * action[:, 0])
     times = choice.times * jnp.exp(STRETCH * action[choice.order, 1])
     taken = choice.taken[choice.order]
     times = jnp.where(taken, jnp.minimum(times, case.horizon[choice.order]), times)
-    # Successive times differ by at least INSTANT.
+    # Make the times increase by at least INSTANT [s] from catch to catch.
     steps = jnp.asarray(INSTANT * np.arange(times.size), times.dtype)
     rising = lax.cummax(times - steps) + steps
     return dataclasses.replace(choice, times=rising)

@@ -20,25 +20,27 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.decide import CatchDecision, in_several_lengths
 from planner_jax.task.catch.estimate import timetable
 
-# Training rewards times from which few iterations lead to a plan. The planner has more iterations
-# and also solves from earlier times: with this factor the last catch is 3 to 4 % earlier.
+# Default factor on a policy's times. In training the planner has few iterations, so that the policy
+# learns times that are easy to reach. In use the planner has more iterations and also succeeds from
+# earlier times: this factor makes the last catch 3 to 4 % earlier.
 _EARLIER = 0.95
 
 
 @struct.dataclass
 class Policy(CatchDecision):
-    """A decision whose order and times come from a network; the weights are leaves.
+    """A decision that takes the order and times of catches from a neural network.
 
-    The first of several proposals is the mean of the network's distribution. The others are drawn
-    around the mean with the same noise for every case. The planner plans all proposals and keeps
-    the one with the earliest last catch.
+    The first proposal for a case is the mean of the network's distribution of actions. Further
+    proposals are drawn from the distribution, with the same random numbers for every case. The
+    planner plans all proposals and selects the plan with the earliest last catch.
     """
 
-    params: Any  # weights of the network
-    network: Any = struct.field(pytree_node=False)
-    proposals: int = struct.field(pytree_node=False, default=1)
+    params: Any  # weights of the network, the leaves of this pytree
+    network: Any = struct.field(pytree_node=False)  # a Flax module from `networks`
+    proposals: int = struct.field(pytree_node=False, default=1)  # number of proposals for a case
     spread: float = struct.field(pytree_node=False, default=1.0)  # factor on standard deviations
-    # Factor on the times. Above 1 a plan needs fewer iterations, and its last catch is later.
+    # Factor on the times of the catches. With a factor above 1 the planner needs fewer iterations,
+    # and the last catch is later.
     stretch: float = struct.field(pytree_node=False, default=1.0)
 
     def __post_init__(self) -> None:
@@ -49,7 +51,7 @@ class Policy(CatchDecision):
             raise ArgumentTypeError("network", "a Flax module", self.network)
 
     def check(self, cases: CatchCase) -> None:
-        """Raise `ValueError` where there are more targets than the network takes."""
+        """Raise `ValueError` if the cases have more targets than the network accepts."""
         most = getattr(self.network, "size", None)
         if most is not None and cases.num_targets > most:
             raise ValueError(
@@ -58,7 +60,10 @@ class Policy(CatchDecision):
             )
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the proposals for one case, leaves (K, N); more than K with optional targets."""
+        """Return K proposals for the order and times of one case with N targets, leaves (K, N).
+
+        With optional targets, each proposal is also returned without its last few catches.
+        """
         table = timetable(case)
         numbers = self.network.apply(self.params, observe(case, table))
         mean, spread = numbers[:, :PER_TARGET], numbers[:, PER_TARGET:]
@@ -74,14 +79,14 @@ class Policy(CatchDecision):
 
 
 def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
-    """Load a policy from a checkpoint.
+    """Load a trained policy from a file.
 
     Args:
-        file: path of a file written by `planner-jax train`, or the name of a shipped policy:
-            "catch", trained on suites of one to twelve targets, or "rush6", trained on the suite
-            `rush6` alone.
-        **options: `proposals`, `spread` and `stretch` of `Policy`; the default of `stretch` is
-            0.95, and 1 gives the times as trained.
+        file: path of a file written by `planner-jax train`, or the name of a policy that is part of
+            the package: "catch", trained on suites with one to twelve targets, or "rush6", trained
+            on the suite `rush6` alone.
+        **options: `proposals`, `spread` and `stretch` of `Policy`. The default of `stretch` is
+            0.95; 1 leaves the times of the network unchanged.
 
     Raises:
         TypeError: an option has the wrong type.
@@ -89,5 +94,6 @@ def policy(file: str | os.PathLike = "catch", **options: Any) -> Policy:
         ArgumentError: the file is not a checkpoint of a policy, or has another format.
     """
     found = checkpoint_of(file)
-    params = jax.tree.map(jnp.asarray, found.params)  # sent to the device once, not each time
+    # Copy the weights to the device once, so that later calls need not copy them.
+    params = jax.tree.map(jnp.asarray, found.params)
     return Policy(params=params, network=found.network, **{"stretch": _EARLIER, **options})

@@ -1,16 +1,16 @@
-"""Progress of a training: rows in the run folder, a progress bar, and TensorBoard event files.
+"""Progress of a training: rows of `progress.jsonl`, a progress bar, and TensorBoard event files.
 
-Every row of `progress.jsonl` has the number of the `part` and the `decisions` of the whole run up
-to the row. There are two kinds of rows:
+Each line of `progress.jsonl` is a row in JSON. A row has the number of the `part` of the training,
+and the number of `decisions` since the start of the training. There are two kinds of rows:
 
-* Rows of the curve hold means over the decisions since the previous row: `reward`, `solved`,
-  `last` and `ratio` of solved cases, `violation` of the others (see
-  `environment.evaluate_actions`), decisions `per_second`, the `divergence` of a PPO update, the
-  `learning_rate`, and `spread`, the standard deviation of the actions.
-* Rows with `suites` hold the evaluation of the policy by the full planner.
+* Rows of the learning curve hold means over the decisions since the previous row: `reward`, the
+  share `solved`, `last` and `ratio` of solved cases, and `violation` of unsolved cases (terms of
+  `environment.evaluate_actions`). They also hold the decisions `per_second`, the `divergence` of a
+  PPO update, the `learning_rate`, and `spread`, the standard deviation of the actions.
+* Rows with `suites` hold an evaluation of the policy with the full number of planner iterations.
 
-The first line of the file has the format, the number of rows and their digest. `training.json`
-holds the settings, the format and the version of the code.
+The first line of the file instead holds the format, the number of rows and their digest.
+`training.json` holds the settings of the training, the format and the version of the code.
 """
 
 import contextlib
@@ -44,10 +44,11 @@ _EVENTS = "tensorboard"
 
 @contextlib.contextmanager
 def report_terms() -> Iterator[None]:
-    """Make the PPO of Brax report the means of reward and unweighted terms with its metrics.
+    """Make Brax's PPO report the mean reward and its unweighted terms, within the `with` block.
 
-    Brax itself reports them for 100 environments only, by calls from the compiled program to the
-    host. JAX does not store programs with such calls in its compilation cache.
+    The loss function of Brax is replaced by one that adds these means to the metrics. Brax itself
+    reports them for 100 environments only, through callbacks from the compiled program to Python.
+    JAX does not store programs with such callbacks in its compilation cache.
     """
     plain = losses.compute_ppo_loss
 
@@ -72,7 +73,7 @@ def report_terms() -> Iterator[None]:
 
 
 def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Convert metrics of Brax under `report_terms` to a row of the curve."""
+    """Convert the metrics that Brax reports in `report_terms` to a row of the learning curve."""
     found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     solved, others = found["solved"], 1.0 - found["solved"]
     return {
@@ -89,13 +90,14 @@ def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
 
 
 class Progress:
-    """The rows of a run.
+    """The rows of a training run, kept in memory and in the file `progress.jsonl`.
 
-    Every new row replaces the whole file. A resumed run reads the file first.
+    Each new row rewrites the whole file atomically. When a run is resumed, the rows of the file are
+    read first.
 
     Args:
         folder: folder of the run.
-        show: show a progress bar on standard error.
+        show: whether to show a progress bar on standard error.
     """
 
     def __init__(self, folder: Path, show: bool):
@@ -106,15 +108,16 @@ class Progress:
     def part(
         self, number: int, title: str, before: int, decisions: int
     ) -> Iterator[Callable[[int, Mapping[str, Any]], None]]:
-        """Yield the callback that Brax calls with the decisions and metrics of a part.
+        """Provide the callback by which Brax reports the progress of one part of a training.
 
-        Rows of this part and of later parts from an interrupted run are removed first.
+        Brax calls it with the number of decisions and the metrics. Rows of this part and of later
+        parts, which an interrupted run may have left, are removed first.
 
         Args:
             number: number of the part.
             title: title of the progress bar.
-            before: decisions before the part.
-            decisions: decisions of the part.
+            before: number of decisions in all earlier parts.
+            decisions: number of decisions in this part.
         """
         self.rows = [row for row in self.rows if row["part"] < number]
         place, suffix = self._folder / _EVENTS, f".part-{number:03d}"
@@ -141,24 +144,24 @@ class Progress:
             yield tell
 
     def add_evaluation(self, number: int, decisions: int, suites: Mapping[str, Any]) -> None:
-        """Add an evaluation of the policy by suite, as `training.evaluate_policy` returns it."""
+        """Add a row with the results of `training.evaluate_policy`, which are stored by suite."""
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
-        """Add a row to the file."""
+        """Add a row for part `number` after `decisions` decisions, and rewrite the file."""
         self.rows.append({"part": number, "decisions": decisions, **row})
         RunFolder(self._folder).write_text(FILE, to_text(self.rows))
 
 
 def to_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the contents of `progress.jsonl`."""
+    """Return the text of `progress.jsonl`: first a line with the digest, then one for each row."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
     head = {"rows": len(rows), "sha256": hashlib.sha256(text.encode()).hexdigest()}
     return json.dumps(to_write(head)) + "\n" + text
 
 
 def read_rows(folder: Path) -> list[dict[str, Any]]:
-    """Read the rows of a run in order of decisions.
+    """Read the rows of a training run from `progress.jsonl`, in the order of their decisions.
 
     Raises:
         ArgumentError: the folder does not hold a training, or the file does not match its digest.
@@ -183,7 +186,7 @@ def read_rows(folder: Path) -> list[dict[str, Any]]:
 
 
 def read_settings(folder: Path) -> dict[str, Any]:
-    """Read the settings of a training from `training.json`.
+    """Read the settings of a training run from `training.json` in its folder.
 
     Raises:
         ArgumentError: the folder does not hold a training, or the file is damaged.

@@ -1,4 +1,4 @@
-"""Settings of `planner-jax train`; imports no JAX."""
+"""Settings of the command `planner-jax train`; this module does not import JAX."""
 
 import dataclasses
 from typing import ClassVar
@@ -7,18 +7,18 @@ from planner_jax.core.choices import require, require_memory, require_seed
 from planner_jax.runs.settings import option, require_count
 from planner_jax.task.catch.spec import SUITES
 
-_MOST_DECISIONS = 1e12
-_CASE_BYTES = 20_000  # estimated memory of one case in a batch
-NETWORK_NAMES = ("attention", "mlp")
-# Weights of the terms of the reward, see `environment.evaluate_actions`.
+_MOST_DECISIONS = 1e12  # greatest accepted number of decisions of a part
+_CASE_BYTES = 20_000  # [bytes] estimated memory of one case in a batch
+NETWORK_NAMES = ("attention", "mlp")  # keys of `networks.NETWORKS`
+# Weights of the reward terms that `environment.evaluate_actions` returns and describes.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
-LEARNING_RATE = 1e-4
+LEARNING_RATE = 1e-4  # default learning rate at the start of each part of a training
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")
 
 
 @dataclasses.dataclass(frozen=True)
 class TrainSettings:
-    """The arguments of `planner-jax train`; `training.Training` has further ones.
+    """The options of `planner-jax train`, from which `training.train_from_settings` makes a run.
 
     Raises:
         ArgumentError: a value breaks its rule.
@@ -65,12 +65,15 @@ class TrainSettings:
 
     @property
     def suites(self) -> tuple[str, ...]:
-        """Names of the suites."""
+        """Names of the suites in `suite`, which is a list separated by commas."""
         return tuple(self.suite.split(","))
 
 
 def usual_iterations(suite: str) -> int:
-    """Return the planner iterations for a suite in training; 0 means the estimate is used."""
+    """Return the number of planner iterations for rewards in training on a suite.
+
+    0 stands for an estimate instead of the planner, used for suites with optional targets.
+    """
     if SUITES[suite].optional:
         return 0
     return 25 if SUITES[suite].num_targets <= 3 else 80

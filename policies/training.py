@@ -1,11 +1,11 @@
-"""Training of a policy by PPO [Schulman2017; Yu2023catch, eqs 5, 7], resumable between parts.
+"""Training of a policy for catches by PPO [Schulman2017; Yu2023catch, eqs 5, 7].
 
-A run consists of parts. Each part is one call of `brax.training.agents.ppo.train` from the weights
-of the previous part, with rewards by the planner or by the estimate. Orbax stores the weights after
-each part. The seed of a part follows from the seed of the run and the number of the part, so that
-an interrupted run continues to the same weights, bit for bit. The moments of Adam start at zero in
-each part, because Brax does not return them. The module `progress` records a run and `curves` draws
-it.
+A training consists of parts, after each of which it can be resumed. A part is one call of
+`brax.training.agents.ppo.train` that starts from the weights of the previous part. The module
+`environment` computes the rewards. Orbax stores the weights after each part. The seed of a part
+follows from the seed of the training and the number of the part, so that an interrupted training
+ends with bit-identical weights. The moments of Adam start at zero in each part, because Brax does
+not return them. The module `progress` records a training, and `curves` draws its learning curves.
 """
 
 import dataclasses
@@ -55,36 +55,38 @@ from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
-_ROWS = 50  # greatest number of rows of a part's curve
+_ROWS = 50  # greatest number of rows that record the learning curve of one part
 _EVAL_SEED = 4242  # seed of the evaluation cases, which no published figure uses
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One call of PPO."""
+    """One part of a training: one call of Brax's PPO."""
 
-    steps: int  # decisions
-    iterations: tuple[int, ...] = ()  # planner iterations for each suite; empty: the estimate
-    learning_rate: float = LEARNING_RATE  # first learning rate; the divergence adapts it
+    steps: int  # number of decisions
+    # Number of planner iterations for each suite. () rewards by an estimate instead of the planner.
+    iterations: tuple[int, ...] = ()
+    # Learning rate at the start. PPO adapts it to the KL divergence of the updates.
+    learning_rate: float = LEARNING_RATE
 
 
 @dataclasses.dataclass(frozen=True)
 class Training:
-    """The settings of a training."""
+    """All settings of a training, which are stored in `training.json`."""
 
-    suites: tuple[str, ...]
+    suites: tuple[str, ...]  # names of the suites from which cases are drawn
     parts: tuple[Part, ...]
-    network: str = "attention"
-    seed: int = 0
-    num_envs: int = 8190  # cases decided in parallel; a multiple of the number of suites
-    updates: int = 4  # passes over each batch of decisions
-    minibatches: int = 6
-    divergence: float = 0.01  # target KL divergence of an update; it sets the learning rate
-    entropy: float = 1e-4
-    # Weight of each term, one number or one for each suite.
+    network: str = "attention"  # key of `networks.NETWORKS`
+    seed: int = 0  # seed of initial weights and cases
+    num_envs: int = 8190  # number of cases in parallel; a multiple of the number of suites
+    updates: int = 4  # number of passes over each batch of decisions
+    minibatches: int = 6  # number of minibatches into which a pass divides the batch
+    divergence: float = 0.01  # desired KL divergence of an update, which adapts the learning rate
+    entropy: float = 1e-4  # weight of the entropy bonus in the loss of PPO
+    # Weights of the reward terms by name. A weight is one number, or one number for each suite.
     weights: tuple[tuple[str, float | tuple[float, ...]], ...] = tuple(WEIGHTS.items())
-    init_from: str | None = None  # checkpoint or shipped policy with the initial weights
-    eval_cases: int = 256  # cases of each suite for evaluations; 0 for no evaluation
+    init_from: str | None = None  # file or name of a policy with the initial weights
+    eval_cases: int = 256  # number of cases of each suite in an evaluation; 0 for no evaluation
 
 
 def train(training: Training, out: str | os.PathLike, *, progress: bool = True) -> Policy:
@@ -92,9 +94,9 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
 
     Args:
         training: settings of the training.
-        out: folder of the run: `training.json`, `parts/`, `progress.jsonl`, `tensorboard/`,
-            `curves.png` after each part, and `policy.npz` at the end.
-        progress: show a bar and a line after each part on standard error.
+        out: folder of the run. It gets `training.json`, `parts/`, `progress.jsonl`, `tensorboard/`,
+            `curves.png` after each part, and `policy.npz` with the weights at the end.
+        progress: whether to show a progress bar, and a line after each part, on standard error.
 
     Returns:
         The policy after the last part.
@@ -115,7 +117,10 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
 def _train_parts(
     training: Training, folder: Path, network: Any, params: Any, progress: bool
 ) -> Policy:
-    """Train all parts that are not stored yet, from the initial parameters."""
+    """Train the parts whose parameters are not stored yet, and write the final policy.
+
+    `params` are the parameters before the first part.
+    """
     keeper = KeptParts(folder / "parts")
     rows, before = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
@@ -145,10 +150,11 @@ def _train_parts(
 
 
 def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Policy:
-    """Train with the settings of `planner-jax train`; raises as `train`."""
+    """Train a policy with the options of `planner-jax train`; calls `train`."""
     lanes = settings.num_envs or (510 if jax.default_backend() == "cpu" else 8190)
     minibatches = 6
-    step = len(settings.suites) * minibatches  # equal shares of suites and minibatches
+    # The number of cases must be divisible by the numbers of suites and of minibatches.
+    step = len(settings.suites) * minibatches
     iterations = tuple(map(usual_iterations, settings.suites))
     training = Training(
         suites=settings.suites,
@@ -166,7 +172,11 @@ def train_from_settings(settings: TrainSettings, out: str | os.PathLike) -> Poli
 
 
 def evaluate_policy(training: Training, network: Any, params: Any) -> dict[str, Any]:
-    """Return success, last catch and optimal time ratio of a policy by suite."""
+    """Plan cases of each suite with a policy's decisions, and return the results by suite.
+
+    The results are the success rate, and the means of the time [s] of the last catch, the optimal
+    time ratio and the iterations over solved cases.
+    """
     decided = DecidedPlanner(ExactCatch(), Policy(params=params, network=network))
     figures = {}
     for suite in training.suites:
@@ -192,7 +202,11 @@ def _sentence(suites: Mapping[str, Any]) -> str:
 
 
 def _record_settings(folder: Path, training: Training) -> None:
-    """Write settings and digest of the code; raise `ArgumentError` if the folder has others."""
+    """Write `training.json` with the settings and the version of the code.
+
+    Raises:
+        ArgumentError: the file exists, with other settings or another version of the code.
+    """
     asked = json.loads(json.dumps(dataclasses.asdict(training)))
     maker = {"version": str(find_version("planner-jax")), "code": code_digest()}
     wanted = {**maker, **asked}
@@ -208,7 +222,10 @@ def _record_settings(folder: Path, training: Training) -> None:
 
 
 def _first_params(training: Training, network: Any) -> Any:
-    """Return the initial normaliser (unused) and the parameters of policy and value."""
+    """Return the initial parameters in the form of Brax: normaliser, policy and value network.
+
+    The normaliser of observations is a part that Brax expects and the networks do not use.
+    """
     env = _environment(training, training.parts[0])
     one, other = jax.random.split(jax.random.key(training.seed))
     seen = jnp.zeros((1, env.size, FEATURES))
@@ -239,7 +256,7 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """Return the number of rows of a part's curve, and the number of updates per row."""
+    """Return the number of rows in a part's learning curve, and the number of batches per row."""
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each
@@ -258,10 +275,10 @@ def _train_part(
     Args:
         training: settings of the training.
         part: settings of the part.
-        number: number of the part, which enters its seed.
-        network: network of the policy.
-        params: parameters before the part.
-        tell: callback with the decisions and metrics of each row of the curve.
+        number: number of the part, from which its seed is computed.
+        network: network of the policy, a Flax module.
+        params: parameters before the part, in the form of Brax.
+        tell: callback that Brax calls with decisions and metrics for each row of the curve.
     """
     env = _environment(training, part)
     rows, each = _rows_and_updates(part, training.num_envs)
@@ -287,7 +304,7 @@ def _train_part(
         seed=training.seed * 1000 + number,
         restore_params=params,
         run_evals=False,
-        num_evals=rows + 1,  # the first row comes before all training
+        num_evals=rows + 1,  # Brax counts an evaluation before the training, too
         num_eval_envs=len(training.suites),  # Brax creates them even with run_evals=False
         progress_fn=tell,
     )
@@ -297,7 +314,7 @@ def _train_part(
 
 
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
-    """Return policy and value in the form of Brax, for flat observations."""
+    """Return policy and value network in the form of Brax, which passes flattened observations."""
     value = Value()
 
     def unflatten(flat: Array) -> Array:
@@ -305,8 +322,8 @@ def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONe
 
     def numbers(_: Any, params: Any, flat: Array) -> Array:
         found = network.apply(params, unflatten(flat))
-        # Absent targets get constant distributions, which add nothing to the KL divergence by which
-        # PPO adapts its learning rate.
+        # Give absent targets constant distributions. They then add nothing to the KL divergence by
+        # which PPO adapts its learning rate.
         found = jnp.where(unflatten(flat)[..., -1:] > 0.5, found, 0.0)
         means, spreads = found[..., :PER_TARGET], found[..., PER_TARGET:]
         shape = (*flat.shape[:-1], -1)

@@ -93,7 +93,7 @@ def plan_with_aims(
 ) -> BlockPlan:
     """Plan cases with estimated balls; each case gets the plan of the first aim that is solved.
 
-    Aims are increasingly lenient requirements. If no aim is solved, the last plan is returned.
+    Later aims are less strict. If none is solved, the best failed plan is returned.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
