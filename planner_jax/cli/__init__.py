@@ -1,1 +1,1 @@
-"""The command `planner-jax`."""
+"""The command line program `planner-jax`: its commands, options and messages."""

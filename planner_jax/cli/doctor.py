@@ -1,4 +1,7 @@
-"""The command `planner-jax doctor`: facts about this machine, and timed plans."""
+"""The command `planner-jax doctor`: it checks the installation and times some plans.
+
+It prints versions, devices, floating-point precision, the compile cache and planning times.
+"""
 
 import dataclasses
 import os
@@ -12,21 +15,22 @@ from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend
 
 _BATCH = 1024  # number of planned and refereed hits
-# Products in float32 have errors of 1e-7, products in TF32 with its ten bits of 1e-3.
+# Greatest relative error of a matrix product in full float32 precision. The error of float32 is
+# about 1e-7, and the error of a GPU's TF32 format, with its ten bits of mantissa, about 1e-3.
 _FULL_PRECISION = 1e-5
 
 
 @dataclasses.dataclass(frozen=True)
 class Finding:
-    """One line of the report."""
+    """One line of the report of `planner-jax doctor`."""
 
     name: str
     text: str
-    good: bool = True
+    good: bool = True  # False if the user should change something
 
 
 def examine() -> Iterator[Finding]:
-    """Yield findings on versions, devices, precision, cache and plans."""
+    """Examine versions, system, devices, GPU kernels, precision, cache and plans, line by line."""
     require_backend()
     folder = keep_compiled_programs()
     found = environment()
@@ -56,7 +60,7 @@ def _devices() -> Finding:
 
 
 def _kernels() -> Finding:
-    """Return whether kernels replace JAX's operations, which makes planning faster on a GPU."""
+    """Report whether GPU kernels replace JAX's operations, which makes planning faster."""
     from planner_jax.lanes import kernels
 
     state = kernels.kernels()
@@ -93,7 +97,7 @@ def _cache(folder) -> Finding:
 
 
 def _plans() -> Iterator[Finding]:
-    """Yield findings on one hit and on a batch of hits, timed and refereed."""
+    """Plan one hit and a batch of hits; yield the planning times and the referee's success rate."""
     import jax
     import numpy as np
 
@@ -118,7 +122,7 @@ def _plans() -> Iterator[Finding]:
 
 
 def report() -> bool:
-    """Print the findings, and return whether all are good."""
+    """Print all findings about the installation, and return whether all of them are good."""
     print(f"planner-jax doctor, Python {platform.python_version()}")
     good = True
     for finding in examine():

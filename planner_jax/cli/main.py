@@ -1,7 +1,7 @@
-"""The command line `planner-jax` with the commands `sweep`, `fly`, `serve`, `train` and others.
+"""Entry point of the program `planner-jax`: it parses the command line and runs a command.
 
-Tasks come from the registry, and the options of `sweep` and `fly` from the fields of a task's
-settings. Nothing here is specific to a task.
+The tasks (hit, catch, ...) come from the registry. The options of `sweep`, `fly` and `plan` are the
+fields of a task's settings. Nothing in this module is specific to a task.
 """
 
 import functools
@@ -18,22 +18,24 @@ from planner_jax.host import signals as stopping
 from planner_jax.live.settings import SERVED
 from planner_jax.runs.environment import find_version
 
-_INTERRUPTED = 130  # exit code
+_INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
+    """Run one command of `planner-jax`.
 
     Args:
-        arguments: words of the command; by default the arguments of the process.
+        arguments: words of the command line; by default the arguments of the process.
 
     Returns:
-        The exit code: 0, 1 if file system or workers fail, 2 for a bad argument, 130 after Ctrl-C.
-        If the process handles signals by `stopping.listen`, they end it instead.
+        The exit code: 0 for success, 1 if the command fails, 2 for a bad argument, 130 after
+        Ctrl-C. In a process that handles signals by `stopping.listen`, Ctrl-C ends the process.
     """
-    flags: dict[str, str] = {}  # options of the command by the names of their arguments
+    flags: dict[str, str] = {}  # by name of an argument, its option, such as "num": "--num"
     try:
-        with warnings.catch_warnings():  # warnings of other packages, such as a task that fails
+        # Other packages may warn, for example if a task of theirs cannot be imported. Print every
+        # warning in one line.
+        with warnings.catch_warnings():
             warnings.simplefilter("always")
             warnings.showwarning = lambda text, *_, **__: print(
                 f"planner-jax: warning: {text}", file=sys.stderr
@@ -61,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _make_parser() -> Parser:
-    """Return the parser of all commands; options are added when a command is used."""
+    """Make the parser of all commands; a command's options are added only when it is used."""
     parser = Parser(
         prog="planner-jax",
         description="Plan for robots that meet flying objects, thousands of cases at once.",
@@ -86,7 +88,7 @@ def _make_parser() -> Parser:
         tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
         for task in all_tasks().values():
             if {"sweep": task.sweep, "fly": task.flight, "plan": task.single}[name] is not None:
-                # Settings are imported for the requested task only.
+                # `fill` imports the settings' module, so it runs for the requested task only.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, argument_default=SUPPRESS)
     words = "train a policy that decides about catches"
@@ -125,7 +127,7 @@ def _make_parser() -> Parser:
 
 
 def _doctor(options: Options) -> int:
-    """Examine the machine."""
+    """Run the command `doctor`, which checks the installation; return the exit code."""
     from planner_jax.cli.doctor import report
 
     return 0 if report() else FAILED

@@ -1,7 +1,6 @@
-"""Parsers of the command line, and options made from the fields of settings.
+"""Parsers of the command line; a command's options are the fields of its dataclass of settings.
 
-Settings are dataclasses whose fields have `metavar` and `help` in their metadata, as
-`planner_jax.runs.settings.option` makes them.
+The fields' metadata have `metavar` and `help`, which `planner_jax.runs.settings.option` sets.
 """
 
 import argparse
@@ -22,17 +21,20 @@ FAILED, BAD_ARGUMENT = 1, 2  # exit codes
 
 
 class BadOption(PlannerJaxError):
-    """A word of the command line is not of the type of its option."""
+    """Error: a word of the command line cannot be converted to the type of its option."""
 
 
 class Unfinished(PlannerJaxError):
-    """The file system or workers failed during a run; the text says how to continue."""
+    """Error: the file system or workers failed during a run; the text says how to continue it."""
 
 
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, with `flags` for names of arguments; return its exit code."""
+    """Print an error in one line, and return the exit code `code`.
+
+    Names of arguments in the message are replaced by their options, such as "--num", in `flags`.
+    """
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -40,10 +42,10 @@ def fail(
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser that reports a bad argument in one line.
+    """An argument parser that reports a bad argument in one line.
 
     Args:
-        fill: adds the options when the parser is first used.
+        fill: function that adds the parser's options; it is called when the parser is used.
         **look: arguments of `argparse.ArgumentParser`.
     """
 
@@ -53,28 +55,32 @@ class Parser(argparse.ArgumentParser):
         )
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill, self._flags = fill, {}
-        # Words that are numbers, not options; the pattern of argparse lacks exponents.
+        # Words with this start are negative numbers and not options. The pattern of argparse would
+        # take numbers with an exponent, such as -1e3, for options.
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the options, and parse words; the result includes the options' flags."""
+        """Add the options and parse the words of the command line.
+
+        The result also has `flags`, the options (such as "--num") by the names of their arguments.
+        """
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
-        """Add an option; `type` int or float makes it a number."""
+        """Add the option `flag`; with `type` int or float its word must be a number."""
         if type in (int, float):
             how["type"] = functools.partial(_read_number, flag, type)
         self._flags[self.add_argument(flag, **how).dest] = flag
 
     def error(self, message: str) -> NoReturn:
-        """Print one line and end the process."""
+        """Print the error in one line, and end the process with the exit code 2."""
         sys.exit(fail(message.removeprefix("argument ")))
 
 
 def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
-    """Return the number in a word of the command line."""
+    """Convert a word of the command line to a number, or raise `BadOption`."""
     try:
         return kind(word)
     except ValueError:
@@ -83,7 +89,10 @@ def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
 
 
 def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
-    """Add an option for every field of a class of settings; unused options stay absent."""
+    """Add an option for every field of the dataclass `kind` of settings.
+
+    The names of a task's planners and suites of cases complete the help texts.
+    """
     hints = typing.get_type_hints(kind)
     names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
     defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}
@@ -109,7 +118,7 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _form_of(field: dataclasses.Field) -> Options:
-    """Return the arguments of `add_argument` for required, multiple or repeated values."""
+    """Return the arguments of `add_argument` for a field with required or several values."""
     names = field.metadata["metavar"].split()
     how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
     if len(names) == 1:
@@ -120,16 +129,19 @@ def _form_of(field: dataclasses.Field) -> Options:
 
 
 def _type_of(hint: Any) -> type:
-    """Return the type of an option's words: int or float if its field holds these, or str."""
+    """Return the type of an option's words, int, float or str, from the type of its field."""
     held = typing.get_args(hint) or (hint,)
-    if str in held:  # beside numbers: "uniform" may replace three numbers
+    if str in held:  # the field accepts numbers or a word, such as "uniform"
         return str
     inner = [_type_of(kind) for kind in held if typing.get_args(kind)]
     return next((kind for kind in (int, float) if kind in held), next(iter(inner), str))
 
 
 def pop_out(given: Options, kind: str = "folder") -> str | None:
-    """Remove the option `--out`, a folder or file, from the options and return it."""
+    """Remove the option `--out` from the options, check it, and return it; None if absent.
+
+    `kind` is "folder" or "file", for messages.
+    """
     out = given.pop("out", None)
     if out == "":
         raise ArgumentError("out", f"a {kind}", out, verb="name")

@@ -1,4 +1,7 @@
-"""Commands that write run folders or files of motions, and commands that read run folders."""
+"""Commands that write or read run folders: `sweep`, `fly`, `train`, `report`, `compare` and others.
+
+A run folder has the results of one command: tables, figures, plans and a manifest.
+"""
 
 import contextlib
 import datetime
@@ -26,7 +29,7 @@ _THROUGHPUT = "planner_jax.benchmarks.throughput_settings:ThroughputSettings"
 
 
 def add_sweep(task: Task, parser: Parser) -> None:
-    """Add the options of `sweep` for one task."""
+    """Add the options of the command `planner-jax sweep` for one task to its parser."""
     parser.description = (
         f"Plan many cases of the task: {task.summary}.\nA referee judges every plan.\n"
         "Writes a run folder: index.html, table.md, figures, plans (Parquet), manifest.json."
@@ -69,7 +72,7 @@ def _print_sweep(manifest: Options, out: str) -> None:
 
 
 def add_fly(task: Task, parser: Parser) -> None:
-    """Add the options of `fly` for one task."""
+    """Add the options of the command `planner-jax fly` for one task to its parser."""
     parser.description = (
         f"Fly many cases of the task: {task.summary}.\n"
         "Flights are simulated in MuJoCo MJX with noise and latency.\n"
@@ -111,7 +114,7 @@ def _print_flights(out: Path) -> None:
 
 
 def add_train(parser: Parser) -> None:
-    """Add the options of `train`."""
+    """Add the options of the command `planner-jax train` to its parser."""
     kind = pkgutil.resolve_name(_TRAIN)
     parser.description = kind.DESCRIPTION
     add_settings(parser, kind)
@@ -137,7 +140,7 @@ def _train(given: Options) -> None:
 
 
 def report(options: Options) -> None:
-    """Write the report of a run again."""
+    """Run the command `report`: write table, figures and page of a finished run again."""
     from planner_jax.runs.run_folder import RunFolder
 
     folder = RunFolder(options["run"], "RUN")
@@ -158,7 +161,7 @@ def report(options: Options) -> None:
 
 
 def compare(options: Options) -> None:
-    """Print a comparison of runs, and write it as a table if requested."""
+    """Run the command `compare`: print a comparison of runs, and write it as CSV if requested."""
     from planner_jax.sweep.compare import as_csv, describe, read_run, require_comparable
 
     out = pop_out(options, "file")
@@ -176,7 +179,7 @@ def compare(options: Options) -> None:
 
 
 def view(options: Options) -> None:
-    """Serve the flights of a run to a browser."""
+    """Run the command `view`: serve a 3-D view of a run's flights to a browser until Ctrl-C."""
     from planner_jax.runs.run_folder import RunFolder
     from planner_jax.sims.run import read_flights
     from planner_jax.sims.view import Viewer
@@ -188,7 +191,7 @@ def view(options: Options) -> None:
 
 
 def add_throughput(parser: Parser) -> None:
-    """Add the options of `bench throughput`."""
+    """Add the options of the command `planner-jax bench throughput` to its parser."""
     kind = pkgutil.resolve_name(_THROUGHPUT)
     parser.description = kind.DESCRIPTION
     add_settings(parser, kind)
@@ -206,17 +209,20 @@ def _throughput(given: Options) -> None:
 
 
 def _name_run_folder(name: str) -> str:
-    """Return the path of a run folder with a name and the current time."""
+    """Return the default path of a run folder: runs/NAME-DATE-TIME with the current time."""
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _quote_command() -> str:
-    """Return the command of this process, quoted for a shell."""
+    """Return the command line of this process, quoted so that a shell can run it again."""
     return shlex.join(["planner-jax", *sys.argv[1:]])
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return how to continue a stopped run, if the file `sign` shows that the run has started."""
+    """Return the hint `again` on continuing a stopped run, if the run folder has a file `sign`.
+
+    Without this file the run has not started, and nothing needs to be continued.
+    """
     return again if (out / sign).exists() else stopping.NOTHING
 
 
@@ -224,7 +230,10 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `remainder()` to the message of an interruption or a failure."""
+    """Add `remainder()`, a hint on how to continue, to the message of an interruption or failure.
+
+    `rule` describes the requirement that an error of the file system violates.
+    """
     try:
         yield
     except KeyboardInterrupt:
@@ -237,7 +246,7 @@ def _tell_how_to_continue(
 
 
 def add_library(library: Parser) -> None:
-    """Add the commands on libraries of stored motions."""
+    """Add the commands `planner-jax library ...`, on stored motions of the arm, to the parser."""
     commands = library.add_subparsers(title="commands", required=True, metavar="command")
 
     def command(name: str, words: str) -> Callable[..., None]:

@@ -1,4 +1,4 @@
-"""Commands on one case, one plan or one robot: `plan`, `export`, `serve`, `robots`."""
+"""Commands for one case, one plan or one robot: `plan`, `export`, `serve`, `robots`."""
 
 import contextlib
 import math
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 def add_plan(task: Task, parser: Parser) -> None:
-    """Add the options of `plan` for one task."""
+    """Add the options of the command `planner-jax plan` for one task to its parser."""
     parser.description = (
         f"Plan one case of the task: {task.summary}. A referee judges the plan.\n"
         "Prints time and position of the contact, and how close the plan comes to each limit."
@@ -62,7 +62,7 @@ def _plan(task: Task, given: Options) -> int:
 def _write_answer(
     task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
 ) -> None:
-    """Write a new folder with plan and pictures, and setpoints if the referee accepts the plan."""
+    """Write plan and pictures into a new folder, and setpoints if the referee accepts the plan."""
     from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
 
@@ -70,7 +70,8 @@ def _write_answer(
     written = [out / "plan.npz"]
     answer.plan.save(written[0])
     if answer.success:
-        recovery = None if answer.plan.recovery is None else "brake"  # the plan keeps its own
+        # A plan that has a recovery trajectory already is exported unchanged with "brake".
+        recovery = None if answer.plan.recovery is None else "brake"
         how = {"rate": rate, "recovery": recovery}
         written.append(export(answer.plan, to="csv", out=out / "setpoints.csv", **how))
     written += write_pictures(task, planner, answer, out)
@@ -78,7 +79,7 @@ def _write_answer(
 
 
 def add_export(parser: Parser) -> None:
-    """Add the options of `export`."""
+    """Add the options of the command `planner-jax export` to its parser."""
     from planner_jax.export.api import FORMATS
 
     parser.description = (
@@ -130,7 +131,10 @@ def _export(given: Options) -> None:
 
 
 def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
-    """Return a plan of a sweep or a file, and the referee's objection, if known."""
+    """Read a plan from a sweep's folder or a file of plans.
+
+    Returns the plan, and the referee's objection to it, which is "" if there is none or no verdict.
+    """
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
         from planner_jax.sweep.rows import read_plan
@@ -144,7 +148,7 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
 
 
 def _case_of(source: str, row: int | None, recovery: str) -> "Case":
-    """Return the case of a row of a sweep, whose limits a recovery trajectory must keep."""
+    """Return the case of one row of a sweep, whose limits the recovery trajectory must keep."""
     if row is None or not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
         raise ArgumentError("recovery", rule, recovery)
@@ -156,7 +160,7 @@ def _case_of(source: str, row: int | None, recovery: str) -> "Case":
 
 
 def add_serve(kind: type[ServeSettings], parser: Parser) -> None:
-    """Add the options of `serve` for one task."""
+    """Add the options of the command `planner-jax serve` for one task to its parser."""
     parser.description = (
         "Receives observations of a ball and of the robot as UDP packets on localhost, plans as\n"
         "soon as the ball is known, and answers every packet with the setpoints that are due."
@@ -188,7 +192,7 @@ def _serve(settings: ServeSettings) -> None:
 
 
 def robots(options: Options) -> None:
-    """Print the known robots, or one of them as YAML."""
+    """Run the command `robots`: print a table of the known robots, or one robot as YAML."""
     from planner_jax.robot.quadrotor_file import RobotError, to_yaml
     from planner_jax.robot.quadrotor_models import format_models, robot_named
 

@@ -1,1 +1,1 @@
-"""Plans in the file formats of controllers: setpoints and polynomials."""
+"""Export of plans to controllers: files and messages with setpoints or polynomials."""

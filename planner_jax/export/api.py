@@ -1,6 +1,7 @@
-"""Export of one plan: `export` into a file, and `stream` to a port.
+"""Export of one plan to a controller: `export` writes a file, and `stream` sends it to a UDP port.
 
-The module that writes a format is imported when the format is requested.
+The module that writes a format is imported only when the format is requested, since it may need an
+optional package.
 """
 
 import dataclasses
@@ -32,12 +33,14 @@ _ALL = ("quadrotor", "car", "arm")
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A format of plans."""
+    """A file format for plans."""
 
-    summary: str  # a few words
-    robots: tuple[str, ...]  # names of `ROBOTS`
-    writers: Mapping[str, str]  # "module:function" of this package by file extension, default first
-    is_sampled: bool = True  # whether it has a rate
+    summary: str  # short description for the command's help
+    robots: tuple[str, ...]  # names of the supported robots of `export.setpoints.ROBOTS`
+    # By file extension, the function "module:name" of this package that writes the file. The first
+    # extension is the default.
+    writers: Mapping[str, str]
+    is_sampled: bool = True  # whether the format holds setpoints at a rate, not polynomials
 
 
 FORMATS = {
@@ -70,7 +73,7 @@ def export(
     recovery: str | None = "brake",
     case: Case | None = None,
 ) -> Path:
-    """Write one plan for a controller, into a new file that appears whole or not at all.
+    """Write one plan for a controller into a new file; after an error there is no partial file.
 
     | `to` | file | content | frame |
     |---|---|---|---|
@@ -84,12 +87,12 @@ def export(
     are SI.
 
     Args:
-        plan: one solved plan; of a batch `pj.take(plans, k)`.
+        plan: one solved plan. `pj.take(plans, k)` selects one from a batch.
         to: name of the format.
         out: path of the file, whose extension selects the variant of the format. The file must not
             exist.
         rate: setpoints per second [Hz], 100 by default; not allowed for `crazyflie`.
-        recovery: end of the recovery trajectory that is appended unless the plan ends at rest:
+        recovery: a plan that does not end at standstill gets a recovery trajectory to standstill:
             "brake" stops where that is cheapest, "home" at the first position of the case. None
             exports the plan up to its last contact.
         case: case of the plan, whose limits the recovery trajectory keeps.
@@ -98,10 +101,10 @@ def export(
         The path of the file.
 
     Raises:
-        UnknownName: there is no such format.
-        ArgumentError: an argument breaks a rule; one line.
+        UnknownName: no format has the name `to`.
+        ArgumentError: an argument breaks a rule, which the message names in one line.
         MissingExtra: a package that the format needs is not installed.
-        OSError: the file system fails; its `filename` is the path.
+        OSError: the file cannot be written; the exception's `filename` is the path.
     """
     form = _require_format(to, plan)
     path = Path(out)
@@ -141,8 +144,8 @@ def stream(
         case: see `export`.
 
     Raises:
-        UnknownName: there is no such format.
-        ArgumentError: an argument breaks a rule, or no program listens on the port; one line.
+        UnknownName: no format has the name `to`.
+        ArgumentError: an argument breaks a rule, or no program listens on the port.
         MissingExtra: pymavlink is not installed.
     """
     if _require_name(to) != "px4":
@@ -153,20 +156,23 @@ def stream(
 
 
 def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
-    """Return the default name of the exported file for a plan of a run or of a saved file."""
+    """Return the default file name, source-row-format, for an exported plan.
+
+    `source` is a run's folder or a file of plans, and `row` the plan's index, or None.
+    """
     extension = next(iter(FORMATS[_require_name(to)].writers))
     index = "" if row is None else f"-{row}"
     return f"{Path(os.path.abspath(source)).stem}{index}-{to}{extension}"
 
 
 def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) -> Plan:
-    """Return one plan with its recovery trajectory.
+    """Return one plan with a recovery trajectory, so that the robot ends at standstill.
 
     Args:
-        plan: solved plan of a robot of `ROBOTS`.
-        recovery: "brake" or "home"; a plan that ends at rest is returned unchanged. None removes
-            the recovery trajectory.
-        case: case of the plan; needed unless the plan ends at rest.
+        plan: solved plan of a quadrotor, a car or an arm.
+        recovery: "brake" or "home"; a plan that ends at standstill is returned unchanged. None
+            removes the recovery trajectory.
+        case: case of the plan; needed unless the plan ends at standstill.
 
     Raises:
         ArgumentError: the plan cannot be exported, `recovery` is unknown, the case is missing or
@@ -196,13 +202,16 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
 
 
 def lacks_recovery(plan: Plan) -> bool:
-    """Return whether one plan does not end at rest; raise `ArgumentError` as `robot_of` does."""
+    """Test whether one plan does not end at standstill; raise `ArgumentError` like `robot_of`."""
     robot_of(plan)
     return not is_rested(plan)
 
 
 def _require_name(to: str) -> str:
-    """Return the name of a format; raise `UnknownName`, with the most similar name, if unknown."""
+    """Return the argument `to` if it names a format; otherwise raise `UnknownName`.
+
+    The error's message proposes the most similar name.
+    """
     if to not in FORMATS:
         alike = difflib.get_close_matches(str(to).lower(), FORMATS, n=1)
         hint = f"; did you mean {alike[0]!r}?" if alike else ""
@@ -211,7 +220,7 @@ def _require_name(to: str) -> str:
 
 
 def _require_format(to: str, plan: Plan) -> Format:
-    """Return a format; raise `ArgumentError` unless it supports the robot of the plan."""
+    """Return the format with the name `to`; raise unless it supports the robot of the plan."""
     form, robot = FORMATS[_require_name(to)], robot_of(plan)
     if robot.name not in form.robots:
         rule = f"a format for plans of the {robot.name}"
@@ -220,7 +229,7 @@ def _require_format(to: str, plan: Plan) -> Format:
 
 
 def _resolve(writer: str, purpose: str) -> Callable:
-    """Return a function "module:name" of this package.
+    """Import and return the function `writer`, a text "module:name" in this package.
 
     Raises:
         MissingExtra: the module needs a package that is not installed.

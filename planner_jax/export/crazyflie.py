@@ -1,8 +1,9 @@
-"""Plans for a Crazyflie's high-level commander: polynomials of degree 7, piece by piece.
+"""Plans for the high-level commander of a Crazyflie quadrotor: polynomials of degree 7.
 
-Its memory holds 132 bytes for each piece: eight coefficients of x, y, z [m] and yaw [rad], the
-constant first, and the duration [s], all little-endian float32. Its frame is the library's, z up,
-and time starts at zero in each piece, as it does here, so that all numbers are unchanged.
+The Crazyflie's memory holds 132 bytes for each piece: eight coefficients each of x, y, z [m] and
+yaw [rad], the constant first, then the duration [s], all little-endian float32. The Crazyflie and
+this library use the same frame, z up, and time starts at zero in each piece. The plan's numbers are
+therefore written unchanged.
 """
 
 from typing import BinaryIO
@@ -14,16 +15,16 @@ from planner_jax.export.csv_rows import write_table
 from planner_jax.export.setpoints import pieces_of
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
-MEMORY = 4096  # bytes for trajectories in the firmware
-POWERS = 8
-_BYTES = 4 * (4 * POWERS + 1)  # bytes of a piece
+MEMORY = 4096  # [bytes], memory for trajectories in the firmware
+POWERS = 8  # number of coefficients of a polynomial
+_BYTES = 4 * (4 * POWERS + 1)  # [bytes], memory of one piece
 
 
 def poly4d(plan: QuadrotorPlan) -> np.ndarray:
-    """Return the pieces of a plan, (M, 33) float32.
+    """Return the M polynomial pieces of a plan as rows (M, 33) float32.
 
-    A row has the duration [s] and eight coefficients each of x, y, z [m] and yaw [rad], the
-    constant first, in the time [s] since the start of the piece. The yaw is always zero.
+    A row has the duration [s], then eight coefficients each of x, y, z [m] and yaw [rad]. They are
+    the coefficients of rising powers of the time [s] since the piece's start. The yaw is zero.
 
     Raises:
         ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than
@@ -48,12 +49,12 @@ def poly4d(plan: QuadrotorPlan) -> np.ndarray:
 
 
 def write_csv(plan: QuadrotorPlan, rate: None, file: BinaryIO) -> None:
-    """Write the pieces as a table of 33 columns, the format of Crazyflie tools."""
+    """Write the pieces of a plan as a CSV table of 33 columns, the format of Crazyflie's tools."""
     powers = [f"{name}^{k}" for name in ("x", "y", "z", "yaw") for k in range(POWERS)]
     write_table(file, ["duration", *powers], [poly4d(plan)])
 
 
 def write_bin(plan: QuadrotorPlan, rate: None, file: BinaryIO) -> None:
-    """Write the pieces in the layout of the Crazyflie's memory, with the duration last."""
+    """Write the pieces of a plan in the binary layout of the Crazyflie's memory."""
     table = poly4d(plan)
     file.write(np.hstack([table[:, 1:], table[:, :1]]).astype("<f4").tobytes())

@@ -1,4 +1,4 @@
-"""Setpoints as a table of text: a header with names and units, and a row for each time."""
+"""Export of setpoints as CSV: a header with names and units, and one row for each time."""
 
 from typing import BinaryIO
 
@@ -8,7 +8,8 @@ from planner_jax.core.protocol import Plan
 from planner_jax.export.setpoints import robot_of, setpoints_of
 
 _AXES, _JOINTS = ("x", "y", "z"), ("1", "2", "3", "4", "5", "6")
-# For each robot: fields of its setpoints, with the names of their columns and the unit.
+# For each robot, the columns of its table: a field of the setpoints, the names of the field's
+# columns, and their unit.
 _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
     "quadrotor": [
         ("time", ["time"], "s"),
@@ -39,9 +40,9 @@ _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
 
 
 def write(plan: Plan, rate: float, file: BinaryIO) -> None:
-    """Write the setpoints of a plan, in the units and frames of its `sample`.
+    """Write the setpoints of a plan at `rate` [Hz], in the units and frames of `plan.sample`.
 
-    Numbers have enough digits to be read back bit for bit.
+    Numbers are written with enough digits to restore the same floating-point number.
     """
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
@@ -50,7 +51,7 @@ def write(plan: Plan, rate: float, file: BinaryIO) -> None:
 
 
 def write_table(file: BinaryIO, header: list[str], columns: list[np.ndarray]) -> None:
-    """Write a header, and columns (K,) or blocks of columns (K, N), as comma-separated text."""
+    """Write a header line and K rows as CSV; an array (K, N) in `columns` gives N columns."""
     file.write((",".join(header) + "\n").encode())
     blocks = [np.asarray(column).reshape(len(column), -1) for column in columns]
     for parts in zip(*blocks, strict=True):

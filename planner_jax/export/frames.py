@@ -1,9 +1,11 @@
-"""Conversions between the frames of this library and the frames of PX4.
+"""Conversions from the frames of this library to the frames of the autopilot PX4.
 
-This library and ROS (REP 103): world ENU, x east, y north, z up; body FLU, x forward, y left, z up;
-yaw counter-clockwise from east. In a world without a compass, the x axis is called east. PX4: world
-NED, x north, y east, z down; body FRD, x forward, y right, z down; yaw clockwise from north. Both
-have the same origin.
+| | world | body | yaw |
+|---|---|---|---|
+| library, ROS | ENU: x east, y north, z up | FLU: forward, left, up | counter-clockwise from east |
+| PX4 | NED: x north, y east, z down | FRD: forward, right, down | clockwise from north |
+
+Both worlds have the same origin. The library's x axis counts as east, whatever its true direction.
 """
 
 import numpy as np
@@ -18,18 +20,19 @@ def to_ned(vectors: np.ndarray) -> np.ndarray:
 
 
 def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
-    """Convert a yaw [rad] counter-clockwise from east to one clockwise from north, in [-pi, pi).
+    """Convert a yaw counter-clockwise from east to a yaw clockwise from north, in [-pi, pi) [rad].
 
-    The conversion is its own inverse; the rate of a yaw only changes its sign.
+    The conversion is its own inverse. The rate of the yaw only changes its sign.
     """
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 
 
-_VERTICAL = 1e-6  # horizontal part of a unit vector below which it has no yaw
+# If the horizontal part of the body's x axis, a unit vector, is shorter, the yaw is undefined.
+_VERTICAL = 1e-6
 
 
 def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the yaw of attitudes, the direction of the body's x axis from above, and its rate.
+    """Return the yaw of attitudes and its rate; yaw is the body's x axis as seen from above.
 
     Args:
         quat_wxyz: (K, 4), FLU body to ENU world.

@@ -1,4 +1,7 @@
-"""Setpoints as MAVLink messages SET_POSITION_TARGET_LOCAL_NED: in a log, or sent in real time."""
+"""Export of setpoints as MAVLink messages SET_POSITION_TARGET_LOCAL_NED.
+
+The messages are written to a telemetry log, or sent over UDP in real time.
+"""
 
 import socket
 import struct
@@ -13,16 +16,16 @@ from planner_jax.export.px4 import trajectory_setpoints
 from planner_jax.export.setpoints import DEFAULT_RATE
 from planner_jax.robot.quadrotor import QuadrotorPlan
 
-FASTEST = 1000.0  # [Hz]: the messages count milliseconds
-_VEHICLE, _AUTOPILOT = 1, 1  # system and component of the receiver
-_SENDER = 255  # system of a ground station
-_NO_FIELD_IGNORED = 0
+FASTEST = 1000.0  # [Hz], greatest rate, since the messages' time stamps are in milliseconds
+_VEHICLE, _AUTOPILOT = 1, 1  # MAVLink's numbers of the receiving system and component
+_SENDER = 255  # MAVLink's system number of a ground station
+_NO_FIELD_IGNORED = 0  # type mask of a message in which every field is valid
 
 
 def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
-    """Yield the time [us] of each message since the start of the plan, and its MAVLink 2 packet.
+    """Yield for each setpoint its time [us] since the plan's start, and its MAVLink 2 packet.
 
-    Position, velocity, acceleration, yaw and its rate are all set; see `trajectory_setpoints`.
+    A packet has position, velocity, acceleration, yaw and yaw rate of `trajectory_setpoints`.
 
     Raises:
         ArgumentError: the plan cannot be exported, or the rate is out of its range.
@@ -47,16 +50,16 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
 
 
 def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write a telemetry log: before each packet its time [us] in eight bytes, big-endian.
+    """Write a telemetry log of a plan at `rate` [Hz].
 
-    Times count from the start of the plan.
+    Before each packet are eight bytes, big-endian: its time [us] since the start of the plan.
     """
     for stamp, packet in packets(plan, rate):
         file.write(struct.pack(">Q", stamp) + packet)
 
 
 def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
-    """Send the packets to a UDP port of this machine, each at its time; return their number.
+    """Send a plan's packets to a UDP port of this machine in real time; return their number.
 
     Raises:
         ArgumentError: the plan cannot be exported, the rate is out of its range, or no program

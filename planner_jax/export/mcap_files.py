@@ -1,6 +1,7 @@
-"""MCAP files for rosbag2: profile ros2, schemas ros2msg, messages CDR.
+"""Export of plans as MCAP files, which ROS 2's recorder rosbag2 reads and plays.
 
-Times of messages count from the start of the plan.
+The files have the profile ros2, schemas ros2msg and messages in CDR encoding. Times of messages
+count from the start of the plan.
 """
 
 from typing import BinaryIO
@@ -46,7 +47,7 @@ def _full_name(kind: str) -> str:
 def _definition(kind: str) -> str:
     """Return the definition of a type, followed by the definitions of all types in its fields."""
     types = [kind]
-    for each in types:  # the list grows while it is read
+    for each in types:  # the loop appends to the list that it iterates over
         inner = (line.split()[0].removesuffix("[]") for line in _TYPES[each].splitlines())
         types += [name for name in dict.fromkeys(inner) if name in _TYPES and name not in types]
     parts = [_TYPES[kind], *(f"MSG: {each}\n{_TYPES[each]}" for each in types[1:])]

@@ -1,4 +1,4 @@
-"""Setpoints for PX4: the fields of its message TrajectorySetpoint, in NED."""
+"""Export of setpoints for the autopilot PX4, as fields of its message TrajectorySetpoint in NED."""
 
 from typing import BinaryIO
 
@@ -17,7 +17,7 @@ def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarr
 
     Args:
         plan: one solved plan.
-        rate: [Hz].
+        rate: [Hz], setpoints per second.
 
     Returns:
         timestamp: (K,) uint64 [us], since the start of the plan.
@@ -39,7 +39,7 @@ def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarr
 
 
 def write_csv(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write the messages as rows, with the column names of PX4's own tools."""
+    """Write a plan's TrajectorySetpoint messages as CSV rows, with PX4's names of the columns."""
     fields = trajectory_setpoints(plan, rate)
     header = [
         f"{name}[{axis}]" if values.ndim == 2 else name

@@ -1,8 +1,8 @@
-"""Plans for ROS 2: one message of `trajectory_msgs` with all setpoints.
+"""Export of plans for ROS 2: one message of the package `trajectory_msgs` with all setpoints.
 
-World frame ENU and body frame FLU (REP 103), the frames of this library. A quadrotor or a car is
-one joint with six degrees of freedom; its linear and angular velocities are in the world frame. An
-arm has its six joints.
+World frame ENU and body frame FLU (REP 103), which this library uses too. In the message a
+quadrotor or a car is one joint with six degrees of freedom, whose linear and angular velocities are
+in the world frame. An arm has six joints.
 """
 
 import pkgutil
@@ -19,12 +19,13 @@ from planner_jax.robot.arm import ArmSetpoints
 from planner_jax.robot.car import CarSetpoints
 from planner_jax.robot.quadrotor import QuadrotorSetpoints
 
-Json = Any  # plain values, lists and dictionaries
+Json = Any  # plain numbers and texts, lists and dictionaries
 WORLD, BODY = "world", "base_link"
-JOINTS = [f"joint_{k}" for k in range(1, 7)]  # names in the ROS packages of the arm's maker
+JOINTS = [f"joint_{k}" for k in range(1, 7)]  # joint names in the ROS packages of the arm's maker
 BODIES, ARM = "trajectory_msgs/MultiDOFJointTrajectory", "trajectory_msgs/JointTrajectory"
 TOPICS = {BODIES: "/command/trajectory", ARM: "/joint_trajectory_controller/joint_trajectory"}
-# Fields of the two messages, and of all types in their fields.
+# By ROS message type, the types and names of its fields: both trajectory messages, and all types
+# that their fields use.
 TYPES = {
     BODIES: "std_msgs/Header header\nstring[] joint_names\n"
     "trajectory_msgs/MultiDOFJointTrajectoryPoint[] points",
@@ -44,7 +45,7 @@ TYPES = {
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
 }
-_NOW = {"sec": 0, "nanosec": 0}  # controllers start a trajectory with this stamp at once
+_NOW = {"sec": 0, "nanosec": 0}  # with this time stamp controllers start a trajectory at once
 
 
 def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
@@ -52,7 +53,7 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
 
     Args:
         plan: one solved plan of a quadrotor, a car or an arm.
-        rate: [Hz].
+        rate: [Hz], setpoints per second.
 
     Returns:
         `trajectory_msgs.msg.MultiDOFJointTrajectory` for a quadrotor or a car,
@@ -72,7 +73,7 @@ def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
 
 
 def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
-    """Return the type of the message, a key of `TYPES`, and its fields as plain values."""
+    """Convert a plan to the type of its ROS message, a key of `TYPES`, and the fields' values."""
     setpoints = setpoints_of(plan, rate)
     nanoseconds = np.round(setpoints.time * 1e9).astype(int).tolist()
     times = [dict(zip(("sec", "nanosec"), divmod(t, 10**9), strict=True)) for t in nanoseconds]
@@ -101,9 +102,9 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
 
 
 def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, ...]:
-    """Return position, quaternion x, y, z, w, velocity, angular velocity and acceleration.
+    """Return the motion of K setpoints as arrays (K, 3 or 4) in the world frame.
 
-    All are in the world frame. Setpoints have no angular accelerations.
+    They are position, quaternion (x, y, z, w), velocity, angular velocity and acceleration.
     """
     if isinstance(setpoints, QuadrotorSetpoints):
         quat = setpoints.quat_wxyz
@@ -124,12 +125,12 @@ def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, .
 
 
 def _vector(values: Sequence[float]) -> dict[str, float]:
-    """Return the components of a vector or a quaternion by name."""
+    """Convert a vector or a quaternion to a dictionary with the keys x, y, z and w."""
     return dict(zip("xyzw"[: len(values)], values, strict=True))
 
 
 def _make_message(kind: str, fields: Mapping[str, Json]) -> object:
-    """Make an object of the class of a ROS 2 type, with all fields set."""
+    """Make an object of the ROS 2 message class `kind`, and set its fields recursively."""
     package, name = kind.split("/")
     message = pkgutil.resolve_name(f"{package}.msg:{name}")()
     for line in TYPES[kind].splitlines():

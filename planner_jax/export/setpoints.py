@@ -1,6 +1,6 @@
-"""Content of every format: the setpoints of a plan, or its polynomials, up to its end.
+"""Setpoints and polynomials of a plan, which the writers of all export formats use.
 
-A recovery trajectory is part of the plan.
+They include the plan's recovery trajectory to standstill, if it has one.
 """
 
 import dataclasses
@@ -19,20 +19,21 @@ from planner_jax.robot.quadrotor import QuadrotorPlan, QuadrotorSetpoints
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 MOST = 100_000  # greatest number of setpoints of a plan
-DEFAULT_RATE = 100.0  # [Hz]
+DEFAULT_RATE = 100.0  # [Hz], setpoints per second
 
 Setpoints = QuadrotorSetpoints | CarSetpoints | ArmSetpoints
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """A robot whose plans can be exported."""
+    """A kind of robot (quadrotor, car or arm) whose plans can be exported."""
 
     name: str
-    plan: type[Plan]
-    shapes: Mapping[str, tuple[int | str, ...]]  # of leaves; equal letters are equal sizes
-    case_field: str  # a field that only the cases of this robot have
-    end: Callable[..., float]  # returns the end [s] of a plan
+    plan: type[Plan]  # class of the robot's plans
+    # Shapes of the plan's arrays by name. Axes with the same letter must have the same size.
+    shapes: Mapping[str, tuple[int | str, ...]]
+    case_field: str  # name of a field that only the cases of this robot have
+    end: Callable[..., float]  # function that returns the duration [s] of a plan
 
 
 ROBOTS = (
@@ -61,11 +62,11 @@ ROBOTS = (
 
 
 def robot_of(plan: Plan) -> Robot:
-    """Return the robot of one plan.
+    """Return the entry of `ROBOTS` for one plan, and check that the plan can be exported.
 
     Raises:
-        ArgumentError: the object is not a plan of a robot, is a batch, is not solved, has leaves of
-            a wrong shape, or takes no time.
+        ArgumentError: the object is not a plan of a robot, is a batch, is not solved, has arrays of
+            a wrong shape, or has no duration.
     """
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
@@ -86,7 +87,7 @@ def robot_of(plan: Plan) -> Robot:
 
 
 def _require_shapes(plan: Plan, robot: Robot) -> None:
-    """Raise unless the leaves of one plan have the shapes of its robot."""
+    """Raise `ArgumentError` unless the arrays of one plan have the shapes in `robot.shapes`."""
     sizes: dict[int | str, int] = {}
     leaves = leaves_by_name(plan)
     for name, expected in robot.shapes.items():
@@ -101,11 +102,11 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
-    """Return `plan.sample(rate)` of one plan.
+    """Return the setpoints `plan.sample(rate)` of one plan, after checks of plan and rate.
 
     Args:
-        plan: solved plan of a robot of `ROBOTS`.
-        rate: [Hz].
+        plan: solved plan of a quadrotor, a car or an arm.
+        rate: [Hz], setpoints per second.
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is
@@ -127,7 +128,7 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
 
 
 def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
-    """Return the polynomials of one plan, without pieces of zero duration.
+    """Return the polynomial pieces of one plan as NumPy arrays, without pieces of zero duration.
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite.
@@ -142,7 +143,9 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
 
 
 def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
-    """Load one plan from a file that `plan.save` wrote, without the fields that a task adds.
+    """Load one plan from a file that `plan.save` wrote.
+
+    The result is the plan of a robot, such as `CarPlan`, without the fields that a task adds.
 
     Args:
         path: path of the file.
@@ -150,7 +153,7 @@ def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
 
     Raises:
         PlanFileError: the file has no plans of a quadrotor, a car or an arm.
-        ArgumentError: there is no such row.
+        ArgumentError: the file has no plan with the index `row`.
     """
     plans: Plan = load_fitting(path, [robot.plan for robot in ROBOTS])
     shape = np.shape(plans.status)

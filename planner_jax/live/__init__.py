@@ -1,4 +1,7 @@
-"""A live loop for one robot: observations of a ball in, setpoints of a plan out, over UDP."""
+"""Live planning for one robot: it receives observations of a ball and answers with setpoints (UDP).
+
+A program sends packets with measured positions; the command `planner-jax serve` answers them.
+"""
 
 import lazy_loader
 

@@ -1,8 +1,9 @@
-"""Selection of packets: each is used once, in order, and by one clock of the senders.
+"""Checks which received packets live planning may use.
 
-All senders share a clock, with any offset to the clock of this process. A packet whose sending time
-disagrees with earlier packets is ignored. If no packet was used for a second, the senders' clock is
-taken to be reset, and earlier times are forgotten.
+A packet is used once, and only in the order of sending. All senders must use one common clock. Its
+offset to the clock of this process is arbitrary. A packet whose sending time disagrees with earlier
+packets by more than a second is ignored. If no packet has been used for a second, such a packet is
+accepted as the first packet of a new clock.
 """
 
 import math
@@ -10,25 +11,29 @@ from collections.abc import Hashable
 
 from planner_jax.live.packets import Fault, Packet
 
-LATE = 0.02  # [s] above the least delay, from which a packet counts as late
-_APART = 1.0  # [s], disagreement from which a time is of another clock
-_SILENCE = 1.0  # [s] without a used packet, after which another clock is accepted
-_DRIFT = 1e-4  # greatest relative drift between the clocks
-_SENDERS = 32  # greatest number of senders in memory
+LATE = 0.02  # [s], delay above the least observed delay from which a packet counts as late
+_APART = 1.0  # [s], disagreement above which a sending time counts as of another clock
+_SILENCE = 1.0  # [s], time without a used packet after which another clock is accepted
+_DRIFT = 1e-4  # greatest relative drift between the senders' clock and the receiver's clock
+_SENDERS = 32  # greatest number of senders whose newest packet is remembered
 
 
 class Arrivals:
-    """State of the selection, over the packets of all senders."""
+    """Sending times and sequence numbers of the used packets of all senders."""
 
     def __init__(self) -> None:
         self.newest = -math.inf  # [s], latest sending time, by the senders' clock
-        self.was_late = False  # the last packet was late
+        self.was_late = False  # whether the last packet was late
         self._least = math.nan  # [s], least difference of arrival time and sending time
-        self._used = -math.inf  # [s], arrival of the last used packet
-        self._senders: dict[Hashable, tuple[float, int]] = {}  # newest sending time and number
+        self._used = -math.inf  # [s], arrival time of the last used packet
+        # By sender: sending time [s] and sequence number of its newest packet.
+        self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Return the fault of a packet that arrives `now` [s], and whether the clock was reset."""
+        """Check a packet that arrives at the time `now` [s], and remember its sending time.
+
+        Returns the packet's fault, and whether it is the first packet of a new senders' clock.
+        """
         self.was_late = False
         if packet.fault:
             return packet.fault, False

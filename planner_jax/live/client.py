@@ -1,4 +1,7 @@
-"""Client of a live loop in Python; docs/live.md describes the packets for other languages."""
+"""Python client of the UDP server `planner-jax serve`.
+
+`docs/live.md` describes the packets, for clients in other languages.
+"""
 
 import socket
 import time
@@ -12,10 +15,10 @@ from planner_jax.live.settings import PORT
 
 
 class Client:
-    """Sends measurements, and waits for setpoints; a `with` block closes its socket.
+    """Sends measurements to the server, and waits for setpoints; use it in a `with` block.
 
     Args:
-        port: of the loop.
+        port: UDP port of the server on this machine.
         timeout: [s], longest wait for an answer.
     """
 
@@ -31,8 +34,9 @@ class Client:
 
         Args:
             pos: (3,) [m].
-            measured: [s], time of the observation by `time.monotonic()`; by default now.
-            number: identifies the ball, from 0 to 65535.
+            measured: [s], time of the observation by `time.monotonic()`; the default is the time of
+                this call.
+            number: number from 0 to 65535 that identifies the ball.
         """
         return self._send(BALL, measured, pos, number)
 
@@ -44,7 +48,10 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's position [m], velocity [m/s], acceleration [m/s^2]; see `ball`."""
+        """Send the robot's state; return the answer, or None after the timeout.
+
+        Position [m], velocity [m/s] and acceleration [m/s^2] are (3,). For `measured` see `ball`.
+        """
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

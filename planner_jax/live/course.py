@@ -1,4 +1,8 @@
-"""The robot's course: a plan and its recovery trajectory, or a recovery trajectory alone."""
+"""The course of a robot in live planning: the trajectory that it follows until standstill.
+
+A course is a plan that meets the ball and then a recovery trajectory, which ends at standstill; or
+it is a recovery trajectory alone.
+"""
 
 from typing import Any
 
@@ -22,14 +26,17 @@ _REST = RecoveryPlanner()
 
 @struct.dataclass
 class Course:
-    """A trajectory that ends at standstill, where the robot then stays. NumPy leaves."""
+    """A trajectory to standstill, at whose end the robot stays. The leaves are NumPy arrays."""
 
     path: PiecewisePolynomial  # M pieces of a plan, then the pieces of the recovery trajectory
-    gravity: Array  # () [m/s^2]
+    gravity: Array  # () [m/s^2], magnitude
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Return the course of a plan whose recovery trajectory is not planned yet."""
+    """Make the course of a plan whose trajectory to standstill has not been planned.
+
+    Pieces of zero duration at the plan's end take the place of the recovery trajectory.
+    """
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,9 +44,9 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan the recovery from the end of a trajectory of M pieces, with NumPy leaves.
+    """Plan a recovery trajectory, which ends at standstill, from the end of a plan's trajectory.
 
-    Returns the course of both, and whether the recovery keeps the limits.
+    Returns the course of both trajectories, and whether the recovery trajectory keeps the limits.
     """
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
@@ -50,14 +57,18 @@ def with_recovery(
 def recovery_from(
     state: Float[np.ndarray, "4 3"], pieces: int, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan the recovery from a state, behind M pieces of zero duration."""
+    """Plan a trajectory from a state (position to jerk) to standstill; return it as a course.
+
+    The course starts with `pieces` pieces of zero duration instead of a plan, so that all courses
+    have arrays of the same shape. The second result is whether the limits hold.
+    """
     path = _stand_still(pieces, state[0])
     path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])
     return with_recovery(path, gravity, limits)
 
 
 def _stand_still(pieces: int, pos: np.ndarray) -> PiecewisePolynomial:
-    """Return pieces of zero duration at a position (3,)."""
+    """Return `pieces` polynomial pieces of zero duration at a position (3,) [m]."""
     coeffs: Any = np.zeros((pieces, 8, 3), np.float32)
     durations: Any = np.zeros(pieces, np.float32)
     coeffs[:, 0] = pos
@@ -70,15 +81,18 @@ def _join(path: PiecewisePolynomial, other: PiecewisePolynomial) -> PiecewisePol
 
 @struct.dataclass
 class Query:
-    """A course, and the times of setpoints."""
+    """A request for setpoints: a course, and the times at which it is sampled."""
 
     course: Course
-    elapsed: Array  # () [s], from the start of the course to the first setpoint
-    period: Array  # () [s], between setpoints
+    elapsed: Array  # () [s], time from the start of the course to the first setpoint
+    period: Array  # () [s], time between setpoints
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample K setpoints of a course, with the columns of `packets.FIELDS`; pure."""
+    """Sample K = `num` setpoints of a course, with the columns of `packets.FIELDS`.
+
+    After the end of the course the quadrotor hovers. The function is pure.
+    """
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)
@@ -96,7 +110,10 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration and jerk at a time [s] of a course, on the host."""
+    """Return position, velocity, acceleration and jerk in a course after `elapsed` [s], in NumPy.
+
+    After the end of the course the robot stands still.
+    """
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:
@@ -105,5 +122,5 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 
 
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration and jerk at a time [s] of a trajectory."""
+    """Return position, velocity, acceleration and jerk in a trajectory after `elapsed` [s]."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)

@@ -1,7 +1,8 @@
-"""The packets of a live loop: little-endian, packed, with a version; `docs/live.md` has the table.
+"""Packet format of live planning (`planner-jax serve`): little-endian, packed, with a version.
 
-A request is a header and a body, either an observation of a ball or a state of the robot. An answer
-is a header, which repeats ball, number and time of the request, a description, and K setpoints.
+A request has a header, and either an observation of a ball or a state of the robot. An answer has a
+header that repeats the request's ball, sequence number and time. Then follow a description and K
+setpoints. `docs/live.md` has a table of all fields.
 """
 
 import dataclasses
@@ -11,24 +12,26 @@ import struct
 
 import numpy as np
 
-MAGIC, VERSION = b"PJLV", 1
-BALL, ROBOT, ANSWER = 1, 2, 129
-MOST_SETPOINTS = 17  # fit an Ethernet frame
-LONGEST = 2048  # [bytes], read from a packet
-FARTHEST = 1e4  # greatest magnitude of a value, in SI units
-OLDEST = 1.0  # [s], greatest age of a measurement
+MAGIC, VERSION = b"PJLV", 1  # first bytes of every packet, and version of the format
+BALL, ROBOT, ANSWER = 1, 2, 129  # kinds of packets
+MOST_SETPOINTS = 17  # greatest number of setpoints that fit an Ethernet frame
+LONGEST = 2048  # [bytes], greatest number of bytes read from a packet
+FARTHEST = 1e4  # greatest accepted magnitude of a measured value, in SI units
+OLDEST = 1.0  # [s], greatest accepted age of a measurement when it is sent
 
 _HEADER = struct.Struct("<4sBBHId")  # magic, version, kind, ball, sequence, time sent
 _MEASURED = struct.Struct("<d")  # time of the measurement
 _VALUES = {BALL: struct.Struct("<3d"), ROBOT: struct.Struct("<9d")}
 _SIZES = {kind: _HEADER.size + 8 + body.size for kind, body in _VALUES.items()}
-_ANSWERED = struct.Struct("<BBBxddd")  # motion, fault, K, time of the first, period, contact
+# Description in an answer: motion, fault, number K of setpoints, time of the first setpoint, period
+# between setpoints, time of the contact.
+_ANSWERED = struct.Struct("<BBBxddd")
 FIELDS = {"pos": 3, "vel": 3, "acc": 3, "jerk": 3, "quat_wxyz": 4, "body_rate": 3, "thrust": 1}
 WIDTH = sum(FIELDS.values())
 
 
 class Fault(enum.IntEnum):
-    """The fault of a packet, which is then not used."""
+    """Reason why a packet is not used; `NONE` for a packet that is used."""
 
     NONE = 0
     STRANGE = 1
@@ -45,11 +48,12 @@ class Fault(enum.IntEnum):
 
     @property
     def words(self) -> str:
-        """Name of the fault in the report."""
+        """Name of the fault as the report prints it, in lower case with spaces."""
         return self.name.lower().replace("_", " ")
 
 
-# Faults without a readable header, so without an answer, and the predicate of the warning.
+# Faults of packets that get no answer, since their header cannot be read. The texts complete the
+# warning "a packet from ADDRESS ...".
 SILENT = {
     Fault.STRANGE: f"does not begin with {MAGIC.decode()}",
     Fault.CUT: "has another length than its kind",
@@ -59,22 +63,22 @@ SILENT = {
 
 
 class Motion(enum.IntEnum):
-    """The trajectory of the setpoints in an answer."""
+    """Kind of trajectory from which the setpoints in an answer are sampled."""
 
     NONE = 0  # no setpoints, since no state of the robot has arrived
-    SAFE = 1  # a recovery trajectory, or standstill
-    PLAN = 2  # a plan, with its recovery trajectory
+    SAFE = 1  # a trajectory to standstill, or standstill
+    PLAN = 2  # a plan that meets the ball, followed by a trajectory to standstill
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Packet:
-    """A readable request."""
+    """A request whose header and length are valid."""
 
     kind: int  # BALL or ROBOT
-    ball: int  # number of the ball
-    sequence: int
-    sent: float  # [s], by the sender's clock
-    measured: float  # [s], by the sender's clock
+    ball: int  # number that identifies the ball
+    sequence: int  # number of the packet, counted by its sender
+    sent: float  # [s], time of sending by the sender's clock
+    measured: float  # [s], time of the measurement by the sender's clock
     values: tuple[float, ...]  # position (3); for a robot also velocity (3), acceleration (3)
     fault: Fault = Fault.NONE
 
@@ -83,13 +87,13 @@ class Packet:
 class Answer:
     """The answer to a request, with K setpoints."""
 
-    sequence: int  # of the request
-    sent: float  # [s], of the request
+    sequence: int  # sequence number of the request
+    sent: float  # [s], time at which the request was sent, by the sender's clock
     motion: Motion
-    fault: Fault  # of the request
-    begin: float  # [s], sender's clock, time of the first setpoint
-    period: float  # [s], between setpoints
-    contact: float  # [s], sender's clock, time of the contact with the ball; NaN without a plan
+    fault: Fault  # fault of the request
+    begin: float  # [s], time of the first setpoint, by the sender's clock
+    period: float  # [s], time between setpoints
+    contact: float  # [s], time of the contact with the ball, sender's clock; NaN without a plan
     setpoints: np.ndarray  # (K, 20), the columns of `FIELDS`
 
     def column(self, name: str) -> np.ndarray:
@@ -102,13 +106,16 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Return the packet of an observed ball, or of a robot's state."""
+    """Encode the request that reports an observed ball or a state of the robot.
+
+    Times are in [s] by the sender's clock, and `values` are the fields of `Packet.values`.
+    """
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 
 
 def read_request(data: bytes) -> Packet | Fault:
-    """Return the content of a packet, or the fault of an unreadable one."""
+    """Decode and check a request; return its content, or the fault if it is not readable."""
     if data[:4] != MAGIC:
         return Fault.STRANGE
     if len(data) < _HEADER.size:
@@ -137,16 +144,16 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """Return the packet of an answer with setpoints (K, 20) float32.
+    """Encode the answer to a request, with setpoints (K, 20) float32.
 
-    `times` are `begin`, `period` and `contact` of `Answer` [s].
+    `times` has the values [s] of `begin`, `period` and `contact` of `Answer`.
     """
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 
 
 def read_answer(data: bytes) -> Answer | None:
-    """Return the content of an answer, or None for any other packet."""
+    """Decode the packet of an answer; return None if the packet is not an answer."""
     first = _HEADER.size + _ANSWERED.size
     if len(data) < first or data[:4] != MAGIC:
         return None

@@ -1,8 +1,10 @@
-"""The live loop without its socket: from packets to setpoints.
+"""Live planning without the socket: a packet with a measurement in, a packet with setpoints out.
 
-The robot always follows a course: at first the recovery trajectory from its first state, then plans
-with recovery trajectories. An answer holds the next setpoints of the course. Planning runs in a
-thread of its own, and an answer waits for its result for a share of the deadline.
+The robot always follows a course, a trajectory that ends at standstill. The first course leads from
+the robot's first reported state to standstill. Later courses are plans that meet the ball, each
+followed by a recovery trajectory to standstill. An answer has the next setpoints of the course.
+Planning runs in a separate thread, and an answer waits for a new plan only for a fraction of the
+deadline.
 """
 
 import concurrent.futures
@@ -44,31 +46,33 @@ from planner_jax.live.sight import Sight
 from planner_jax.live.strokes import CaseT, PlanT, Stroke
 from planner_jax.planning.programs import call_packed
 
-_PATIENCE = 0.2  # share of the deadline for which an answer waits for a plan
-_ASTRAY = 0.5  # [m], distance between robot and course above which a new course starts
-_JOIN = (0.02, 0.2)  # [m, m/s], greatest difference between a late plan and the course
+_PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
+_ASTRAY = 0.5  # [m], distance of the robot from its course above which a new course starts
+# [m] and [m/s] Greatest difference in position and velocity between a plan that was found too late
+# for its start and the current course.
+_JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
 _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Flight(Generic[PlanT]):
-    """A course and its plan, if any. Times are of the senders' clock."""
+    """A course of the robot, and the plan that it follows. Times are of the senders' clock."""
 
     course: Course
-    start: float  # [s]
-    plan: PlanT | None = None
-    contact: float = math.nan  # [s]
-    ball: int = -1
+    start: float  # [s], time at which the course starts
+    plan: PlanT | None = None  # None if the course only leads to standstill
+    contact: float = math.nan  # [s], time at which the plan meets the ball
+    ball: int = -1  # number of the ball that the plan meets
 
 
 @dataclasses.dataclass(frozen=True)
 class _Job(Generic[PlanT]):
-    """A search for a plan."""
+    """A search for a plan, which runs in the planning thread."""
 
     found: concurrent.futures.Future[_Flight[PlanT] | None]
-    start: float  # [s], of the plan
-    ball: int
+    start: float  # [s], time at which the plan starts, by the senders' clock
+    ball: int  # number of the ball that the plan meets
 
 
 class LivePlanner(Generic[CaseT, PlanT]):
@@ -76,9 +80,9 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     Args:
         stroke: the task, such as `HitStroke()`.
-        rate: [Hz], of the setpoints in an answer.
-        horizon: K, number of setpoints in an answer.
-        deadline: [s], from a packet to its answer.
+        rate: [Hz], rate of the setpoints in an answer.
+        horizon: number K of setpoints in an answer.
+        deadline: [s], longest time from the arrival of a packet to its answer.
         noise: [m], standard deviation of an observed coordinate of a ball.
     """
 
@@ -105,11 +109,13 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._forget()
 
     def _forget(self) -> None:
-        """Forget robot and ball."""
+        """Delete the robot's course, the search for a plan and the ball's estimate."""
         self._flight: _Flight[PlanT] | None = None
-        self._before: _Flight[PlanT] | None = None  # continued if the flight has no recovery
+        # Course before the current plan, to which the robot returns if the plan has no recovery
+        # trajectory within the limits.
+        self._before: _Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
-        self._done = -1  # number of the last ball of a completed contact
+        self._done = -1  # number of the last ball that the robot met
         self._sight.forget()
 
     def close(self) -> None:
@@ -118,7 +124,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.end()
 
     def warm_up(self) -> None:
-        """Compile all programs, and start the report."""
+        """Compile all programs by planning for an invented ball, and start the report."""
         state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
         ball = None
@@ -132,7 +138,11 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.begin()
 
     def answer(self, data: bytes, sender: Hashable, received: float) -> bytes | None:
-        """Return the answer to a packet, or None; `received` [s] is by `time.perf_counter()`."""
+        """Use the measurement in a packet, and return the packet of the answer.
+
+        Returns None if the packet cannot be read. The arrival time `received` [s] is measured by
+        `time.perf_counter()`.
+        """
         self._complete()
         report = self.report
         report.counts["packets"] += 1
@@ -146,7 +156,8 @@ class LivePlanner(Generic[CaseT, PlanT]):
             report.counts["clocks"] += 1
             self._forget()
         report.stages["read"].add(time.perf_counter() - received)
-        due = self._arrivals.newest  # also if a newer packet has arrived before this one
+        # The answer's setpoints start at the latest sending time of all packets.
+        due = self._arrivals.newest
         if fault is Fault.NONE:
             use = self._use_ball if packet.kind == BALL else self._use_robot
             fault = use(packet, due, received)
@@ -161,7 +172,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Count an answer that was sent, and then plan the recovery if it is missing."""
+        """Count an answer that was sent, and complete the current plan's course (`_complete`)."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
@@ -170,7 +181,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self.report.stages["ball"].add(taken)
         self._complete()
 
-    # The robot.
+    # Packets with a state of the robot.
 
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
@@ -193,7 +204,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.counts["hard_rests"] += not is_within
         return _Flight(course, start)
 
-    # The ball.
+    # Packets with an observation of the ball.
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         before = self._sight.number
@@ -224,7 +235,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Search for a flight that starts at time `due`, in the planning thread."""
+        """Search for a plan that starts at the time `due`; runs in the planning thread.
+
+        A plan for the same ball is improved first. If that fails, planning starts from scratch.
+        """
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
@@ -244,7 +258,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
-        """Switch to the plan that the thread has found, if it is close to the course."""
+        """Switch to the plan that the planning thread has found, if the robot can still join it."""
         flight, job = self._flight, self._job
         if flight is not None and flight.plan is not None and due >= flight.contact:
             self._done = flight.ball
@@ -264,9 +278,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery of the current plan; without one, return to the previous course.
+        """Plan the recovery trajectory, from the current plan's end to standstill.
 
-        This is deferred until an answer has been sent or needs it.
+        If no recovery trajectory keeps the limits, return to the previous course. This is done
+        after an answer is sent, or before if the answer's setpoints reach beyond the contact.
         """
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
@@ -282,7 +297,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         old, new = (state_of(each.course, due - each.start) for each in (flight, found))
         return all(math.dist(old[k], new[k]) <= _JOIN[k] for k in range(2))
 
-    # The answer.
+    # Packets of answers.
 
     def _pack(self, packet: Packet, fault: Fault, due: float) -> bytes:
         flight = self._flight
@@ -294,7 +309,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return answer(packet, fault, motion, times, self._setpoints(flight, due))
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
-        """Return the setpoints (K, 20) from time `due`."""
+        """Sample the K setpoints (K, 20) of a flight's course from the time `due` [s] on."""
         times: Any = np.float32(due - flight.start), np.float32(self._period)
         query = Query(flight.course, *times)
         return call_packed(setpoints_of, self._num, None, query)

@@ -1,4 +1,7 @@
-"""Counts and times of a live loop, in constant memory."""
+"""Statistics of live planning (`planner-jax serve`): counts and computing times.
+
+They need constant memory, so that the program can run for days.
+"""
 
 import collections
 import contextlib
@@ -12,34 +15,37 @@ import numpy as np
 from planner_jax.host.machine import format_size, resident_memory
 from planner_jax.live.packets import Fault
 
-_SHORTEST = 1e-6  # [s]
-_STEP = 0.01  # relative width of a bin of times
-_CLASSES = math.ceil(math.log(100.0 / _SHORTEST) / _STEP)
-_COMPILING = "/jax/core/compile/"  # prefix of JAX's events
+_SHORTEST = 1e-6  # [s], lower end of the histogram of times
+_STEP = 0.01  # relative width of a bin of the histogram
+_CLASSES = math.ceil(math.log(100.0 / _SHORTEST) / _STEP)  # number of bins, up to 100 s
+_COMPILING = "/jax/core/compile/"  # prefix of the events that JAX reports when it compiles
 
 
 class Latencies:
-    """Histogram of times [s], with bins 1 % wide from 1 us to 100 s."""
+    """Histogram of computing times [s], with bins 1 % wide from 1 us to 100 s."""
 
     def __init__(self) -> None:
         self._counts = np.zeros(_CLASSES, np.int64)
         self.num, self.longest = 0, 0.0
 
     def add(self, seconds: float) -> None:
-        """Count one time."""
+        """Add one time [s] to the histogram."""
         index = int(math.log(max(seconds, _SHORTEST) / _SHORTEST) / _STEP)
         self._counts[min(index, _CLASSES - 1)] += 1
         self.num, self.longest = self.num + 1, max(self.longest, seconds)
 
     @contextlib.contextmanager
     def measure(self) -> Iterator[None]:
-        """Count the time of a `with` block."""
+        """Measure the duration of a `with` block, and add it to the histogram."""
         start = time.perf_counter()
         yield
         self.add(time.perf_counter() - start)
 
     def quantile(self, share: float) -> float:
-        """Return a quantile of the times [s], to 1 %; NaN without times."""
+        """Return the time [s] that a fraction `share` of the times do not exceed, to 1 %.
+
+        The result is NaN if the histogram is empty.
+        """
         if not self.num:
             return math.nan
         index = int(np.searchsorted(np.cumsum(self._counts), share * self.num))
@@ -47,7 +53,7 @@ class Latencies:
 
 
 class Report:
-    """Counts by name, times by stage, memory, and the number of compilations after the start."""
+    """Report of a run of live planning: counts of packets and plans, times and memory."""
 
     STAGES = {
         "read": "packet read and checked",
@@ -65,12 +71,12 @@ class Report:
         self.counts: collections.Counter[str] = collections.Counter()
         self.faults: collections.Counter[Fault] = collections.Counter()
         self.stages = {name: Latencies() for name in self.STAGES}
-        self.tracking = 0.0  # [m], greatest distance between robot and course
-        self.compiled = 0
+        self.tracking = 0.0  # [m], greatest distance of the robot from its planned position
+        self.compiled = 0  # number of compilations after the start
         self._memory: int | None = None
 
     def begin(self) -> None:
-        """Start to count compilations, and record the memory."""
+        """Start to count JAX's compilations, and record the memory that the process uses."""
         self._memory = resident_memory()
         jax.monitoring.register_event_duration_secs_listener(self._count_compiled)
 
@@ -82,7 +88,7 @@ class Report:
         self.compiled += event.startswith(_COMPILING)
 
     def headline(self) -> str:
-        """Return the report in one line."""
+        """Summarise packets, answers and response times in one line."""
         ball = self.stages["ball"]
         p50, p99 = 1e3 * ball.quantile(0.5), 1e3 * ball.quantile(0.99)
         times = f"from a ball observed to setpoints p50 {p50:.2f} ms, p99 {p99:.2f} ms"
@@ -93,7 +99,7 @@ class Report:
         )
 
     def lines(self) -> list[str]:
-        """Return the lines of the whole report."""
+        """Format the whole report as lines of text: counts, faults, times, memory."""
         lines = [self.headline(), ""]
         lines += [f"{self.counts[name]:>9,}  {words}" for name, words in COUNTS.items()]
         lines += [

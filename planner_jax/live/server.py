@@ -1,4 +1,4 @@
-"""The UDP socket of a live loop on localhost, for one robot."""
+"""UDP server of live planning: it receives packets on localhost and sends the planner's answers."""
 
 import contextlib
 import socket
@@ -19,14 +19,14 @@ _STAMPS, _STAMP = 35, struct.Struct("@ll")
 
 
 class Server:
-    """A socket whose packets a planner answers.
+    """A UDP socket on localhost, and the planner that answers its packets.
 
     Args:
-        planner: answers the packets.
-        port: 0 for a free one.
+        planner: planner that computes the answers.
+        port: number of the UDP port; 0 selects a free port.
 
     Raises:
-        OSError: the port is not available; `filename` names the port.
+        OSError: the port is not available; the exception's `filename` names the port.
     """
 
     def __init__(self, planner: LivePlanner, port: int) -> None:
@@ -43,7 +43,7 @@ class Server:
         self.port: int = self._socket.getsockname()[1]
 
     def warm_up(self) -> None:
-        """Compile all programs, and drop packets that arrive meanwhile."""
+        """Compile all of the planner's programs, and discard packets that arrive meanwhile."""
         self.planner.warm_up()
         self._socket.setblocking(False)
         with contextlib.suppress(BlockingIOError):
@@ -60,7 +60,8 @@ class Server:
     def _receive(self) -> tuple[bytes, tuple[str, int], float]:
         """Return the next packet, its sender, and its arrival time by `time.perf_counter()`.
 
-        The packet may have arrived earlier than this call, during another answer.
+        The packet may have arrived before this call, while the server was computing an answer. The
+        arrival time is therefore computed from the time stamp of the operating system.
         """
         data, others, _, sender = self._socket.recvmsg(LONGEST, socket.CMSG_SPACE(_STAMP.size))
         now, received = time.time(), time.perf_counter()
@@ -83,7 +84,7 @@ class Server:
         self.planner.record_sent(data, received)
 
     def _warn(self, data: bytes, sender: tuple[str, int]) -> None:
-        """Print the fault of a packet without an answer, once for each fault."""
+        """Print a warning about a packet that cannot be read, once for each kind of fault."""
         fault = read_request(data)
         assert isinstance(fault, Fault)
         if fault in self._reported:
@@ -97,14 +98,15 @@ class Server:
         )
 
     def close(self) -> None:
-        """Release the port, and end the planner's thread."""
+        """Close the socket, and end the planner's thread."""
         self._socket.close()
         self.planner.close()
 
 
 def compute_in_place() -> None:
-    """Let JAX compute on the CPU in the calling thread; call this before any computation.
+    """Let JAX run CPU computations in the calling thread; call this before any computation.
 
-    Dispatching a small computation to another thread takes longer than the computation.
+    By default JAX dispatches a computation to another thread. For the small computations of live
+    planning the dispatch takes longer than the computation.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -1,4 +1,4 @@
-"""Settings of `planner-jax serve`, checked before JAX is imported."""
+"""Options of the command `planner-jax serve`, checked before the slow import of JAX."""
 
 import dataclasses
 from typing import TYPE_CHECKING, Any
@@ -11,17 +11,17 @@ from planner_jax.task.hit.spec import DRAG
 if TYPE_CHECKING:
     from planner_jax.live.strokes import CatchStroke, HitStroke, Stroke
 
-PORT = 5560
+PORT = 5560  # default UDP port of the server
 
 
 @dataclasses.dataclass(frozen=True)
 class ServeSettings:
-    """Settings of any task; an invalid value raises `ArgumentError`."""
+    """Options of `planner-jax serve` for any task; an invalid value raises `ArgumentError`."""
 
-    port: int = option(PORT, "N", "UDP port of this machine, 0 takes a free one")
-    rate: float = option(100.0, "HZ", "of the setpoints in an answer")
-    horizon: int = option(10, "K", "setpoints in an answer")
-    deadline: float = option(0.01, "S", "from a packet to its answer [s]")
+    port: int = option(PORT, "N", "UDP port of this machine; 0 selects a free port")
+    rate: float = option(100.0, "HZ", "rate of the setpoints in an answer [Hz]")
+    horizon: int = option(10, "K", "number of setpoints in an answer")
+    deadline: float = option(0.01, "S", "longest time from a packet to its answer [s]")
     noise: float = option(0.005, "M", "standard deviation of an observed coordinate [m]")
     seconds: float | None = option(None, "S", "end after this time (default: never)")
     report: bool = option(False, "", "print counts, times and memory at the end")
@@ -38,17 +38,17 @@ class ServeSettings:
             require(0.0 < self.seconds <= 1e7, "seconds", "> 0 and at most 1e7", self.seconds)
 
     def stroke(self) -> "Stroke":
-        """Return the task of the loop."""
+        """Make the task that the server plans, such as a `HitStroke`."""
         raise NotImplementedError
 
 
 @dataclasses.dataclass(frozen=True)
 class HitServe(ServeSettings):
-    """Settings of hits."""
+    """Options of `planner-jax serve hit`, which returns balls with a racket."""
 
     robot: Any = robot_option("paper-hitter")
-    target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "landing position of the ball")
-    drag: float = option(DRAG, "K", "K_D of the ball [1/m]")
+    target: tuple[float, ...] = option((3.0, 0.0, 0.0), "M", "landing position of the ball [m]")
+    drag: float = option(DRAG, "K", "quadratic drag K_D of the ball [1/m]")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,7 +59,7 @@ class HitServe(ServeSettings):
         require(0.0 <= self.drag <= 1.0, "drag", "from 0 to 1", self.drag)
 
     def stroke(self) -> "HitStroke":
-        """Return a hit to the target."""
+        """Make the task to hit balls to the target with this robot and drag."""
         from planner_jax.live.strokes import HitStroke
         from planner_jax.robot.quadrotor_model import PAPER_HITTER
 
@@ -68,10 +68,10 @@ class HitServe(ServeSettings):
 
 @dataclasses.dataclass(frozen=True)
 class CatchServe(ServeSettings):
-    """Settings of catches."""
+    """Options of `planner-jax serve catch`, which catches balls with a net."""
 
     robot: Any = robot_option("paper-catcher")
-    drag: float = option(0.5, "K", "of the ball [1/s]")
+    drag: float = option(0.5, "K", "linear drag of the ball [1/s]")
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -79,7 +79,7 @@ class CatchServe(ServeSettings):
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
     def stroke(self) -> "CatchStroke":
-        """Return the `CatchStroke` that plans catches with this robot and drag."""
+        """Make the task to catch balls with this robot and drag."""
         from planner_jax.live.strokes import CatchStroke
         from planner_jax.robot.quadrotor_model import PAPER_CATCHER
 

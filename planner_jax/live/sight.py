@@ -1,4 +1,7 @@
-"""A Kalman filter of one ball, which rejects outliers and is reset for another ball."""
+"""Estimate of one observed ball for live planning: a Kalman filter that rejects outliers.
+
+The filter starts anew if another ball is observed.
+"""
 
 import math
 from typing import Any
@@ -21,36 +24,37 @@ from planner_jax.ball.flight import BallState
 from planner_jax.live.packets import Fault
 from planner_jax.planning.programs import call_packed
 
-_SPREAD = 15.0  # [m/s], standard deviation of the velocity at the first observation
-_DENSITY = 0.01  # [m^2/s^3], power density of accelerations that the flight model omits
-_GATE = 5.0  # standard deviations from the prediction, above which an observation is an outlier
-_OTHERS = 5  # consecutive outliers that count as another ball
-_FORGOTTEN = 0.3  # [s] without an observation, after which the next one is of another ball
-_LEAST = 3  # observations that a known velocity needs
+_SPREAD = 15.0  # [m/s], assumed standard deviation of the velocity at the first observation
+_DENSITY = 0.01  # [m^2/s^3], power spectral density of accelerations not in the flight model
+# An observation is an outlier above this Mahalanobis distance [-] from the prediction.
+_GATE = 5.0
+_OTHERS = 5  # number of consecutive outliers after which the filter starts anew
+_FORGOTTEN = 0.3  # [s], time without an observation after which the filter starts anew
+_LEAST = 3  # least number of observations before the velocity counts as known
 
 
 @struct.dataclass
 class Observation:
-    """Input of one step of the filter."""
+    """Input of one step of the filter: the belief before an observation, and the observation."""
 
     belief: EkfState
-    since: Array  # () [s], from the belief to the observation
-    pos: Array  # (3,) [m]
-    ahead: Array  # () [s], from the observation to the prediction
+    since: Array  # () [s], time from the belief to the observation
+    pos: Array  # (3,) [m], observed position
+    ahead: Array  # () [s], time from the observation to the requested prediction
 
 
 @struct.dataclass
 class Estimate:
-    """Output of one step of the filter."""
+    """Output of one step of the filter: the belief after an observation, and a prediction."""
 
     belief: EkfState
-    is_outlier: Array  # () bool, the observation is not used
-    spread: Array  # () [m/s], greatest standard deviation of the velocity
-    ball: BallState  # at the time of the prediction
+    is_outlier: Array  # () bool, whether the observation was rejected
+    spread: Array  # () [m/s], greatest standard deviation of a velocity component
+    ball: BallState  # predicted ball
 
 
 def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
-    """Update the belief with an observation, and predict the ball; pure."""
+    """Update the belief with an observation, and predict the ball; the function is pure."""
     belief = ekf_predict(seen.belief, seen.since, model, flight=flight)
     away = seen.pos - belief.mean[:3]
     noise = jnp.diag(jnp.ones(3, away.dtype) * model.observation_std**2)
@@ -63,12 +67,12 @@ def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
 
 
 class Sight:
-    """The estimate of one ball.
+    """Estimate of position and velocity of one ball from its observed positions.
 
     Args:
-        flight: function that predicts the ball.
-        drag: argument of `flight`.
-        gravity: [m/s^2].
+        flight: flight model (ball, duration, drag, gravity) -> ball.
+        drag: the drag in the unit that `flight` expects.
+        gravity: [m/s^2], magnitude.
         noise: [m], standard deviation of an observed coordinate.
     """
 
@@ -79,15 +83,15 @@ class Sight:
         self.forget()
 
     def forget(self) -> None:
-        """Expect another ball."""
+        """Delete the estimate; the next observation starts a new one."""
         self._belief: EkfState | None = None  # NumPy leaves
         self.number: int | None = None
-        self.spread = math.inf  # [m/s], of the velocity
+        self.spread = math.inf  # [m/s], greatest standard deviation of a velocity component
         self._time = -math.inf
         self._num = self._outliers = 0
 
     def is_known(self, spread: float) -> bool:
-        """Test whether the standard deviation of the velocity is at most `spread` [m/s]."""
+        """Test whether the velocity's standard deviation is at most `spread` [m/s] on each axis."""
         return self._num >= _LEAST and self.spread <= spread
 
     def see(
@@ -96,10 +100,10 @@ class Sight:
         """Update the estimate; return the predicted ball, and the fault of the observation.
 
         Args:
-            number: of the ball.
-            pos: (3,) [m].
+            number: number that identifies the ball.
+            pos: (3,) [m], observed position.
             measured: [s], time of the observation.
-            until: [s], time of the prediction.
+            until: [s], time of the requested prediction.
 
         Returns:
             The ball with NumPy leaves (3,), or None at the first observation and after a fault.

@@ -1,6 +1,8 @@
-"""The tasks of a live loop: to hit or to catch the observed ball.
+"""The tasks of live planning (`planner-jax serve`): to hit or to catch the observed ball.
 
-A plan is one compiled call of a single optimisation round: the next call continues from its result.
+Each class plans from scratch, or improves the previous plan with the newest estimate of the ball.
+To save time, a plan is a single attempt of the optimiser, in one compiled call. The next call
+continues from its result.
 """
 
 import abc
@@ -38,14 +40,14 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import DRAG as HIT_DRAG
 from planner_jax.trajectory.polynomial import evaluate
 
-CATCH_DRAG = 0.5  # [1/s], of the suite `throws`
-TARGET = (3.0, 0.0, 0.0)  # [m], landing position of a hit ball
-_BISECTIONS = 24
+CATCH_DRAG = 0.5  # [1/s], drag of the balls in the suite of cases `throws`
+TARGET = (3.0, 0.0, 0.0)  # [m], default landing position of a hit ball
+_BISECTIONS = 24  # number of bisections in the search for the latest time of a catch
 _LONGEST = 4.0  # [s], latest time of a catch
-# Share of the robot's limits that a plan may use. A plan that uses them fully often has no recovery
-# trajectory within the limits, and cannot be flown.
+# Fraction of the robot's limits that a plan may use. From a plan that uses its limits fully there
+# is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
-# Round of the re-planners.
+# Starts and solver for planning again: two L-BFGS steps from the previous plan.
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
@@ -53,9 +55,9 @@ PlanT = TypeVar("PlanT", HitPlan, CatchPlan)
 
 
 class Stroke(abc.ABC, Generic[CaseT, PlanT]):
-    """A task of a live loop. Cases and plans have NumPy leaves."""
+    """Base class of the tasks of live planning. Cases and plans have NumPy leaves."""
 
-    shortest: ClassVar[float]  # [s] before the contact, when re-planning ends
+    shortest: ClassVar[float]  # [s], time before the contact with the ball at which planning ends
 
     def __init__(
         self,
@@ -71,30 +73,36 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners
         self._solve_first, self._solve_again = solvers  # functions of round, planner and case
-        self.pieces = self._planner.num_pieces  # of a plan's trajectory
+        self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 
     def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
-        """Plan from scratch."""
+        """Plan from scratch for a ball, from the robot's state: position to jerk at time 0."""
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
     def again(self, plan: PlanT, elapsed: float, ball: BallState) -> PlanT:
-        """Plan again from the state of the robot in a plan, some time [s] after its start."""
+        """Plan again for a newer estimate of the ball, with `plan` as the first guess.
+
+        The new plan starts at the state in `plan` after the time `elapsed` [s].
+        """
         since: Any = np.float32(elapsed)
         task = Replanning(self._with_ball(ball), plan, since)
         return call_packed(self._solve_again, _AGAIN, self._replanner, task)
 
     @abc.abstractmethod
     def contact(self, plan: PlanT) -> float:
-        """Return the time [s] at which a plan meets the ball."""
+        """Return the time [s], from the plan's start, at which the robot meets the ball."""
 
     @abc.abstractmethod
     def _with_ball(self, ball: BallState) -> CaseT:
-        """Return the case of an observed ball."""
+        """Return the case of this task with an estimated ball at time 0."""
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return the state (4, 3), position to jerk, of the previous plan at the elapsed time."""
+    """Return position, velocity, acceleration and jerk (4, 3) in the previous plan when it is left.
+
+    This time is `task.elapsed` [s] after the previous plan's start.
+    """
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
@@ -109,12 +117,12 @@ def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> HitPlan:
 
 
 class HitStroke(Stroke[HitCase, HitPlan]):
-    """One hit of the ball to a target.
+    """The task to hit one ball so that it lands at a target.
 
     Args:
-        robot: with a racket.
-        target: (3,) [m].
-        drag: K_D [1/m] of the ball.
+        robot: quadrotor with a racket.
+        target: (3,) [m], desired landing point.
+        drag: K_D [1/m], quadratic drag of the ball.
     """
 
     shortest = 0.2
@@ -140,10 +148,13 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until the ball is too low for an upright net; 0 if it is."""
+    """Return the time (1,) [s] until the ball is too low for an upright net.
+
+    The time is 0 if the ball is too low at its apex, or at time 0 if it falls.
+    """
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
-    # The bisection starts at the apex, since a rising ball may be below that height.
+    # The bisection starts at the ball's apex, since a rising ball may be too low at time 0.
     start = jnp.maximum(path.ball.vel[2], 0.0) / path.gravity
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -156,7 +167,7 @@ def _time_left(case: CatchCase) -> Array:
 
 
 def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchPlan:
-    """Plan a catch at the earliest time at which the ball can be caught."""
+    """Plan a catch from scratch; the first guess is the earliest catch that the robot can reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
     return solve_cases(planner, case.with_choice(choice), attempt)
@@ -175,11 +186,11 @@ def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Catc
 
 
 class CatchStroke(Stroke[CatchCase, CatchPlan]):
-    """One catch of the ball, before it is too low for the net.
+    """The task to catch one ball before it is too low for the net.
 
     Args:
-        robot: with a net.
-        drag: K_i [1/s] of the ball, the same along all axes.
+        robot: quadrotor with a net.
+        drag: K_i [1/s], linear drag of the ball, equal on all axes.
     """
 
     shortest = 0.15

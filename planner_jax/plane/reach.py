@@ -113,7 +113,7 @@ def grid_of(
 
 
 def _pack(cells: Array) -> Array:
-    """Pack cells (..., W * 32) bool into words (W, ...)."""
+    """Pack flags (..., W * 32) bool into the bits of 32-bit words (W, ...) uint32."""
     bits = cells.reshape(*cells.shape[:-1], -1, 32).astype(jnp.uint32)
     shifts = jnp.expand_dims(jnp.arange(32, dtype=jnp.uint32), tuple(range(cells.ndim)))
     words = jnp.sum(bits << shifts, axis=-1, dtype=jnp.uint32)
@@ -121,7 +121,10 @@ def _pack(cells: Array) -> Array:
 
 
 def _move_y(rows: Array, move: Array) -> Array:
-    """Move words (words, ..., cells) by (...) rows, up to `_FARTHEST`; drop rows off the grid."""
+    """Move cells (words, ..., cells) along y by `move` (...) cells, at most `_FARTHEST`.
+
+    Cells that leave the grid are dropped.
+    """
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(
@@ -133,7 +136,10 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Move bits (words, ..., cells) by (...) cells, less than 32; drop bits off the grid."""
+    """Move cells (words, ..., cells) along x by `move` (...) cells, less than 32; x is in bits.
+
+    Cells that leave the grid are dropped.
+    """
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31
@@ -147,12 +153,12 @@ def _move_x(rows: Array, move: Array) -> Array:
 
 
 def _shift(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) by (..., 2) [x, y]; drop cells off the grid."""
+    """Move cells (words, ..., cells) by `move` (..., 2), numbers of cells along x and y."""
     return _move_x(_move_y(rows, move[..., 1]), move[..., 0])
 
 
 def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> Array:
-    """Map a function over entries; on a CPU over the first `needed`, storing each result."""
+    """Apply `body` to every entry of `over`; on a CPU, only to the first `needed` entries."""
 
     def loop(over: Array, needed: Array) -> Array:
         one = jax.eval_shape(body, over[0])
@@ -165,7 +171,11 @@ def _map_needed(body: Callable[[Array], Array], over: Array, needed: Array) -> A
 
 
 def _stencils(grid: Grid, movers: Obstacles, radius: Array) -> Array:
-    """Return the bitmaps (M, _STENCIL) uint32 of the M moving obstacles, around their centres."""
+    """Return bitmaps (M, _STENCIL) uint32 of the cells near each of M moving obstacles.
+
+    A bit is set if the cell's middle is closer than `radius` [m] to the obstacle. The bitmap's
+    middle is the obstacle's centre.
+    """
     offsets = grid.cell * (jnp.arange(_STENCIL, dtype=grid.corner.dtype) - _STENCIL // 2)
     x, y = jnp.meshgrid(offsets, offsets)
     far, _ = distances(movers.corners, movers.present, x.reshape(1, -1), y.reshape(1, -1))
@@ -192,7 +202,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
 
 def _word_of(row: Array, at: Array) -> Array:
-    """Return the part of a row of 32 bits that is in a word if the row starts at its bit `at`."""
+    """Return the part of a 32-bit row that falls into a word if the row starts at its bit `at`."""
     by = jnp.minimum(jnp.abs(at), 31).astype(jnp.uint32)
     moved = jnp.where(at >= 0, row << by, row >> by)
     return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))
@@ -206,13 +216,14 @@ def reach_set(
     initial_speed: Array,
     needed: Array,
 ) -> ReachSet:
-    """Compute the reach set of a vehicle.
+    """Compute which states a vehicle can reach at each time layer.
 
     Args:
-        grid: of `grid_of`.
-        field: (cells, cells) [m], distance of every cell's middle from the walls; rows are y.
+        grid: positions of the cells and times of the layers, from `grid_of`.
+        field: (cells, cells) [m], distance of every cell's middle from the walls; the first index
+            counts along y.
         movers: moving obstacles.
-        vehicle: sizes and limits.
+        vehicle: sizes and limits of the vehicle.
         initial_speed: () [m/s].
         needed: () int32, number of layers to compute, equal for all cases of a batch.
     """
@@ -223,8 +234,8 @@ def reach_set(
     angle = grid.heading + width * jnp.arange(headings, dtype=dtype)
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     pace = speed * grid.step / grid.cell * jnp.arange(levels, dtype=dtype) / (levels - 1)
-    # Differences of rounded positions, so that the moves of n layers add up to the rounded
-    # position: if each move were rounded, a heading of 11 degrees would become 0.
+    # A move is the difference of two rounded positions, so that the moves of n layers add up to the
+    # rounded position. If each move were rounded instead, a heading of 11 degrees would become 0.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
     cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None]).astype(
         jnp.int32
@@ -233,7 +244,8 @@ def reach_set(
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
-    # The same for turns: their whole bins add up to the angle that the turn rates allow.
+    # Turns are whole numbers of heading bins too. They are differences of a rounded angle, so that
+    # they add up to the angle that the turn rates allow.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     span = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))
@@ -241,7 +253,7 @@ def reach_set(
     walls = _pack(field < vehicle.radius)
     stencils = _stencils(grid, movers, vehicle.radius)
     discs = jnp.round(-vehicle.ahead[:, None, None] * direction[None] / grid.cell).astype(jnp.int32)
-    middle = jnp.mean(vehicle.ahead) * direction  # of the body from the rear axle
+    middle = jnp.mean(vehicle.ahead) * direction  # from the rear axle to the body's middle
     position = grid.corner[:, None] + grid.cell * jnp.arange(num_cells, dtype=dtype)[None]
     on_map = (position[None] + middle[:, :, None] > grid.lower[None, :, None]) & (
         position[None] + middle[:, :, None] < grid.upper[None, :, None]
@@ -258,7 +270,7 @@ def reach_set(
     blocked = _map_needed(draw_obstacles, times, halves_needed)
 
     def find_free(blocked: Array) -> Array:
-        """Return the cells (words, headings, cells) in which the rear axle can be."""
+        """Return the cells (words, headings, cells) in which the rear axle is allowed."""
         each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
         return allowed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
 
@@ -280,10 +292,10 @@ def reach_set(
     ]
 
     def apart(bits: Array, n: Array) -> Array:
-        """Compute one layer, each part in an iteration of its own.
+        """Compute one layer on a CPU, with each of its parts in a separate loop iteration.
 
-        XLA would fuse the parts on a CPU, and compute a part again for every bit that the next part
-        reads.
+        Otherwise XLA would fuse the parts on a CPU, and repeat the work of one part for every bit
+        that the next part reads.
         """
         return lax.fori_loop(0, len(parts), lambda k, bits: lax.switch(k, parts, bits, n), bits)
 
@@ -305,7 +317,7 @@ def reach_set(
 
 
 def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
-    """Return the bits at time 0: the start, at the levels of speed next to the vehicle's own."""
+    """Return the bits at time 0: the start cell, at the speed levels next to the initial speed."""
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
@@ -316,14 +328,14 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
 
 
 def _change_speed(bits: Array) -> Array:
-    """Add the cells of the neighbouring levels to every level of speed."""
+    """Mark every state as reached whose speed level is at most one from a reached state's level."""
     none = jnp.zeros_like(bits[:, :1])
     slower = jnp.concatenate([bits[:, 1:], none], axis=1)
     return bits | slower | jnp.concatenate([none, bits[:, :-1]], axis=1)
 
 
 def _turn(bits: Array, turns: Array) -> Array:
-    """Add the cells of the headings from which the car can turn to every heading."""
+    """Mark every state as reached whose heading the car can turn to from a reached state."""
     reached = jnp.zeros_like(bits)
     for k in range(2 * SPAN + 1):
         by = jnp.roll(bits, k - SPAN, axis=2)
@@ -332,7 +344,10 @@ def _turn(bits: Array, turns: Array) -> Array:
 
 
 def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
-    """Return whether a layer (words, levels, headings, cells) holds a cell (2,) [x, y]."""
+    """Test whether a state is marked in a layer (words, levels, headings, cells) of bits.
+
+    The state is a speed level, a heading bin and a cell (2,), its indices along x and y.
+    """
     _, levels, headings, cells = bits.shape
     inside = jnp.all((cell >= 0) & (cell < cells)) & (level >= 0) & (level < levels)
     x, y = jnp.clip(cell, 0, cells - 1)
@@ -343,18 +358,19 @@ def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
 def goal_cells(
     grid: Grid, layer: Array, goal: Array, ahead: Array, headings: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around a goal, and whether a layer holds them.
+    """Return the cells around a goal, and whether the car can reach them at one time layer.
 
     Args:
-        grid: of the reach set.
-        layer: (words, levels, headings, cells) uint32.
-        goal: (2,) [m].
-        ahead: () [m], from the rear axle to the point that meets the goal.
+        grid: grid of the reach set.
+        layer: (words, levels, headings, cells) uint32, bits of one layer.
+        goal: (2,) [m], position to be met.
+        ahead: () [m], distance from the rear axle forward to the point that meets the goal.
         headings: (headings,) bool, allowed headings.
 
     Returns:
-        cells: (headings, 9, 2) int32, for the rear axle; the first of 9 is the nearest to the goal.
-        is_reached: (levels, headings, 9) bool.
+        cells: (headings, 9, 2) int32, indices [x, y] of 3 x 3 cells for the rear axle. The first of
+            the 9 cells is the one whose middle is nearest to the goal.
+        is_reached: (levels, headings, 9) bool, whether the car can be in the cell.
     """
     lattice = grid.lattice
     width = 2.0 * np.pi / lattice.headings

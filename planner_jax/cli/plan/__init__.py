@@ -1,1 +1,1 @@
-"""The command `plan`: one case in a few numbers, planned and refereed."""
+"""The command `planner-jax plan`: it plans and referees one case that a few options specify."""

@@ -1,4 +1,7 @@
-"""One case of the command `plan`: its plan, the referee's verdict, and margins to the limits."""
+"""The answer of the command `planner-jax plan` for one case, as text and as pictures.
+
+It has the plan, the referee's verdict, and how close the plan comes to each limit.
+"""
 
 import abc
 import dataclasses
@@ -29,9 +32,9 @@ from planner_jax.sweep.sweep import sweep_of
 
 SingleT = TypeVar("SingleT", bound=SingleSettings)
 
-_SAMPLES = 4001  # number of samples of a plan
+_SAMPLES = 4001  # number of times at which a plan is compared with the limits
 
-# Units of the upper bounds of the flight, by names in `PANELS`.
+# Units of the quantities that have an upper limit; the names are those of `PANELS`.
 _ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 
 
@@ -39,15 +42,19 @@ _ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 class Margin:
     """How close a plan comes to one limit."""
 
-    limit: str  # name and unit
-    reached: float
-    allowed: float
-    time: float  # [s], at which the plan is closest
+    limit: str  # name and unit of the limit
+    reached: float  # the plan's value closest to the limit
+    allowed: float  # the limit
+    time: float  # [s], time at which the plan is closest to the limit
     least: bool = False  # whether the limit is a lower bound
 
     @property
     def share(self) -> float:
-        """Used share of the limit; above 1 if it is exceeded, infinite without a finite ratio."""
+        """Used fraction of the limit: reached / allowed, or allowed / reached for a lower bound.
+
+        The fraction is above 1 if the limit is exceeded. It is infinite if an exceeded limit allows
+        no finite ratio.
+        """
         part, whole = (self.allowed, self.reached) if self.least else (self.reached, self.allowed)
         if whole > 0.0:
             return max(part, 0.0) / whole
@@ -56,7 +63,7 @@ class Margin:
 
 @dataclasses.dataclass(frozen=True)
 class Answer:
-    """A case, its plan and the verdict on it."""
+    """A case, its plan, and the referee's verdict on the plan."""
 
     case: PyTree
     plan: PyTree
@@ -64,19 +71,20 @@ class Answer:
 
     @property
     def success(self) -> bool:
-        """True if the referee accepts the plan."""
+        """Whether the referee accepts the plan."""
         return bool(self.verdict.success)
 
 
 class Single(abc.ABC, Generic[SingleT]):
-    """The single cases of one task.
+    """Base class of the command `plan` for one task: it makes, plans and describes a case.
 
     Args:
-        task: task of the cases.
-        settings: settings of the case, of the task's class, with the planner filled in.
+        task: task of the case.
+        settings: options of the command; `settings.planner` is not None.
     """
 
-    # Setting for a field of the case, if it is not the last name in the dotted path of the field.
+    # By field of the case, the option that sets the field. A field that is not listed has the
+    # option with the last name of its dotted path.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):
@@ -84,18 +92,18 @@ class Single(abc.ABC, Generic[SingleT]):
 
     @abc.abstractmethod
     def case(self) -> PyTree:
-        """Return the case; NumPy leaves."""
+        """Make the case from the settings."""
 
     @abc.abstractmethod
     def contact(self, answer: Answer) -> list[str]:
-        """Return sentences on time and position of the contact."""
+        """Describe time and position of each contact with a ball, one sentence per contact."""
 
     @abc.abstractmethod
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins of limits that only this task has."""
+        """Return the margins to those limits that only this task has."""
 
     def answer(self) -> Answer:
-        """Return plan and verdict; raise `ArgumentError` if a number of the case breaks a rule."""
+        """Plan the case and judge the plan; raise `ArgumentError` if the case breaks a rule."""
         try:
             case = jax.tree.map(np.asarray, self.case())
             planner = self.task.planner(self.settings.planner, **self.settings.planner_options())
@@ -105,11 +113,11 @@ class Single(abc.ABC, Generic[SingleT]):
         return Answer(case, found, self.task.judge(case, found))
 
     def _setting_of(self, field: str) -> tuple[str, str]:
-        """Return a field of the case and the setting that decides it."""
+        """Return a field of the case, and the name of the option that sets this field."""
         return field, self.NAMES.get(field, field.rpartition(".")[2])
 
     def describe(self, answer: Answer) -> list[str]:
-        """Return the answer as lines of text."""
+        """Describe contact, status, verdict and margins in lines of text."""
         status = Status(int(answer.plan.status))
         sentence = answer.verdict.sentence()
         planner = f"Planner {self.settings.planner}: {status.name}, {status.message}."
@@ -121,7 +129,7 @@ class Single(abc.ABC, Generic[SingleT]):
         return [*lines, "", *_table(self.margins(answer))]
 
     def margins(self, answer: Answer) -> list[Margin]:
-        """Return the margins to all limits of the case."""
+        """Return the margins to all limits of the case: of flight, rotors and task."""
         of_flight = _of_flight(answer, sample_plan(answer.plan))
         return [*of_flight, *_of_rotors(answer), *self.task_margins(answer)]
 
@@ -133,7 +141,10 @@ def sample_plan(found: QuadrotorPlan) -> SampledMotion:
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan with its recovery."""
+    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan's polynomial pieces.
+
+    They include the recovery trajectory, but no pieces of zero duration.
+    """
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0
@@ -149,7 +160,7 @@ def _closest(
     least: bool = False,
 ) -> Margin:
     """Return the margin at the time when a plan is closest to a limit, or exceeds it most."""
-    # Without an attitude no limit holds.
+    # Values are NaN where the attitude is undefined; such a plan exceeds the limit infinitely.
     values = np.nan_to_num(values, nan=-np.inf if least else np.inf)
     at = int(np.argmin(values) if least else np.argmax(values))
     return Margin(words, float(values[at]), float(allowed), float(times[at]), least)
@@ -178,7 +189,7 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
 
 
 def _of_rotors(answer: Answer) -> list[Margin]:
-    """Return margins of the least and the greatest thrust of a rotor."""
+    """Return margins to the least and the greatest thrust of a rotor, if the case limits them."""
     rotors = answer.case.limits.rotors
     if rotors is None:
         return []
@@ -198,7 +209,7 @@ def _of_rotors(answer: Answer) -> list[Margin]:
 
 
 def _table(margins: Sequence[Margin]) -> list[str]:
-    """Return lines of a table, one for each limit."""
+    """Format margins as a text table with a header and one line for each limit."""
     rows = [("limit", "reached", "allowed", "share", "at [s]")]
     for margin in margins:
         share = f"{100.0 * margin.share:.1f} %" if np.isfinite(margin.share) else "exceeded"
@@ -209,17 +220,17 @@ def _table(margins: Sequence[Margin]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class OneRow(RunRows):
-    """A case without a run, for the figures of runs."""
+    """One case in the form of a run's rows, so that the figures of runs can draw it."""
 
     row: Row
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return planner and row."""
+        """Return the planner's name and the only row, as figures of one case expect them."""
         return [(self.manifest["parameters"]["planner"], self.row)]
 
 
 def write_pictures(task: Task, planner: str, answer: Answer, out: Path) -> list[Path]:
-    """Draw a case into a folder, and return the paths of the pictures."""
+    """Draw a case and its plan into the folder `out`, and return the paths of the pictures."""
     sweep = sweep_of(task)
     case, plan = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (answer.case, answer.plan))
     verdict = dataclasses.replace(

@@ -1,4 +1,4 @@
-"""A single catch of one ball or several."""
+"""The command `planner-jax plan catch`: one case in which a quadrotor catches balls with a net."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +13,7 @@ from planner_jax.task.catch.case import GRAVITY
 
 
 class SingleCatch(Single[SingleCatchSettings]):
-    """A quadrotor that catches one ball, or several one after another."""
+    """One case in which a quadrotor catches one ball, or several balls one after another."""
 
     NAMES = {
         **Single.NAMES,
@@ -21,7 +21,7 @@ class SingleCatch(Single[SingleCatchSettings]):
     }
 
     def case(self) -> PyTree:
-        """Return the case."""
+        """Make the case of the specified balls, which must be caught before the horizon."""
         given = self.settings
         pos, vel = (jnp.asarray(part, jnp.float32) for part in zip(*given.balls, strict=True))
         num = pos.shape[0]
@@ -34,7 +34,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return self.task.case(path, np.full(num, given.horizon), **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Return a sentence on every catch."""
+        """Describe time, position, speed of the ball and miss in one sentence for every catch."""
         lines = []
         targets = answer.case.targets
         for index, (target, time) in enumerate(
@@ -51,7 +51,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins of net, angle and horizon, each at the closest catch."""
+        """Return margins to the net's radius, its angle and the horizon, at the closest catch."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]

@@ -1,4 +1,4 @@
-"""A single hit."""
+"""The command `planner-jax plan hit`: one case in which a quadrotor returns a ball to a target."""
 
 import numpy as np
 from jaxtyping import PyTree
@@ -8,7 +8,7 @@ from planner_jax.cli.plan.settings import SingleHitSettings
 
 
 class SingleHit(Single[SingleHitSettings]):
-    """A quadrotor that returns one ball."""
+    """One case in which a quadrotor returns a ball with its racket."""
 
     NAMES = {
         **Single.NAMES,
@@ -16,12 +16,12 @@ class SingleHit(Single[SingleHitSettings]):
     }
 
     def case(self) -> PyTree:
-        """Return the case."""
+        """Make the case of the specified ball and target."""
         given = self.settings
         return self.task.case(given.pos, given.vel, given.target, **given.case_options())
 
     def contact(self, answer: Answer) -> list[str]:
-        """Return a sentence on impact and landing."""
+        """Describe the impact and the ball's landing in one sentence."""
         stroke = answer.plan.stroke
         x, y, z = np.asarray(stroke.ball_pos)
         before, after = (
@@ -34,7 +34,7 @@ class SingleHit(Single[SingleHitSettings]):
         ]
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins of the racket, of the speed at the impact and of the apex."""
+        """Return margins to the racket's radius, the hitting speeds and the limits of the apex."""
         limits, verdict = answer.case.hit_limits, answer.verdict
         end = float(np.sum(answer.plan.trajectory.durations))
         speeds = np.abs(np.asarray(verdict.hitting_velocity))

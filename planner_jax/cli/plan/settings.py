@@ -1,4 +1,7 @@
-"""Settings of the command `plan` for each task; nothing here imports JAX."""
+"""Options of the command `planner-jax plan` for each task.
+
+Nothing here imports JAX, so that the command reports a wrong option at once.
+"""
 
 import dataclasses
 import math
@@ -13,14 +16,16 @@ from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
 _OWN = "(default: the robot's)"
-_MOST_BALLS = 6  # all orders of the balls are evaluated
+# Greatest number of balls: the planner evaluates all orders in which they can be caught.
+_MOST_BALLS = 6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleSettings:
-    """Settings of single cases of all quadrotor tasks; the class of a task adds its own.
+    """Options that `planner-jax plan` has for every task of a quadrotor.
 
-    The `metavar` of a field with several numbers has one word for each.
+    A subclass adds the options of its task. Each field is an option; the text of its `metavar` has
+    one word for each number of the option.
 
     Raises:
         ArgumentError: a value breaks a rule.
@@ -35,11 +40,11 @@ class SingleSettings:
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: object = robot_option("the task's")
-    recovery: str = recovery_option("brake")  # a controller needs setpoints to standstill
+    recovery: str = recovery_option("brake")  # a controller needs setpoints until standstill
 
-    RUN: ClassVar[str]  # subclass of `Single`, "module:Class"
+    RUN: ClassVar[str]  # subclass of `Single` that runs the command, as "module:Class"
     PLANNER: ClassVar[tuple[str, ...]] = ()  # fields that are options of the planner
-    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # fields that are no arguments of `case`
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # fields that are not arguments of `task.case`
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
 
     def __post_init__(self) -> None:
@@ -51,23 +56,23 @@ class SingleSettings:
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
             for number in _numbers(value):
-                # Only the thrust may be unbounded.
+                # Of all options only the greatest thrust may be infinite.
                 sound = math.isfinite(number) or (field.name == "max_thrust" and number > 0.0)
                 require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
-        """Return the settings with the task's planner, checked; None selects the first one."""
+        """Return a copy with the planner's name checked, and None replaced by the first planner."""
         name = next(iter(task.all_planners())) if self.planner is None else self.planner
         task.split_planner(name)
         return dataclasses.replace(self, planner=name)
 
     def planner_options(self) -> Entries:
-        """Return the options of the planner that these settings decide."""
+        """Return the planner's options that these settings specify, by name."""
         own = {name: vars(self)[name] for name in self.PLANNER}
         return own | recovery_options(self.recovery)
 
     def case_options(self) -> Entries:
-        """Return the named arguments of the task's `case`."""
+        """Return the keyword arguments of `task.case`: the options that are not None."""
         apart = {"planner", "recovery", *self.PLANNER, *self.ELSEWHERE}
         given = vars(self).items()
         return {name: value for name, value in given if value is not None and name not in apart}
@@ -81,10 +86,14 @@ def _numbers(value: object) -> list[float]:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleHitSettings(SingleSettings):
-    """A ball, a target, and values that may differ from the paper."""
+    """Options of `planner-jax plan hit`: a ball, a target, and numbers that replace defaults."""
 
-    pos: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m]")
-    vel: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "of the ball now [m/s]")
+    pos: tuple[float, ...] = option(
+        dataclasses.MISSING, "X Y Z", "initial position of the ball [m]"
+    )
+    vel: tuple[float, ...] = option(
+        dataclasses.MISSING, "X Y Z", "initial velocity of the ball [m/s]"
+    )
     target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "desired landing point [m]")
     acceleration: float | None = option(None, "A", "greatest [m/s^2] (default: the robot's)")
     hitting_speed: tuple[float, ...] | None = option(
@@ -102,12 +111,17 @@ class SingleHitSettings(SingleSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleCatchSettings(SingleSettings):
-    """One ball by `pos` and `vel`, or any number of `balls`, and a horizon."""
+    """Options of `planner-jax plan catch`: the balls, a horizon and limits.
 
-    pos: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m]")
-    vel: tuple[float, ...] | None = option(None, "X Y Z", "of the one ball now [m/s]")
+    One ball is specified by `pos` and `vel`, or several balls by a repeated option `ball`.
+    """
+
+    pos: tuple[float, ...] | None = option(None, "X Y Z", "initial position of the only ball [m]")
+    vel: tuple[float, ...] | None = option(None, "X Y Z", "initial velocity of the only ball [m/s]")
     ball: tuple[tuple[float, ...], ...] = option(
-        (), "X Y Z VX VY VZ", "position and velocity of a ball now; repeat it for several balls"
+        (),
+        "X Y Z VX VY VZ",
+        "initial position and velocity of a ball; repeat it for several balls",
     )
     horizon: float = option(dataclasses.MISSING, "S", "latest time of a catch [s]")
     drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
@@ -138,7 +152,7 @@ class SingleCatchSettings(SingleSettings):
 
     @property
     def balls(self) -> list[tuple[tuple[float, ...], tuple[float, ...]]]:
-        """Position and velocity of every ball."""
+        """Position [m] and velocity [m/s] of every specified ball."""
         if self.pos is not None and self.vel is not None:
             return [(self.pos, self.vel)]
         return [(ball[:3], ball[3:]) for ball in self.ball]
