@@ -124,9 +124,9 @@ def fly(
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
     """Return the ball after a flight with drag acceleration -K_i v_i on each axis i.
 
-    [Yu2023bat, eq. 4a], with the constant that is missing in the paper:
-    s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K on each axis, with signed g. The result is
-    exact to rounding for any K >= 0.
+    On each axis s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K, with signed g. This is
+    [Yu2023bat, eq. 4a] with the constant of integration, which the paper omits. The result is exact
+    to rounding for any K >= 0.
     """
     x = drag * duration
     phi_1, phi_2 = _phi(x)
@@ -188,10 +188,10 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
     definition of beta and its eq. 12 need the plus sign. The tangential velocity is unchanged.
 
     Args:
-        ball_vel: v-.
-        racket_vel: u.
+        ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
+        racket_vel: u (3,) [m/s], velocity of the racket.
         normal: z (3,), unit normal of the racket.
-        restitution: beta (), 0 to 1.
+        restitution: beta (), coefficient of restitution, 0 to 1.
     """
     return ball_vel - (1.0 + restitution) * jnp.sum((ball_vel - racket_vel) * normal) * normal
 

@@ -39,7 +39,7 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """A ball with linear drag on each axis ([Yu2023catch, eq. 9], with its constant).
+    """Path of a ball with linear drag on each axis [Yu2023catch, eq. 9].
 
     Without drag the path is a parabola, and without drag and gravity a straight line, as in
     [Yu2023catch, Section VII-B a, c, d].
@@ -63,7 +63,10 @@ class BallPath:
 
 @struct.dataclass
 class HarmonicPath:
-    """A target that drifts and oscillates, p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
+    """Path of a target that drifts and oscillates: p_0 + v t + A sin(w t + phi).
+
+    It covers the targets of [Yu2023catch, Section VII-B b].
+    """
 
     rules: ClassVar[Table] = (
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),

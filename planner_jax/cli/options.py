@@ -55,8 +55,8 @@ class Parser(argparse.ArgumentParser):
         )
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill, self._flags = fill, {}
-        # Words with this start are negative numbers and not options. The pattern of argparse would
-        # take numbers with an exponent, such as -1e3, for options.
+        # A word that starts like this is a negative number and not an option. The own pattern of
+        # argparse does not match numbers with an exponent, such as -1e3.
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
@@ -140,7 +140,7 @@ def _type_of(hint: Any) -> type:
 def pop_out(given: Options, kind: str = "folder") -> str | None:
     """Remove the option `--out` from the options, check it, and return it; None if absent.
 
-    `kind` is "folder" or "file", for messages.
+    `kind`, "folder" or "file", is what the option must name, for error messages.
     """
     out = given.pop("out", None)
     if out == "":

@@ -27,7 +27,8 @@ def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 
 
-# If the horizontal part of the body's x axis, a unit vector, is shorter, the yaw is undefined.
+# The yaw is undefined if the horizontal part of the body's x axis, a unit vector, is shorter than
+# this number.
 _VERTICAL = 1e-6
 
 

@@ -46,12 +46,12 @@ class _Capsule:
 
     @property
     def middle(self) -> np.ndarray:
-        """Middle (3, B, S) [m]."""
+        """Middle (3, B, S) [m] of the capsule's axis."""
         return 0.5 * (self.first + self.second)
 
     @property
     def reach(self) -> np.ndarray:
-        """Radius (B, 1) [m] of the bounding sphere."""
+        """Radius (B, 1) [m] of the sphere around `middle` that contains the capsule."""
         return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
@@ -84,7 +84,7 @@ class _Box:
 
     @property
     def reach(self) -> np.ndarray:
-        """Radius (B, 1) [m] of the bounding sphere."""
+        """Radius (B, 1) [m] of the sphere around `middle` that contains the box."""
         return length(self.half)
 
     def lowest(self) -> np.ndarray:

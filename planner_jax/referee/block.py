@@ -102,7 +102,7 @@ class BlockVerdict(Verdict):
     tilt: np.ndarray  # (B,) [rad], shield's normal to minus the ball's velocity
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe for plan `k`, a success, where and when the ball meets the shield."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.contact_time)[k]
         return f"the ball is {miss:.2g} m from the shield's middle at {time:.3g} s"
 

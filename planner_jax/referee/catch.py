@@ -5,8 +5,8 @@ checks the flight. This module checks the plan's order of targets and its catch 
 targets' positions and compares them with the net. Only the case's extra limits (`referee.extras`)
 are code that planners use too. World frame, z up, SI units.
 
-Equations of [Yu2023catch]: eq. 9 ball with linear drag (with its constant), eq. 22 net centre
-p + l z_d, eq. 25 angle between z_d and minus the ball's velocity, with the thrust direction z_d.
+Equations of [Yu2023catch]: eq. 9 ball with linear drag, eq. 22 net centre p + l z_d, eq. 25 angle
+between z_d and minus the ball's velocity, with the unit vector z_d along the thrust.
 """
 
 import dataclasses
@@ -79,7 +79,7 @@ class CatchVerdict(FlightVerdict):
     num_caught: np.ndarray  # (B,) int
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe for plan `k`, a success, how many targets it catches, and the greatest miss."""
         if not (number := int(np.asarray(self.num_caught)[k])):
             return "there is no target to catch"
         farthest = np.nanmax(self.net_distance[k])
@@ -232,9 +232,9 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities (B, N, 3) of balls with linear drag K [1/s] on each axis.
 
-    [Yu2023catch, eq. 9] with its constant: s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K, x = K t,
-    which is s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. For small x,
-    h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
+    The position is s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K with x = K t [Yu2023catch, eq. 9].
+    It is computed as s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. For
+    small x, the series h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
     """
     times = times[..., None]
     x = drag * times

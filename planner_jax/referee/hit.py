@@ -76,7 +76,7 @@ class HitVerdict(FlightVerdict):
     contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe for plan `k`, a success, how far from the target the ball lands."""
         return f"the ball lands {np.asarray(self.landing_error)[k]:.2g} m from the target"
 
 
@@ -174,10 +174,11 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 
 
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
-    """Find the time (B,) [s] within a step at which an entry of the ball's state falls to a level.
+    """Find the time (B,) [s] within a step at which one entry of the ball's state falls to `level`.
 
-    Returns the time and the state (6, B) at that time. Newton's method starts at the end of the
-    step, where height and vertical speed are falling. It therefore converges to the last crossing.
+    The entry is the height (2) or the vertical speed (5). Returns the time and the state (6, B) at
+    that time. Newton's method starts at the end of the step, where the entry is falling. It
+    therefore converges to the last crossing.
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):

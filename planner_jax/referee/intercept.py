@@ -80,7 +80,7 @@ class InterceptVerdict(Verdict):
     meeting_time: np.ndarray  # (B,) [s], when the plan ends
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe for plan `k`, a success, when the car meets the target and how exactly."""
         miss, time = np.asarray(self.miss)[k], np.asarray(self.meeting_time)[k]
         return f"the body's middle is {miss:.2g} m from the target after {time:.3g} s"
 

@@ -38,7 +38,7 @@ class GroupVerdict(InterceptVerdict):
     num_met: np.ndarray  # (B,) int, number of targets that are met up to this leg
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe for plan `k`, a success, how many targets it meets and when."""
         num, time = np.asarray(self.num_met)[k], np.asarray(self.meeting_time)[k]
         return f"{num} targets are met, the last after {time:.3g} s"
 
@@ -109,7 +109,7 @@ def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNames
 
 
 def _delay(where: Callable, begin: np.ndarray) -> Callable:
-    """Return the function of positions `where` for times that count from `begin` (B,) [s]."""
+    """Shift the time origin of `where(target, times)`: times of the result count from `begin`."""
     return lambda target, times: where(target, begin + times)
 
 

@@ -59,7 +59,7 @@ class Verdict:
         return f"{name}: {text}"
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe the success of plan `k`."""
+        """Describe plan `k`, a success, for `sentence`; subclasses add measurements."""
         return "every limit holds"
 
 

@@ -98,7 +98,8 @@ MOTION_SENTENCES = {
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
-# [s] Least duration that converts an error of a derivative to a displacement; see `joint_errors`.
+# [s] Least duration h with which an error e of the n-th derivative counts as the displacement
+# |e| h^n / n!.
 SHORTEST_PIECE = 0.1
 _INTERVALS = 400  # least number of sample intervals between two contacts
 _FEWEST_INTERVALS = 16  # least number of sample intervals of one polynomial piece

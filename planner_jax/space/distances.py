@@ -345,7 +345,7 @@ def _rows(pair: Array) -> tuple[Vector, Vector]:
 
 
 def _ground(pair: Array) -> tuple[Vector, Vector]:
-    """Split two vectors (2, 3) into tuples of their x and y components, the ground's plane."""
+    """Project two vectors (2, 3) onto the x-y plane, and return them as tuples of components."""
     return tuple(pair[0, :2]), tuple(pair[1, :2])
 
 
