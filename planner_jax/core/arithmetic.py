@@ -1,7 +1,7 @@
-"""Arithmetic written so that XLA compiles it to few loops on a CPU.
+"""Arithmetic in forms that XLA compiles to few loops on a CPU.
 
-XLA compiles each division, root or sum to a loop of its own. The time of one small problem depends
-on the number of loops, not on what they compute.
+XLA compiles each division, root or sum over an axis to its own loop. The computing time of one
+small problem depends on the number of loops, not on the amount of arithmetic in them.
 """
 
 from types import ModuleType
@@ -14,7 +14,7 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array, typed as a leaf of a case or plan.
+    """Return a value as a NumPy array whose type suits the leaves of cases and plans.
 
     Such leaves are jax arrays inside compiled programs and may be NumPy arrays outside.
     """
@@ -31,7 +31,7 @@ def numpy_of(*arrays: object) -> ModuleType:
 
 @jax.custom_jvp
 def reciprocal(x: Array) -> Array:
-    """Return 1 / x for x (...) != 0."""
+    """Return 1 / x for x (...) != 0; the derivative needs no second division."""
     return 1.0 / x
 
 
@@ -43,7 +43,7 @@ def _reciprocal_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Arra
 
 @jax.custom_jvp
 def inverse_sqrt(x: Array) -> Array:
-    """Return 1 / sqrt(x) for x (...) > 0."""
+    """Return 1 / sqrt(x) for x (...) > 0; the derivative needs no second root."""
     return lax.rsqrt(jnp.asarray(x))
 
 
@@ -56,7 +56,7 @@ def _inverse_sqrt_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
 def at_least(x: Array, floor: float) -> Array:
     """Return max(x, floor) with slope 1 where x == floor.
 
-    The slope of `jnp.maximum` is 1/2 there.
+    The slope of `jnp.maximum` at x == floor is 1/2.
     """
     return jnp.where(x < floor, floor, x)
 
@@ -67,7 +67,7 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 def components(x: Components) -> list[Array]:
     """Return the n components (...) of vectors (..., n), or the entries of a tuple.
 
-    They come from one split, whose derivative is one concatenation instead of n paddings.
+    One split yields them all; its derivative is one concatenation instead of n paddings.
     """
     if isinstance(x, tuple):
         return [*x]

@@ -1,7 +1,7 @@
 """Checks of single arguments: numbers, switches, arrays, paths, instances of a class.
 
-Each check raises one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for a value of the
-wrong kind, `ArgumentError` for a value that breaks the rule. `name` is the NAME of the argument.
+Each check raises an error of one line, `NAME must be RULE, got VALUE`: `ArgumentTypeError` for a
+value of the wrong type, `ArgumentError` for a value that breaks the rule. `name` is the NAME.
 """
 
 import functools
@@ -29,7 +29,7 @@ def format_shapes(tree: PyTree) -> str:
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
     """Raise unless an argument is one finite number that keeps a rule.
 
-    Of a jax array, which may be traced or on another device, only shape and kind are checked.
+    A jax array may be traced or on another device, so only its shape and type are checked.
     """
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
@@ -70,7 +70,7 @@ def require_path_name(name: str, value: object) -> None:
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-# Types that `isinstance` quickly separates from JAX's arrays
+# Types that a fast `isinstance` recognises as no arrays of JAX.
 _HOSTS = (np.ndarray, np.generic, float)
 
 
@@ -91,10 +91,10 @@ def numeric(value: object) -> Numbers | None:
 def numbers_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...]
 ) -> np.ndarray:
-    """Return numbers for every case of a batch, an array of the shape batch + shape.
+    """Return numbers for every case of a batch, as an array of the shape batch + shape.
 
     The argument has this shape, or the shape `shape` for numbers that all cases share. Other shapes
-    raise, so that no axis is stretched by accident. `batch` is () or (B,).
+    raise, so that no axis is broadcast by accident. `batch` is () or (B,).
     """
     array, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
     if array.shape not in (shape, whole):
@@ -116,7 +116,7 @@ def _require_numeric(name: str, value: object) -> Numbers:
 
 
 def floating(dtype: object) -> np.dtype:
-    """Return a floating-point type that is enabled in JAX; raise `ArgumentTypeError` otherwise."""
+    """Return a floating-point dtype that JAX has enabled; raise `ArgumentTypeError` if not."""
     try:
         kind = np.dtype(dtype)  # type: ignore[call-overload]
     except TypeError:
@@ -131,7 +131,7 @@ def floating(dtype: object) -> np.dtype:
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
     """Return the leaves of an argument as arrays; raise unless their shapes begin with `shape`.
 
-    `words` describes these axes in the message.
+    `words` describes the axes of `shape` in the message.
     """
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
@@ -160,9 +160,9 @@ def require_path(
     Args:
         name: name of the argument.
         path: a pytree with a method `at(time)`.
-        axes: axes that every leaf has in front of the axes of one path.
+        axes: batch axes that every leaf has in front of the axes of one path.
         dimensions: dimension of the positions, 2 or 3.
-        whose: argument that determines the axes, for the message.
+        whose: name of the argument that determines `axes`, for the message.
     """
     if isinstance(path, type) or not isinstance(path, _Path):
         raise ArgumentTypeError(name, "a path, with a method at(time)", path)

@@ -1,6 +1,6 @@
-"""Named choices and ranges that planners, settings and exports share, and checks against them.
+"""Named choices and ranges that planners, settings and exports share, and their checks.
 
-Nothing here imports JAX or NumPy, because the command line checks its options with this module.
+This module imports neither JAX nor NumPy, because the command line checks its options with it.
 """
 
 import os
@@ -10,9 +10,9 @@ from numbers import Integral
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.host import machine
 
-EFFORTS = ("feasible", "good", "best")  # default first
-RECOVERIES = ("brake", "home")  # to standstill anywhere, or at the initial position
-NONE = "none"  # setting for plans that end at their last contact
+EFFORTS = ("feasible", "good", "best")  # how long a planner searches; the first is the default
+RECOVERIES = ("brake", "home")  # to standstill anywhere, or at the initial position of the case
+NONE = "none"  # setting for plans that end at their last contact, without a recovery
 CHOICES = (NONE, *RECOVERIES)
 SCALES = (1e-3, 1e3)  # least and greatest factor on limits that leaves them plausible
 
@@ -20,13 +20,13 @@ SCALES = (1e-3, 1e3)  # least and greatest factor on limits that leaves them pla
 def require(
     holds: bool, name: str, rule: str, value: object = None, *, shown: str | None = None
 ) -> None:
-    """Raise `ArgumentError` unless a rule on an argument holds."""
+    """Raise `ArgumentError` about the argument `name` unless `holds` is true."""
     if not holds:
         raise ArgumentError(name, rule, value, shown=shown)
 
 
 def require_one_of(names: Iterable[str], name: str, value: object) -> None:
-    """Raise `ArgumentError` unless an argument is one of several names."""
+    """Raise `ArgumentError` unless a value is one of the allowed names."""
     names = tuple(names)
     require(value in names, name, f"one of {', '.join(names)}", value)
 
@@ -40,12 +40,12 @@ def require_size(name: str, value: object, least: int = 1) -> None:
 
 
 def require_seed(value: object) -> None:
-    """Raise unless the argument `seed` is valid for every random generator."""
+    """Raise unless the argument `seed` is a whole number >= 0, as random generators need."""
     require_size("seed", value, 0)
 
 
 def require_scale(value: float) -> None:
-    """Raise `ArgumentError` unless the argument `limit_scale` leaves plausible limits."""
+    """Raise `ArgumentError` unless the factor `limit_scale` on limits is in the range `SCALES`."""
     least, most = SCALES
     require(least <= value <= most, "limit_scale", f"from {least:g} to {most:g}", value)
 
@@ -57,12 +57,12 @@ def require_memory(name: str, num: int, bytes_each: int) -> None:
 
 
 def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike) -> None:
-    """Raise `ArgumentError` if `num` rows exceed the free space of a folder's disk."""
+    """Raise `ArgumentError` if `num` rows of `bytes_each` bytes exceed the folder's free disk."""
     _require_space(name, num, bytes_each, machine.free_disk(folder), "which the disk has room")
 
 
 def _require_space(name: str, num: int, bytes_each: int, free: int | None, what: str) -> None:
-    """Raise `ArgumentError` if `num` elements exceed the free bytes; None is unknown."""
+    """Raise `ArgumentError` if `num` elements exceed the `free` bytes; None means unknown."""
     if free is not None and num * bytes_each > free:
         sizes = f"{machine.format_size(bytes_each)} each, {machine.format_size(free)} free"
         most = max(free // bytes_each, 1)

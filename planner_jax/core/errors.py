@@ -1,7 +1,7 @@
-"""The exceptions of the library: one tree, whose base is `PlannerJaxError`.
+"""The exceptions of the library; `PlannerJaxError` is the base class of all.
 
-An error of an argument stores its parts as fields. Code that uses another name for the argument,
-such as the command line, calls `with_names`; nothing parses the text. Nothing here imports JAX.
+An error about an argument stores its parts as fields. Code that uses another name for the argument,
+such as the command line, renames it by `with_names`. This module does not import JAX.
 """
 
 import copy
@@ -12,15 +12,15 @@ from typing import ClassVar, Self
 
 
 class PlannerJaxError(Exception):
-    """Base of the exceptions that the library defines; the text is one line."""
+    """Base class of the exceptions that the library defines; their text is one line."""
 
     _names: ClassVar[tuple[str, ...]] = ()  # fields that hold names of arguments
 
     def with_names(self, names: Mapping[str, str]) -> Self:
-        """Return the same error with arguments under other names.
+        """Return a copy of the error in which arguments have other names.
 
         Args:
-            names: new names by old ones; a name that is missing stays.
+            names: maps old names to new names; names that are missing stay.
         """
         error = copy.copy(self)
         vars(error).update({k: names.get(v, v) for k, v in vars(self).items() if k in self._names})
@@ -35,10 +35,10 @@ class ArgumentError(PlannerJaxError, ValueError):
         rule: condition on the argument, such as "> 0".
         value: value of the argument.
         index: first entry, or first case of a batch, that breaks the rule, if there are several.
-        verb: word between "must" and the rule.
-        other: argument to which the rule compares this one; it follows the rule.
-        shown: text in the place of `value`; "" leaves the value out.
-        more: number of further elements of the batch that break the rule.
+        verb: word between "must" and the rule, such as "be" or "have".
+        other: name of a second argument with which the rule compares this one.
+        shown: text that is shown instead of `value`; "" shows nothing.
+        more: number of further cases of the batch that break the rule.
     """
 
     _names = ("name", "other")
@@ -73,7 +73,7 @@ class ArgumentError(PlannerJaxError, ValueError):
 
 
 class ArgumentTypeError(ArgumentError, TypeError):
-    """An argument is of a kind that its rule excludes, such as text in the place of a number."""
+    """An argument has a type that its rule excludes, such as text instead of a number."""
 
 
 class CaseError(ArgumentError):
@@ -83,7 +83,7 @@ class CaseError(ArgumentError):
 
 
 class UnknownName(ArgumentError):
-    """No task, planner, suite or robot has this name; the rule lists the names that exist."""
+    """The name of a task, planner, suite or robot is unknown; the rule lists the known names."""
 
 
 class MissingExtra(PlannerJaxError, ModuleNotFoundError):
@@ -118,7 +118,7 @@ def install_line(extra: str) -> str:
 
 
 def format_value(value: object) -> str:
-    """Return a value as one short line for a message."""
+    """Format a value as one short line for a message."""
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         return f"{float(value):g}"
     text = str(value) if isinstance(value, numbers.Number) else repr(value)

@@ -1,4 +1,4 @@
-"""Dataclasses of arrays in NumPy's .npz files: arrays by field names, a version, and no pickle."""
+"""Save and load dataclasses of arrays as .npz files of NumPy, with a version and no pickle."""
 
 import contextlib
 import dataclasses
@@ -30,11 +30,11 @@ Kind = TypeVar("Kind")
 
 
 class PlanFileError(ArgumentError):
-    """A file that cannot be read as plans; one line that names the file."""
+    """A file cannot be read as plans; the text is one line that names the file."""
 
 
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
-    """Write a dataclass, whose leaves are arrays or such dataclasses, whole or not at all.
+    """Write a dataclass of arrays, or of such dataclasses, to a file: completely or not at all.
 
     Raises:
         ArgumentTypeError: a leaf is not an array of numbers, or `path` is not a path.
@@ -70,12 +70,12 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 
 
 def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
-    """Return the first of several classes whose fields are all in a file of `save_arrays`.
+    """Load a file of `save_arrays` as the first of several classes whose fields it contains.
 
     A file of a derived class is read as its base class, without the fields of the derived class.
 
     Raises:
-        PlanFileError: the file holds something else, none of the classes or another version.
+        PlanFileError: the file contains none of the classes, another version, or something else.
     """
     version, name, arrays = _read(path)
     if version == VERSION:
@@ -95,7 +95,7 @@ def _other_file(
 def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray]]:
     """Return the version and the class name in a file, and its arrays."""
     try:
-        # NumPy leaves open a broken file that it has opened itself.
+        # NumPy would not close a broken file that it has opened itself.
         with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:
             arrays = dict(file)
         header = json.loads(str(arrays.pop(_HEADER)))
@@ -123,7 +123,7 @@ def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
 
 
 def build_tree(kind: type[Kind], prefix: str, arrays: dict[str, PyTree]) -> Kind:
-    """Build a dataclass from the arrays named as its fields, which are removed from `arrays`."""
+    """Build a dataclass from arrays by the names of its fields; remove them from `arrays`."""
     types = typing.get_type_hints(kind)
     values = {}
     for field in dataclasses.fields(kind):  # type: ignore[arg-type]

@@ -1,7 +1,7 @@
-"""The base class of every planner: what `plan`, `solve`, `replan` and `gradient` may call.
+"""The base class of every planner, with the methods that `plan`, `replan` and `gradient` call.
 
 A planner is a pytree. Sizes and switches are static. Arrays, such as a library of motions or the
-weights of a network, are leaves, so that other arrays of the same shapes compile nothing anew. A
+weights of a network, are leaves, so that other arrays of the same shapes need no compilation. A
 frozen dataclass without arrays becomes a pytree by `jax.tree_util.register_static`.
 """
 
@@ -27,7 +27,7 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 
 class Kind(enum.Enum):
-    """The method of a planner that makes its plans."""
+    """The method by which a planner makes its plans."""
 
     COMPILED = "compiled"  # `solve`, a pure function of one case
     HOST = "host"  # `solve_on_host`, a function of a batch of NumPy arrays
@@ -35,7 +35,7 @@ class Kind(enum.Enum):
 
 
 class Drive(Protocol):
-    """Runs planners on behalf of the `plan_by` of a composite planner."""
+    """Runs planners on behalf of a composite planner, whose method `plan_by` receives it."""
 
     @property
     def is_pure(self) -> bool:
@@ -60,7 +60,7 @@ class Drive(Protocol):
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after another try at some cases, each the better of old and new.
+        """Return plans (B,) after another try at some cases: the better of the old and new plan.
 
         `plan_of` makes plans of a batch of the cases. NumPy leaves of `plans` are changed in place.
         The cases where `left` (B,) is true are tried, unless the caller's time limit has passed.
@@ -72,15 +72,14 @@ class Planner(Generic[CaseT, PlanT]):
     """A planner of one class of cases.
 
     A subclass implements one of `solve`, `solve_on_host` and `plan_by`, which determines its
-    `kind`. The other methods are optional abilities; those without a default raise a one-line
-    error.
+    `kind`. The other methods are optional; methods without a default raise an error.
     """
 
     kind: ClassVar[Kind | None] = None
     case_type: ClassVar[type] = Case  # cases of other classes are rejected
     plan_type: ClassVar[type[Plan]] = Plan  # class of the plans that `begin` takes
-    # Whether a CPU solves a batch case after case. This suits planners whose cases differ much in
-    # computing time: in step, all cases would wait for the slowest one.
+    # Whether a CPU solves the cases of a batch one after another. This suits planners whose cases
+    # differ much in computing time: solved together, all cases would wait for the slowest one.
     is_sequential: ClassVar[bool] = False
 
     def __init_subclass__(cls, **options: object) -> None:
@@ -111,14 +110,14 @@ class Planner(Generic[CaseT, PlanT]):
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
-        if has_only_cpu():  # which spares tracing the program for other devices
+        if has_only_cpu():  # saves the time to trace the program for other devices
             return in_turn(cases)
         return lax.platform_dependent(
             cases, cpu=in_turn, default=lambda cases: self.solve_at_once(cases, attempt)
         )
 
     def solve_at_once(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes of a batch, all cases in step; pure."""
+        """Return the plans that one attempt makes of a batch, all cases together; pure."""
         return jax.vmap(lambda case: self.solve(case, attempt))(cases)
 
     def solve_on_host(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
@@ -126,15 +125,15 @@ class Planner(Generic[CaseT, PlanT]):
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:
-        """Return the plans of a batch, made from plans of other planners by `drive`."""
+        """Return the plans of a batch, composed of plans that `drive` makes by other planners."""
         raise NotImplementedError
 
     def starts_long(self, cases: CaseT) -> bool:
-        """Return whether the first attempt at such cases is already a long search."""
+        """Return whether the first attempt at these cases is already a long search."""
         return False
 
     def replanner(self) -> "Planner":
-        """Return the planner that continues from plans of this one; see `pj.replan`."""
+        """Return the planner that continues from existing plans; see `pj.replan`."""
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
@@ -144,7 +143,7 @@ class Planner(Generic[CaseT, PlanT]):
         quantities by name.
 
         Raises:
-            TypeError: the planner is no re-planner.
+            TypeError: the planner is not a re-planner.
         """
         raise TypeError(
             f"{type(self).__name__} cannot plan again: use hits' and catches' exact, intercepts' "
@@ -154,13 +153,14 @@ class Planner(Generic[CaseT, PlanT]):
     def settle(
         self, cases: CaseT, plan_of: Callable[["Planner", PyTree], PyTree] | None = None
     ) -> "tuple[PyTree, PyTree]":
-        """Return an `OptimisedPlanner`, and the cases with all that is decided before it starts.
+        """Return an `OptimisedPlanner`, and the cases with all decisions that precede its search.
 
-        `plan_of` plans cases by a planner, to determine the decision. By default the decision is
-        its first proposal, and no plan is made: that is pure, and constant to derivatives.
+        `plan_of` plans cases by a planner; the decisions are taken from these plans. By default the
+        decisions are the first proposals. The function is then pure and makes no plan, and
+        derivatives treat the decisions as constants.
 
         Raises:
-            TypeError: the planner minimises nothing.
+            TypeError: the planner does not minimise a cost.
         """
         raise TypeError(
             f"{type(self).__name__} minimises nothing, so that its plans have no gradient: use "
@@ -168,13 +168,13 @@ class Planner(Generic[CaseT, PlanT]):
         )
 
     def with_effort(self, effort: str) -> Self:
-        """Return the planner with a first round, made for all cases, that searches for longer.
+        """Return a copy of the planner whose first attempt, at all cases, searches for longer.
 
         "feasible" returns the planner itself, which leaves a case as soon as every limit holds,
         mostly far from the least cost. See `OptimisedPlanner.with_effort` for the other efforts.
 
         Raises:
-            ArgumentError: the effort is unknown, or the planner minimises nothing.
+            ArgumentError: the effort is unknown, or the planner does not minimise a cost.
         """
         require_one_of(EFFORTS, "effort", effort)
         if effort != EFFORTS[0]:
@@ -185,7 +185,7 @@ class Planner(Generic[CaseT, PlanT]):
 
 @struct.dataclass
 class PlannerAround(Planner[CaseT, PlanT]):
-    """A planner that calls one other planner for cases of the same class."""
+    """A planner that wraps one other planner for cases of the same class."""
 
     planner: Planner[CaseT, PlanT]
 
@@ -205,7 +205,7 @@ class PlannerAround(Planner[CaseT, PlanT]):
 
 
 def require_planner(planner: object) -> None:
-    """Raise `TypeError` unless the argument `planner` is a planner."""
+    """Raise `TypeError` unless the argument `planner` is an instance of a planner class."""
     if not isinstance(planner, Planner) or planner.kind is None:
         is_class = isinstance(planner, type)
         got = f"the class {planner.__name__}" if is_class else f"a {type(planner).__name__}"
@@ -213,7 +213,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless a planner is complete and plans cases of the class of these."""
+    """Raise unless the planner is complete, and the cases belong to the class that it plans."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

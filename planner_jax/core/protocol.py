@@ -1,4 +1,4 @@
-"""Plans, the rule that selects one of several plans, and attempts and decisions of planners."""
+"""Plans and their statuses, the rule that selects the best plan, attempts, and decisions."""
 
 import dataclasses
 import enum
@@ -21,7 +21,7 @@ from planner_jax.core.rules import FINITE, NOT_NEGATIVE, POSITIVE, fields_of, ha
 
 
 class Status(enum.IntEnum):
-    """Outcome of one case; `message` explains it and states a remedy."""
+    """The outcome of planning one case; `message` explains the status and states a remedy."""
 
     CONVERGED = 0
     FEASIBLE = 1
@@ -42,7 +42,7 @@ class Status(enum.IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Status | None":
-        """Return the status in a jax array of one number, which is not hashable."""
+        """Return the status that equals a jax array of one number, which is not hashable."""
         return next((status for status in cls if status == value), None)
 
 
@@ -68,17 +68,17 @@ def is_solved(status: Numbers | int) -> Array:
 
 
 def is_unsolved(status: Numbers | int) -> Array:
-    """Return which statuses are worth another attempt: unsolved, finite and not hopeless."""
+    """Return which statuses another attempt may improve: a limit is exceeded, or out of reach."""
     worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
     return worth | (status == Status.OUT_OF_REACH)  # type: ignore[return-value]
 
 
-# The referee accepts an excess of 1e-3 of a limit; half of it is left for peaks between samples.
+# The referee accepts a relative excess of 1e-3. Half of it is reserved for peaks between samples.
 FEASIBILITY_TOLERANCE = 5e-4
 
 
 def status_of(cost: Array, violation: Array, stationary: Array | bool) -> Array:
-    """Return the `Status` of a finished case, () int32."""
+    """Return the `Status` of a plan from its cost, violation and stationarity, () int32."""
     feasible = violation <= FEASIBILITY_TOLERANCE
     status = jnp.where(
         feasible,
@@ -107,9 +107,9 @@ def outcome(cost: Array, violation: Array, *, stationary: Array | bool = True) -
 
 @struct.dataclass
 class Plan:
-    """The outcome of planning; the plans of tasks add the motion.
+    """The outcome of planning: cost, violation and status; the subclasses of tasks add the motion.
 
-    One plan, or a batch of them with a leading axis on every leaf.
+    An object holds one plan, or a batch of plans with a leading axis on every leaf.
     """
 
     cost: Array  # (), the planner's own objective
@@ -140,7 +140,7 @@ def require_settings(planner: PyTree) -> None:
     """Raise unless every field of a planner, a dataclass, has the kind of its default value.
 
     Sizes are whole numbers >= 1, or >= 0 if the default is 0. Weights and times are finite, and >=
-    0 unless the default is negative. Attempts are one or more.
+    0 unless the default is negative. There must be at least one attempt.
     """
     defaults = {field.name: field.default for field in dataclasses.fields(planner)}
     for name, value in fields_of(planner).items():
@@ -169,10 +169,10 @@ def require_attempts(name: str, value: object, kind: type) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Attempt:
-    """One try at the cases that earlier attempts left unsolved; static under jit."""
+    """One try of a planner at the cases that earlier attempts left unsolved; static under jit."""
 
-    starts: int = 1  # lanes of a batch that one case takes
-    # Greatest violation after earlier attempts with which a case is tried; None for any.
+    starts: int = 1  # number of starting points from which each case is solved
+    # Greatest violation of an earlier plan with which a case is tried again; None for no bound.
     within: float | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -181,7 +181,7 @@ class Attempt:
             require_number("within", self.within, POSITIVE)
 
     def is_due(self, plans: "Plan") -> Array:
-        """Return which of the plans so far this attempt may improve, bool."""
+        """Return for which of the existing plans this attempt should be made, bool."""
         unsolved = is_unsolved(plans.status)
         return unsolved if self.within is None else unsolved & (plans.violation <= self.within)
 
@@ -198,7 +198,7 @@ class Decision(Protocol):
     """
 
     def check(self, cases: PyTree, /) -> None:
-        """Raise `ArgumentError` for a batch that this cannot decide; on the host."""
+        """Raise `ArgumentError` for a batch that the rule cannot decide; called on the host."""
 
     def propose(self, case: PyTree, /) -> PyTree:
         """Return choices for `case.with_choice`, best first, leaves (F, ...); a pure function."""
@@ -213,7 +213,7 @@ class Decision(Protocol):
         return plans.cost
 
     def explain(self, case: PyTree, status: Array, /) -> Array:
-        """Return the status () of an unsolved case, or a status that explains more; pure."""
+        """Return the status () of an unsolved case, or a status that states the reason; pure."""
         return status
 
 
@@ -288,7 +288,7 @@ def is_better(
         is_good, was_good = later.violation <= tolerance, before.violation <= tolerance
     xp = numpy_of(was_good)
     is_cheaper = is_good & (later.cost < share * before.cost)
-    is_farther = before.violation <= later.violation  # false, too, where either is NaN
+    is_farther = before.violation <= later.violation  # false if one of them is NaN
     is_nearer = xp.isfinite(later.violation) & xp.logical_not(is_farther)
     return xp.where(was_good, is_cheaper, is_good | is_nearer)
 
@@ -304,9 +304,10 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
 
 
 def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
-    """Return plans, changed in place where later plans of some lanes are better; NumPy leaves.
+    """Replace plans in place by later plans of the same cases that are better; NumPy leaves.
 
-    `lanes` are indices of the batch. Later plans beyond their number are padding.
+    `lanes` are the indices of these cases in the batch. Later plans beyond their number are
+    padding.
     """
     later = jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], later)
     better = is_better(later, jax.tree.map(lambda leaf: leaf[lanes], plans))
@@ -335,7 +336,7 @@ def select_first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, bes
     """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
 
     `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is
-    solved, no other is made.
+    is solved already, no other plan is made.
     """
 
     def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:

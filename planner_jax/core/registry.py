@@ -1,6 +1,6 @@
-"""Tasks, planners and suites by name, of the library and of other packages.
+"""Registry of tasks, planners and suites by name, from this library and from other packages.
 
-Another package registers its objects by entry points:
+Another package registers its objects by entry points in its `pyproject.toml`:
 
     [project.entry-points."planner_jax.tasks"]
     meet = "my_package.meet:TASK"
@@ -9,7 +9,7 @@ Another package registers its objects by entry points:
     [project.entry-points."planner_jax.suites"]
     "catch.gusts" = "my_package.suites:draw_gusts"
 
-Nothing here imports JAX, so that names can be listed quickly.
+This module does not import JAX, so that names can be listed quickly.
 """
 
 import dataclasses
@@ -36,27 +36,27 @@ _OWN = {
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """A task: its four functions, planners, suites, and settings of its runs.
+    """The description of a task: its functions, planners and suites, and settings of its runs.
 
     Objects are named as "module:attribute" and imported on first use.
     """
 
-    name: str  # on the command line
+    name: str  # name on the command line
     summary: str  # one line, without a full stop
     home: str  # module with the functions `case`, `draw`, `planner` and `judge`
     planners: Mapping[str, str]  # name -> class or function that makes the planner; default first
     suites: Mapping[str, str]  # name -> a sentence about its cases; default first
-    # Planners read from a file, as in "library:motions.bin" -> the command that writes the file.
+    # Planners that are read from a file, as in "library:motions.bin", and commands that write it.
     from_file: Mapping[str, str] = dataclasses.field(default_factory=dict)
-    # Classes of the settings of its sweeps, and of its flights in `sims`.
+    # Classes with the settings of the task's sweeps, and of its simulated flights in `sims`.
     sweep: str = "planner_jax.runs.settings:SweepSettings"
     flight: str | None = None
-    # Class of the settings of one case that is specified by a few numbers.
+    # Class with the settings of one case that a user specifies by a few numbers.
     single: str | None = None
-    # Options of `planner` in benchmarks of its speed.
+    # Options of `planner` in speed benchmarks.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Planner whose costs are the reference for planners without a long search.
+    # Name of the planner whose costs are the reference for planners without a long search.
     yardstick: str | None = None
 
     @property
@@ -66,7 +66,7 @@ class Task:
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
-        """`draw(num, suite=None, seed=0, *, first=0)`: a batch of a suite.
+        """Function `draw(num, suite=None, seed=0, *, first=0)`, which draws cases of a suite.
 
         Case k of a seed is always the same case; `first` is the k of the first case.
         """
@@ -74,12 +74,12 @@ class Task:
 
     @property
     def planner(self) -> "Callable[..., Planner]":
-        """`planner(name, **options)`: the planner of a name."""
+        """Function `planner(name, **options)`, which makes the planner with this name."""
         return self._function("planner")
 
     @property
     def judge(self) -> "Callable[..., PyTree]":
-        """`judge(cases, plans)`: the referee's verdict."""
+        """Function `judge(cases, plans)`, which returns the verdict of the referee."""
         return self._function("judge")
 
     def all_planners(self) -> dict[str, str | metadata.EntryPoint]:
@@ -92,7 +92,7 @@ class Task:
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
     def split_planner(self, name: object) -> tuple[str, str]:
-        """Return the key of `all_planners` in a planner's name, and its file or "".
+        """Split a planner's name, as in "library:FILE", into its key in `all_planners` and a file.
 
         Raises:
             UnknownName: no planner has this name, or it needs a file or takes none.
@@ -108,7 +108,7 @@ class Task:
         return planner, file
 
     def make_planner(self, name: object, options: Mapping[str, object]) -> "Planner":
-        """Return the planner of a key of `all_planners`, with its file if it is in `from_file`.
+        """Make the planner with a key of `all_planners`, from its file if it is in `from_file`.
 
         Raises:
             UnknownName: no planner has this name, or it needs a file or takes none.
@@ -129,7 +129,7 @@ class Task:
 
 
 def require_name(known: Collection[str], kind: str, name: object) -> str:
-    """Return a name; raise `UnknownName` unless it is known."""
+    """Return a name if it is among the known names; raise `UnknownName` otherwise."""
     if not isinstance(name, str):
         raise UnknownName(kind, "a name", name)
     if name not in known:
@@ -138,7 +138,7 @@ def require_name(known: Collection[str], kind: str, name: object) -> str:
 
 
 def _require_options(planner: str, maker: object, options: Collection[str]) -> None:
-    """Raise `ArgumentTypeError` unless a planner's class, if a dataclass, has these fields."""
+    """Raise `ArgumentTypeError` for an option that is not a field of a planner's dataclass."""
     if isinstance(maker, type) and dataclasses.is_dataclass(maker):
         known = [field.name for field in dataclasses.fields(maker) if field.init]
         for option in options:
@@ -148,7 +148,7 @@ def _require_options(planner: str, maker: object, options: Collection[str]) -> N
 
 
 def suite_named(name: object, default: str) -> str:
-    """Return the name of a suite, or the default for None; raise `UnknownName` for no name."""
+    """Return a suite's name, or the default for None; raise `UnknownName` if it is no text."""
     if name is not None and not isinstance(name, str):
         raise UnknownName("suite", "a name", name)
     return name or default
@@ -157,7 +157,7 @@ def suite_named(name: object, default: str) -> str:
 def split_name(
     known: Collection[str], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
-    """Return a known name and the file after it, as in "policy:FILE", or "".
+    """Split a name such as "policy:FILE" into the known name and the file, "" if there is none.
 
     `kind` is the noun for the named objects, and `from_file` lists the names that may have a file.
 
@@ -174,7 +174,7 @@ def split_name(
 
 
 def task_named(name: object) -> Task:
-    """Return the task of a name, of the library or of another package; raise `UnknownName`."""
+    """Return the task with this name; raise `UnknownName` if neither package nor library has it."""
     tasks = all_tasks()
     return tasks[require_name(tasks, "task", name)]
 
@@ -204,7 +204,7 @@ def all_tasks() -> dict[str, Task]:
 
 
 def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
-    """Return other packages' entry points for a task by name, except names that are taken."""
+    """Return the entry points of other packages for a task by name, without names in use."""
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")

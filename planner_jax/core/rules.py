@@ -1,4 +1,4 @@
-"""Rules on the numbers of cases: one table serves the host and compiled programs.
+"""Rules that the numbers of cases must keep, for checks on the host and in compiled programs.
 
 A class of cases, or of parts of cases such as a target's path, lists its arrays and their rules in
 `rules`. Every number must be finite and keep the rule of its array. On the host `require_sound`
@@ -25,12 +25,12 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError, CaseError
 class Rule:
     """A condition on every number of an array."""
 
-    words: str  # as in "limits.speed must be WORDS, got -1"
-    # Takes an array with any leading axes, and the case or part of it whose table has the rule.
-    # Returns where the condition holds, number by number.
+    words: str  # text of the rule, as in "limits.speed must be WORDS, got -1"
+    # A function of an array with any leading axes, and of the case (or part of a case) that
+    # contains the array. It returns, number by number, where the condition holds.
     holds: Callable[[Numbers, PyTree], Numbers]
-    infinite: bool = False  # whether the number may be infinite
-    other: str = ""  # array of the same part with which the number is compared
+    infinite: bool = False  # whether the numbers may be infinite
+    other: str = ""  # name of the array in the same part with which the numbers are compared
 
 
 FINITE = Rule("finite", lambda value, part: abs(value) < np.inf)
@@ -39,12 +39,12 @@ NOT_NEGATIVE = Rule(">= 0", lambda value, part: value >= 0.0)
 NOT_ZERO = Rule(  # for a vector
     "other than zero", lambda value, part: (value != 0.0) | (value != 0.0).any(-1, keepdims=True)
 )
-# For limits, where infinity means no limit
+# For limits: an infinite number means that there is no limit.
 POSITIVE_OR_NONE = Rule("> 0", lambda value, part: value > 0.0, infinite=True)
 
 
 def within(low: float, high: float, words: str) -> Rule:
-    """Return the rule of a closed interval."""
+    """Return the rule that numbers are in the closed interval from `low` to `high`."""
     return Rule(words, lambda value, part: (value >= low) & (value <= high))
 
 
@@ -54,7 +54,7 @@ def below(other: str) -> Rule:
 
 
 def _is_permutation(value: Numbers, part: PyTree) -> Numbers:
-    """Return where an entry along the last axis is an index of it that occurs only once."""
+    """Return which entries along the last axis are indices of it that occur only once."""
     alike = (value[..., :, None] == value[..., None, :]).sum(axis=-1)
     return (alike == 1) & (value >= 0) & (value < value.shape[-1])
 
@@ -66,11 +66,11 @@ PERMUTATION = Rule("a permutation", _is_permutation)
 class Field:
     """One array of a case: its name, its shape in one case, its rule, and its kind of numbers.
 
-    An array that is None, or in a part that is None, is not checked.
+    An array that is None, or that belongs to a part that is None, is not checked.
     """
 
     name: str  # dotted, as in "limits.speed"
-    shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None is any shape
+    shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None allows any shape
     rule: Rule = FINITE
     kind: type = np.floating
 
@@ -80,7 +80,7 @@ Table = tuple[Field, ...]
 
 @dataclasses.dataclass(frozen=True)
 class Ruled:
-    """One array of a case, and one rule that it must keep."""
+    """One array of a case, one rule that it must keep, and the part that contains it."""
 
     name: str
     value: Numbers
@@ -98,7 +98,7 @@ class Case(Protocol):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch."""
         ...
 
 
@@ -121,17 +121,17 @@ def part_at(tree: PyTree, name: str) -> PyTree:
 
 
 def has_rules(cases: PyTree) -> bool:
-    """Return whether the class of the cases, or of a part of them, has a table."""
+    """Return whether the class of the cases, or of a part of them, has a table of rules."""
     return any(True for _ in _parts(cases))
 
 
 def require_sound(cases: object, names: Mapping[str, str] | None = None) -> None:
-    """Raise for the first rule that a case breaks, in one line.
+    """Raise an error of one line for the first rule that a case breaks.
 
     Args:
-        cases: one case, or a batch, in arrays of any kind. Classes without `rules` pass. Of traced
-            arrays, which have no values yet, only shape and kind are checked.
-        names: the caller's argument names by field names, for the message.
+        cases: one case, or a batch, with NumPy or jax arrays. Classes without `rules` pass. Traced
+            arrays have no values yet, so only their shapes and types are checked.
+        names: maps field names to the caller's names of arguments, for the message.
 
     Raises:
         CaseError: a number breaks its rule; the line has the field, the rule, the value and the
@@ -210,7 +210,7 @@ def require_shapes(cases: PyTree) -> None:
 
 
 def _usual_batch(part: PyTree) -> tuple[int, ...]:
-    """Return the most common axes in front of the axes of one case, among a part's arrays."""
+    """Return the batch shape of most arrays of a part: the axes in front of those of one case."""
     fronts: Counter[tuple[int, ...]] = Counter()
     for name, shape in {field.name: field.shape for field in type(part).rules}.items():
         if shape is not None and (value := part_at(part, name)) is not None:
@@ -230,7 +230,7 @@ def is_sound(cases: PyTree) -> PyTree:
     """Return whether every number of each case keeps its rules, bool of the batch shape; pure."""
     batch = cases.batch_shape
     held = [ruled.holds() for ruled in all_ruled(cases)]
-    # Joined before the reduction: one loop of a compiled program instead of one for each array.
+    # Joining the arrays before the reduction compiles to one loop instead of one for each array.
     xp = numpy_of(*held)
     return xp.concatenate([each.reshape(*batch, -1) for each in held], axis=-1).all(axis=-1)
 
@@ -258,7 +258,7 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
 
 
 def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
-    """Yield dotted prefixes and parts of a case whose class has a table, outer parts first."""
+    """Yield dotted prefixes and parts of a case that have a table of rules, outer parts first."""
     if getattr(type(tree), "rules", None):
         yield place, tree
     children: Mapping[str, PyTree] = {}

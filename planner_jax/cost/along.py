@@ -1,9 +1,9 @@
-"""Penalties integrated along a trajectory of pieces in fixed proportion [Yu2023catch, eq. 26].
+"""Penalties integrated along trajectories with pieces of fixed proportions [Yu2023catch, eq. 26].
 
-This is the innermost part of every solve. On a GPU one kernel computes it (`along_kernel`), which
-keeps the samples of a trajectory in registers; its slopes and their derivatives along a direction
-are kernels too. Elsewhere, and for all other derivatives, JAX compiles the functions of this
-module, which are the reference of the kernels.
+This is the innermost part of every search. On a GPU one CUDA kernel computes it (`along_kernel`),
+which keeps the samples of a trajectory in registers. Further kernels compute its slopes (first
+derivatives) and their derivatives along a direction. On other devices, and for all other
+derivatives, JAX compiles the functions of this module. They are the reference for the kernels.
 """
 
 import dataclasses
@@ -22,37 +22,37 @@ from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_motion
 
-BETWEEN_NODES = 0.004  # typical height of peaks between penalty nodes above the nodes
+BETWEEN_NODES = 0.004  # typical amount by which a peak between penalty nodes exceeds the nodes
 
-# Takes a motion and any pytree of numbers, and no other array. Returns E arrays of the shape of the
-# motion's height, positive where a limit is exceeded.
+# A function of a motion and of any pytree of numbers, and of no other array. It returns E arrays
+# with the shape of the motion's height, positive where a limit is exceeded.
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
-# Takes the same arguments. Returns the cost per second at each sample.
+# A function of the same arguments, which returns the cost per second at each sample.
 Rate = Callable[[Motion, PyTree], Array]
 
 
 @dataclasses.dataclass(frozen=True)
 class Along:
-    """The integrand and the quadrature of penalties: constants of a planner.
+    """Constants of a planner that define its penalties: the integrand and the quadrature.
 
-    h is the mean duration of a segment's pieces.
     A segment's penalty is the integral, by the trapezoid rule, of the weighted smoothed hinges of
-    excess + margin, plus the integral of the rate if there is one.
+    excess + margin, plus the integral of the rate if there is one. h is the mean duration of a
+    segment's pieces.
     """
 
     maps: ProportionalMinco
-    nodes: int  # intervals a piece
+    nodes: int  # number of intervals of each piece
     excess: Excess
     margins: tuple[float, ...]  # (E,), in the unit of each excess
     hinge_width: float
-    # Rate of a case's extras. They take the whole position, which kernels do not compute.
+    # Cost per second of a case's extras, which need the whole position; kernels do not compute it.
     rate: Rate | None = None
-    # Derivatives of the motion that the excess takes, position included: 5 with the snap
+    # Number of derivatives, from the position on, that the excess needs: 4, or 5 with the snap.
     orders: int = 4
-    # Slots (order, axis) of the motion that occur in common limits, for `along_curvature`: the
-    # penalty is a sum of functions of one group each. By default all slots are one group.
+    # Groups of derivatives (order, axis) that occur together in limits, for `along_curvature`. The
+    # penalty is a sum of functions of one group each. By default all derivatives are one group.
     groups: tuple[tuple[tuple[int, int], ...], ...] = ()
-    hinge_weights: tuple[float, ...] = ()  # (E,), of the hinges; 1 by default
+    hinge_weights: tuple[float, ...] = ()  # (E,), weights of the hinges; 1 by default
 
     def __post_init__(self) -> None:
         if not self.hinge_weights:
@@ -62,7 +62,7 @@ class Along:
             object.__setattr__(self, "groups", (every,))
 
     def __repr__(self) -> str:
-        """Return all constants in numbers and names, the same text in every process."""
+        """Return a text of all constants, the same in every process, which identifies kernels."""
         code = self.excess.__module__, getattr(self.excess, "__qualname__", "")
         pieces = tuple(self.maps.proportions.tolist())
         shape = self.maps.order, pieces, self.maps.coefficients.shape[-1], self.nodes
@@ -70,7 +70,7 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return maps (K, orders, C) from columns to samples of the motion, for h = 1."""
+        """Return matrices (K, orders, C) from columns to samples of the derivatives, for h = 1."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 
@@ -87,13 +87,13 @@ class Along:
 def integrate_along(
     along: Along, columns: Array, piece_durations: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
-    """Integrate the penalties of N segments, and find their greatest excesses.
+    """Integrate the penalties of N segments, and return the greatest excess of each segment.
 
     Args:
-        along: constants.
-        columns: (N, C, 3) boundary rows and whitened offsets of each segment.
+        along: the excess functions and the quadrature.
+        columns: (N, C, 3) boundary rows (scaled end states) and whitened offsets of each segment.
         piece_durations: (N,) [s], mean duration h of the pieces of each segment.
-        parameters: second argument of the excess, the same for all segments.
+        parameters: second argument of the excess functions, the same for all segments.
 
     Returns:
         penalties: (N,).
@@ -116,21 +116,21 @@ def greatest_along(
 def _with_kernel(
     function: Callable, along: Along, mode: str, jvp: Callable | None = None
 ) -> Callable:
-    """Bind a function to its constants, with the kernel of a mode."""
+    """Bind a function to the constants `along`, and attach its kernel for a mode of `MODES`."""
     path = "planner_jax.cost.along_kernel:along_kernel"
     return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
 
 
 @functools.cache
 def _greatest(along: Along) -> Callable:
-    """Return `greatest_along` for these constants, with a kernel."""
+    """Make `greatest_along` for these constants, with its CUDA kernel."""
     greatest = functools.partial(_greatest_of_segments, along)
     return with_kernel(greatest, "planner_jax.cost.peaks_kernel:peaks_kernel", along)
 
 
 @functools.cache
 def _integral(along: Along) -> Callable:
-    """Return `integrate_along` for these constants, with kernels for it and two derivatives."""
+    """Make `integrate_along` for these constants, with CUDA kernels for it and derivatives."""
     values = _with_kernel(_values, along, "values")
     slopes = _with_kernel(_slopes, along, "slopes")
     curvature = _with_kernel(_curvature, along, "curvature")
@@ -160,7 +160,7 @@ def _greatest_of_segments(
 
     def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
         motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
-        # The barrier keeps XLA from computing every sample three times for the peaks.
+        # The barrier keeps XLA from computing every sample three times, once for each parabola.
         excess = jax.lax.optimization_barrier(along.excess(motion, parameters))
         return tuple(greatest_by_parabolas(each, along.times()) for each in excess)
 
@@ -170,7 +170,7 @@ def _greatest_of_segments(
 def _values(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
-    """Return penalties and greatest excesses, (N,) each."""
+    """Return the penalties (N,) and the greatest excesses (N,) of N segments."""
     segments = jax.vmap(functools.partial(_of_segment, along), in_axes=(0, 0, None))
     return segments(columns, durations, parameters)
 
@@ -178,14 +178,14 @@ def _values(
 def _slopes(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
-    """Return `_values`, and slopes of the penalties by columns (N, C, 3) and durations (N,)."""
+    """Return `_values`, and the penalties' derivatives by columns (N, C, 3) and durations (N,)."""
     value = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
     penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
     return penalties, worst, *pull_back(jnp.ones_like(penalties))
 
 
 def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
-    """Return `_slopes`, and slopes by the parameters of each segment, N in front."""
+    """Return `_slopes`, and derivatives by the parameters with a leading axis N for segments."""
 
     def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
         value = functools.partial(_of_segment, along)
@@ -197,14 +197,14 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
-    """Return the derivative of `_slopes_by_all` along tangents; parameters are fixed if None."""
+    """Return the derivative of `_slopes_by_all` along tangents; None keeps parameters fixed."""
     moves = 2 if tangents[2] is None else 3
     slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]
 
 
 def _contract(slope: Array, tangent: Array) -> Array:
-    """Return the change of each segment's penalty along a tangent, (N,)."""
+    """Return the change (N,) of each segment's penalty along a tangent."""
     return jnp.sum(slope * tangent, axis=tuple(range(1, slope.ndim)))
 
 
@@ -222,7 +222,7 @@ def _dense(tangent: PyTree) -> PyTree:
 def _of_segment(
     along: Along, columns: Array, duration: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
-    """Return penalty and greatest excess of one segment."""
+    """Return the penalty () and the greatest excess () of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], columns.dtype)
@@ -234,5 +234,5 @@ def _of_segment(
     penalty = duration * jnp.sum(hinges * weights[None])
     if along.rate is not None:
         penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
-    # First over the limits at each sample: on a CPU faster than a maximum of the stack.
+    # First over the limits at each sample, which is faster on a CPU than a maximum of the stack.
     return penalty, jnp.max(functools.reduce(jnp.maximum, each))

@@ -1,9 +1,10 @@
-"""Penalties of `cost.along` with their second derivatives: all of them, or the strong ones.
+"""Penalties of `cost.along` with second derivatives, all or some of them, for Newton's method.
 
-Samples are linear in a segment's columns, and each limit depends on few orders of the motion. So
-the Hessian is a sum over samples and pairs of orders of a number times an outer product of constant
-rows: one product with a constant matrix for each pair of axes, for any number of lanes.
-`jax.hessian` would take one tangent for each unknown. Only the requested entries are computed.
+The samples of a motion are linear in a segment's columns (boundary rows and waypoint offsets), and
+each limit depends on few derivatives of the motion. So the Hessian is a sum over samples and pairs
+of derivatives: a number times an outer product of constant rows. This is one product with a
+constant matrix for each pair of axes, for any number of problems in a batch. `jax.hessian` would
+need one tangent for each unknown. Only the requested entries are computed.
 """
 
 import dataclasses
@@ -21,7 +22,7 @@ from planner_jax.cost.along import Along
 from planner_jax.cost.penalty import smooth_hinge
 from planner_jax.trajectory.polynomial import Motion
 
-_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # of axes
+_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # pairs of axes
 
 Slot = tuple[int, int]  # order of a derivative of the motion, and axis
 
@@ -30,8 +31,8 @@ Slot = tuple[int, int]  # order of a derivative of the motion, and axis
 class AlongCurvature:
     """Penalties of one segment, with derivatives by its variable columns and theta = log h.
 
-    h is the mean duration of a piece. The fixed columns are the rows of the initial state; the row
-    of order d is proportional to h^d.
+    h is the mean duration of a piece. The first columns are fixed: they are rows of the initial
+    state, and the row of the d-th derivative is proportional to h^d.
     """
 
     penalty: Array  # ()
@@ -40,8 +41,9 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives at the samples, from which `columns_columns` and `block_and_diagonal` are
-    # computed: for each group of pairs of axes with common terms (terms K, pairs).
+    # Second derivatives at the K samples, which `columns_columns` and `block_and_diagonal` read. An
+    # array (terms K, pairs) belongs to the pairs of axes that have the same terms (pairs of
+    # orders).
     at_samples: tuple[Array, ...]
 
 
@@ -51,10 +53,10 @@ def curvature_along(
     """Integrate the penalties of one segment, with first and second derivatives.
 
     Args:
-        along: constants.
+        along: the excess functions and the quadrature.
         columns: (G + C, 3) boundary rows and whitened offsets.
         piece_duration: () [s], mean duration of the pieces.
-        parameters: second argument of the excess.
+        parameters: second argument of the excess functions.
         given: G, the number of fixed columns, which come first.
     """
     constants = _constants(along, given)
@@ -69,7 +71,7 @@ def curvature_along(
     rates = jnp.stack(powers)[:, None, None]
     order = np.arange(orders)[:, None, None]
     motion, drift, drift_of_drift = unit * rates[None]  # (orders, K, 3) each
-    # First and second derivatives of the samples by theta.
+    # First and second derivatives of the motion's samples by theta = log h.
     first = drift - samples(order) * motion
     second = drift_of_drift - samples(2.0 * order) * drift + samples(order**2) * motion
     value, worst, slope, curvature = _at_samples(along, motion, parameters)
@@ -110,7 +112,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return all second derivatives by the variable columns, (C, 3, C, 3)."""
+    """Return all second derivatives by the variable columns, as an array (C, 3, C, 3)."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -119,9 +121,9 @@ def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0)
 def block_and_diagonal(
     along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
 ) -> tuple[Array, Array]:
-    """Return second derivatives among the first columns, and the diagonal of the others.
+    """Return second derivatives among the first E = `num` columns, and the others' diagonal.
 
-    Their shapes are (E, 3, E, 3) and (C - E, 3), where E is `num`.
+    The shapes are (E, 3, E, 3) and (C - E, 3).
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
@@ -136,7 +138,7 @@ def _at_samples(
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
     """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,).
 
-    Groups of slots without a common limit share the tangents of one derivative.
+    Groups of derivatives that no limit has in common share the tangents of one differentiation.
     """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
@@ -192,7 +194,7 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return second derivatives by pairs of variable columns, (pairs,) for each pair of axes."""
+    """Return second derivatives by some pairs of variable columns, for each pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -205,7 +207,7 @@ def _entries(
 
 
 def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
-    """Return the matrix (num, 3, num, 3) of the entries of all pairs of columns."""
+    """Combine the entries of all pairs of columns into one matrix (num, 3, num, 3)."""
     blocks = {pair: found.reshape(num, num) for pair, found in entries.items()}
     rows = [
         jnp.stack([blocks[a, b] if a <= b else blocks[b, a].T for b in range(3)], axis=-1)
@@ -216,14 +218,14 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class _Constants:
-    """Constant matrices of `curvature_along`."""
+    """Constant matrices of `curvature_along`; they are cached for each `Along`."""
 
-    # Maps from all columns to samples of all orders, followed by the same maps times the power d
-    # of h in each fixed column and times d^2: (3 orders K, G + C).
+    # Three stacked maps from all columns to samples of all derivatives, (3 orders K, G + C). In the
+    # second map each fixed column is multiplied by d, its power of h; in the third map by d^2.
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Pairs of axes with their common terms, which are pairs of orders.
+    # Groups of pairs of axes, each with the common terms, which are pairs of orders of derivatives.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property
@@ -261,7 +263,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return for each group of pairs of axes the matrix (places, terms K) from the samples."""
+    """Return, for each group of pairs of axes, the matrix (places, terms K) for the samples."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []
@@ -270,7 +272,7 @@ def _matrices(
         for d, e in terms:
             one, other = constants.moving_samples[d], constants.moving_samples[e]  # (K, C) each
             each = one[:, first] * other[:, second]
-            if pairs[0][0] == pairs[0][1] and d != e:  # the equal mixed term is not listed
+            if pairs[0][0] == pairs[0][1] and d != e:  # add the mirrored term, which is not listed
                 each = each + one[:, second] * other[:, first]
             outer.append(each.T)
         found.append(np.concatenate(outer, axis=1))

@@ -1,9 +1,9 @@
-"""`integrate_along` on many lanes as one kernel for CUDA.
+"""A CUDA kernel for `integrate_along` on many lanes, that is, problems of a batch.
 
-One thread computes one lane. It reads the columns once, computes the samples one after another from
-rows of the constant matrices, and sums penalties and, by the transposed product, slopes. Only
-columns and results pass through memory. If there are few lanes, several threads share the samples
-of one lane.
+One thread computes one lane. It reads the columns of a segment once, computes its samples one after
+another from rows of the constant matrices, and sums the penalties. The transposed product gives
+their slopes (derivatives by the columns). Only columns and results pass through memory. If there
+are few lanes, several threads divide the samples of one lane among them.
 """
 
 import dataclasses
@@ -26,30 +26,31 @@ from planner_jax.lanes.kernels import Treedef
 from planner_jax.lanes.pallas import Block, block_width, grid_index, kernel_call
 from planner_jax.trajectory.polynomial import Motion
 
-_THREADS = 128  # lanes of a block
-_ENOUGH = 512  # blocks that keep a large GPU busy
-_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # of position to jerk that a motion has
-_WORST = 1  # index of the greatest excess among the results
+_THREADS = 128  # threads of a block, one for each lane
+_ENOUGH = 512  # number of blocks that keeps a large GPU busy
+_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # used axes of position to jerk: height, then all
+_WORST = 1  # index of the greatest excess among the results of a kernel
 
-# Results: the sum of penalties, and the greatest excess; also slopes by columns and durations; also
-# slopes by the parameters; or the derivative of all of these along a direction.
+# Results of a kernel: "values" are the sum of penalties and the greatest excess; "slopes" adds the
+# derivatives by columns and durations, "slopes by all" also by the parameters; "curvature" is the
+# derivative of all of these along a direction.
 MODES = ("values", "slopes", "slopes by all", "curvature")
 
-Vectors = list[list[Array]]  # columns or derivatives, each of three numbers
+Vectors = list[list[Array]]  # columns, or derivatives of a motion, each with its components
 
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The blocks of a kernel for some trajectories of each lane."""
+    """The division of a kernel's work into blocks, by trajectories and lanes (problems)."""
 
-    trajectories: int
+    trajectories: int  # number of trajectories of each lane
     num_columns: int  # C
     lanes: int
     threads: int  # of a block, one for each lane
 
     @property
     def blocks(self) -> int:
-        """Number of blocks of one trajectory."""
+        """Number of blocks that one trajectory of all lanes needs."""
         return self.lanes // self.threads
 
     @property
@@ -61,21 +62,22 @@ class Grid:
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
-        """Join the axes that `vmap` has put in front of an array of (*own, lanes)."""
+        """Broadcast an array of (*own, lanes), and join the axes that `vmap` put in front of it."""
         return jnp.broadcast_to(leaf, (*lead, *own, self.lanes)).reshape(-1, *own, self.lanes)
 
 
 def grid_of(
     along: Along, leaves: Sequence[Array], points: Sequence[tuple[Array, Array, PyTree]]
 ) -> tuple[Grid, tuple[int, ...]] | None:
-    """Return the grid for some arguments, and the axes that `vmap` has put in front of them.
+    """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
 
-    `leaves` are the leaves of all arguments, and `points` the columns, durations and parameters of
-    a point, or of a point and a direction. The result is None for arguments without a kernel.
+    `leaves` are the leaves of all arguments. `points` has columns, durations and parameters of a
+    point, and for a directional derivative the same of a direction. The result is None if the
+    kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
-    # Extras take vectors and the position, and rotors the snap, which are not computed here.
+    # Extras need vectors and the position, and rotors need the snap, which kernels do not compute.
     if along.rate is not None or along.orders != 4 or threads is None:
         return None
     if any(leaf.dtype != jnp.float32 for leaf in leaves):
@@ -98,7 +100,7 @@ def call_on_grid(
     name: str,
     interpret: bool,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a kernel of the leaves of its arguments; its results have shares of the samples first.
+    """Make a function that runs a kernel; its results have one more axis, for parts of the samples.
 
     `body` takes references to the leaves, to the `constants`, which every block reads, and to the
     results. `shapes` are the results' shapes for one trajectory of one lane.
@@ -112,7 +114,7 @@ def call_on_grid(
         index = lambda t, i, s: (s, t, *(0 for _ in shape), i)  # noqa: E731
         return (grid.shares, grid.trajectories, *shape, grid.lanes), jnp.float32, (block, index)
 
-    inputs: dict[int, Block] = {  # by the number of axes of an argument's leaf
+    inputs: dict[int, Block] = {  # blocks of the leaves, by their number of axes
         1: ((grid.threads,), lambda t, i, s: (i,)),
         2: ((None, grid.threads), lambda t, i, s: (t, i)),
         4: ((None, grid.num_columns, 3, grid.threads), lambda t, i, s: (t, 0, 0, i)),
@@ -136,9 +138,9 @@ def call_on_grid(
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel of one of the functions in `along`; `interpret` runs it without a GPU.
+    """Make the kernel for a mode of `MODES`; with `interpret` it runs without a GPU, for tests.
 
-    The mode "curvature" takes a point and a direction, whose parameters may be None.
+    The mode "curvature" takes a point and a direction. The direction's parameters may be None.
     """
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
@@ -166,7 +168,7 @@ def along_kernel(
 def _call(
     along: Along, mode: str, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the kernel for a grid, a function of the leaves of its arguments."""
+    """Make the function that runs the kernel on a grid; it takes the leaves of the arguments."""
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
     share = -(-num_samples // grid.shares)
@@ -199,7 +201,7 @@ def _call(
 
 
 def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
-    """Return the shapes of the results for one trajectory of one lane."""
+    """Return the shapes of a mode's results for one trajectory of one lane."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]
@@ -211,19 +213,19 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load the number of each lane, or C columns of three numbers."""
+    """Load one number of each lane, or C columns of three numbers of each lane."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
 
 
 def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
-    """Load the row of a sample: position to jerk, each from C columns."""
+    """Load a sample's row of the matrices: C factors for each of position to jerk."""
     return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
 
 
 def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
-    """Write the results; columns are written number by number."""
+    """Write the results to references; columns are written number by number."""
     numbers = iter(values)
     for ref in refs:
         if len(ref.shape) == 3:
@@ -235,7 +237,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return position to jerk for h = 1; of the position the height only."""
+    """Return height, velocity, acceleration and jerk of a sample, with times in units of h."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)
@@ -244,13 +246,13 @@ def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
 
 @dataclasses.dataclass
 class _Sample:
-    """The constants of one sample."""
+    """The constants of one sample: its row of the matrices, and its quadrature weight."""
 
-    row: Vectors  # position to jerk, each from C columns
+    row: Vectors  # C factors for each of position to jerk
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
-        """Convert a slope by the unit motion to a slope by the columns."""
+        """Convert derivatives by the sample of `unit_motion` to derivatives by the columns."""
         return [
             [
                 _total(
@@ -271,11 +273,11 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Evaluate one sample in a mode.
+    """Compute the terms that one sample adds to the results of a mode.
 
     Returns:
-        worst: greatest excess of the sample; None for a curvature.
-        terms: summands of the results, in their order.
+        worst: greatest excess of the sample; None in the mode "curvature".
+        terms: summands of the results, in the order of the results.
     """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
@@ -293,7 +295,11 @@ def _of_sample(
 
 
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
-    """Return the excess over each limit, for a unit motion and a duration h."""
+    """Return the excess over each limit at one sample of a trajectory.
+
+    `unit` is the result of `unit_motion`: height, velocity, acceleration and jerk with times in
+    units of the `duration` h [s], the mean duration of a piece. `given` has gravity and limits.
+    """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]
     vel, acc, jerk = (
@@ -305,7 +311,7 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    """Return the sum of hinges times the duration, and the greatest excess."""
+    """Return the sum of a sample's hinges, times the duration h, and its greatest excess."""
     excess = sample_excess(along, unit, duration, given)
     hinges = [
         factor * smooth_hinge(value + margin, along.hinge_width)
@@ -315,9 +321,9 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return the greatest excess, and the weighted penalty with its slopes by the free arguments.
+    """Return the greatest excess, and the weighted penalty with its derivatives by `free`.
 
-    The arguments of `_penalty` are the free ones, followed by the fixed ones.
+    `_penalty` is called with the arguments `free`, followed by the arguments `fixed`.
     """
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
@@ -326,7 +332,7 @@ def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Arr
 def _curvature(
     along: Along, sample: _Sample, free: tuple, given: PyTree, direction: tuple
 ) -> tuple:
-    """Return the derivative, along a direction, of the weighted penalty and all its slopes."""
+    """Return the derivative, along a direction, of the weighted penalty and its derivatives."""
     columns, duration, given_change = direction
     moving, tangents, still = free, (unit_motion(sample.row, columns), duration), (given,)
     if given_change is not None:

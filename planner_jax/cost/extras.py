@@ -2,9 +2,10 @@
 
 An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, which are
 pure and for one case. The planner calls them with jax arrays, and the referee calls `excess` with
-float64 NumPy arrays: use operators and the methods of both. Another value compiles nothing anew;
-another class does. The search evaluates samples some centimetres apart, and the check of a finished
-plan every few millimetres, with tangents in between. Smaller obstacles may be missed.
+float64 NumPy arrays: use operators and the methods of both. Other values of the arrays need no new
+compilation, but another class does. The search evaluates samples some centimetres apart. The check
+of a finished plan evaluates samples every few millimetres, and the tangents between them. Smaller
+obstacles may be missed.
 """
 
 from collections.abc import Sequence
@@ -26,14 +27,14 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Intervals a piece at which a finished plan is checked against extra limits. Near an edge or a
-# small sphere the excess peaks between samples of the search.
+# Intervals of each piece at which a finished plan is checked against extra limits. They are short
+# because near an edge or a small sphere the excess peaks between the samples of the search.
 _CLOSE_NODES = 64
 
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """A limit that the planner keeps and the referee checks."""
+    """A limit that a user defines; the planner keeps it and the referee checks it."""
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the excess (...), > 0 if broken, of a motion (..., 3) in SI units."""
@@ -42,7 +43,7 @@ class ExtraLimit(Protocol):
 
 @runtime_checkable
 class ExtraCost(Protocol):
-    """A term of the planner's cost; the referee ignores it."""
+    """A term of the planner's cost that a user defines; the referee ignores it."""
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the cost per second (...), >= 0, of a motion (..., 3) in SI units."""
@@ -53,7 +54,7 @@ Extra = ExtraLimit | ExtraCost
 
 
 def _size(vector: Numbers) -> Numbers:
-    """Return the length (...) of vectors (..., 3), with slope zero at zero."""
+    """Return the length (...) of vectors (..., 3), smoothed so that its slope at zero is zero."""
     return ((vector**2).sum(-1) + 1e-12) ** 0.5
 
 
@@ -67,7 +68,7 @@ class KeepOut:
     radius: Numbers  # () [m], > 0
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the depth over the radius."""
+        """Return the depth of the positions inside the sphere, divided by its radius."""
         return 1.0 - _size(pos - self.centre) / self.radius
 
 
@@ -81,7 +82,7 @@ class KeepOutBox:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the depth below the nearest face, over half of the shortest side."""
+        """Return the depth behind the box's nearest face, divided by half of the shortest side."""
         half = 0.5 * (self.high - self.low)
         return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
 
@@ -96,7 +97,7 @@ class Plane:
     normal: Numbers  # (3,), of any length
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the distance [m] beyond the plane."""
+        """Return the distance [m] of the positions beyond the plane, negative on the good side."""
         return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
 
 
@@ -110,16 +111,17 @@ class Geofence:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the distance [m] outside, along the worst axis."""
+        """Return the distance [m] outside of the box, along the axis where it is greatest."""
         half = 0.5 * (self.high - self.low)
         return (abs(pos - self.low - half) - half).max(-1)
 
 
 @struct.dataclass
 class SpeedZone:
-    """A speed limit within a sphere, which fades out up to 1.25 radii.
+    """A speed limit within a sphere, which fades out between the sphere and 1.25 radii.
 
-    The limit is speed / (u^2 (3 - 2 u)), where u falls from one to zero: continuous with its slope.
+    The limit is speed / (u^2 (3 - 2 u)), where u falls linearly from one at the sphere to zero at
+    1.25 radii. This limit and its slope are continuous.
     """
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("speed", None, POSITIVE))
@@ -129,14 +131,14 @@ class SpeedZone:
     speed: Numbers  # () [m/s], > 0
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return speed / limit - 1."""
+        """Return the ratio of the speed to the limit at the position, minus 1."""
         u = (5.0 - 4.0 * _size(pos - self.centre) / self.radius).clip(0.0, 1.0)
         return u * u * (3.0 - 2.0 * u) * _size(vel) / self.speed - 1.0
 
 
 @struct.dataclass
 class Dislike:
-    """A sphere with a cost, which the quadrotor avoids if it can."""
+    """A sphere with a cost inside it, which the quadrotor avoids if it can."""
 
     rules: ClassVar[Table] = (Field("radius", None, POSITIVE), Field("weight", None, NOT_NEGATIVE))
 
@@ -151,10 +153,10 @@ class Dislike:
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Return extras whose leaves have a dtype and the axes of a batch, () or (B,), in front.
+    """Convert extras for a batch: all leaves get a dtype, and the batch axes () or (B,) in front.
 
     Raises:
-        ArgumentError: the extras are no sequence, or one is no extra for one case or for the batch.
+        ArgumentError: the extras are not a sequence, or an entry does not fit a case or the batch.
     """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
@@ -199,7 +201,8 @@ def greatest_extras(
     """Return the greatest excess () over each extra limit along a whole segment.
 
     The maximum is not missed if the excess is concave between samples: see
-    `penalty.greatest_by_tangents`. The other arguments are as for `cost.along`, for one segment.
+    `penalty.greatest_by_tangents`. `maps`, `columns` and `duration` describe one segment, as for
+    `cost.along`.
     """
     if not num_limits(extras):
         return ()

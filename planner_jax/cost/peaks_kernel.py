@@ -1,7 +1,7 @@
-"""`greatest_along` on many lanes as one kernel for CUDA.
+"""A CUDA kernel for `greatest_along` on many lanes, that is, problems of a batch.
 
 One thread computes one lane, as in `along_kernel`. It computes the samples one after another and
-keeps the excesses of the last two, to evaluate the parabola through each three neighbours.
+stores the excesses of the last two, to evaluate the parabola through each three neighbours.
 """
 
 import functools
@@ -30,7 +30,7 @@ from planner_jax.lanes.pallas import grid_index
 def peaks_kernel(
     along: Along, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel of `greatest_along`; `interpret` runs it without a GPU."""
+    """Make the kernel of `greatest_along`; with `interpret` it runs without a GPU, for tests."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         columns, durations, *parameters = leaves
@@ -49,7 +49,7 @@ def peaks_kernel(
 def _call(
     along: Along, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the kernel for a grid, a function of the leaves of its arguments."""
+    """Make the function that runs the kernel on a grid; it takes the leaves of the arguments."""
     matrices, steps = along.matrices(), np.diff(along.times())
     num_samples, num = len(matrices), len(along.margins)
     share = -(-num_samples // grid.shares)
@@ -59,7 +59,7 @@ def _call(
         matrices_ref, steps_ref, *out = refs[treedef.num_leaves :]
         columns, duration, given = jax.tree.unflatten(treedef, leaves)
         begin = grid_index(2) * share
-        # One more sample on either side, for the parabolas at the ends of the share.
+        # One more sample on either side, for the parabolas at the ends of this thread's samples.
         first = jnp.maximum(begin - 1, 0)
         last = jnp.minimum(begin + share + 1, num_samples)
 

@@ -14,7 +14,7 @@ def smooth_hinge(x: Array, width: float | Array | Array) -> Array:
 
     It is twice continuously differentiable. mu is the `width`, > 0.
     """
-    # `where` is faster than `clip` and `maximum`, whose slopes divide.
+    # `where` is faster than `clip` and `maximum`, whose derivatives contain divisions.
     below = x < width
     inside = jnp.where(below, jnp.where(x > 0.0, x, 0.0), width)
     blend = (width - 0.5 * inside) * (inside * (1.0 / width)) ** 3
@@ -31,7 +31,7 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
 def join_trapezoid_weights(
     num_intervals: int, proportions: np.ndarray | Sequence[float]
 ) -> np.ndarray:
-    """Return trapezoid weights (M n + 1,) of M pieces of n intervals that share their ends."""
+    """Return trapezoid weights (M n + 1,) of M pieces of n intervals with common end nodes."""
     weights = np.zeros(len(proportions) * num_intervals + 1)
     for i, share in enumerate(proportions):
         span = slice(i * num_intervals, (i + 1) * num_intervals + 1)
@@ -40,7 +40,7 @@ def join_trapezoid_weights(
 
 
 def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
-    """Return the maximum () of samples (K,) and of parabolas through each three neighbours.
+    """Return the maximum () of samples (K,) and of the parabolas through each three neighbours.
 
     For a smooth quantity the error is of third order in the step. `times` (K,) are in any unit.
     """

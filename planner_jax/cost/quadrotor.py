@@ -1,8 +1,8 @@
-"""Excess of samples of a trajectory over the quadrotor's limits.
+"""Functions that compute how far samples of a trajectory exceed the quadrotor's limits.
 
-Most functions return q^2 / limit^2 - 1 for a quantity q: positive where the limit is exceeded, and
-differentiable without a square root. `relative` converts it to q / limit - 1. Vectors may be tuples
-of their components, as in a kernel.
+Most functions return the excess q^2 / limit^2 - 1 of a quantity q. It is positive where the limit
+is exceeded, and needs no square root. `relative` converts it to q / limit - 1. Vectors may be
+tuples of their components, as they are in a CUDA kernel.
 """
 
 import dataclasses
@@ -48,7 +48,7 @@ def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """Return |omega|^2 / omega_max^2 - 1 by flatness [Yu2023bat, eq. 18a]."""
+    """Return |omega|^2 / omega_max^2 - 1 for body rates omega by flatness [Yu2023bat, eq. 18a]."""
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
@@ -56,7 +56,8 @@ def body_rate_excess(
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
     """Return z_min - z [m] for heights z (...) [m].
 
-    It is [Yu2023catch, eq. 28] without the printed squares, which change sign below ground.
+    It is [Yu2023catch, eq. 28] without the square that is printed there, which changes the sign
+    below the ground.
     """
     return limits.min_height - height
 
@@ -64,7 +65,7 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
 ) -> tuple[PyTree, ...]:
-    """Return the excess (N,) over each limit of flight, then over each extra limit."""
+    """Return the excess (N,) over each limit of flight, then over each limit of the extras."""
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
@@ -87,7 +88,7 @@ def thrust_excess(
 
 
 class QuadrotorCase(Protocol):
-    """The fields of a case, a dataclass, that the penalties of a flight use."""
+    """The fields that a case, a dataclass, must have for the penalties of a flight."""
 
     __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[PyTree]]]
 
@@ -98,7 +99,7 @@ class QuadrotorCase(Protocol):
 
     @property
     def gravity(self) -> Array:
-        """Magnitude () [m/s^2]."""
+        """Magnitude () [m/s^2] of the gravitational acceleration."""
         ...
 
     @property
@@ -108,7 +109,7 @@ class QuadrotorCase(Protocol):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch."""
         ...
 
     @property
@@ -126,11 +127,11 @@ class Measure(enum.Enum):
 
     @property
     def factor(self) -> float:
-        """Ratio of the excess to a small relative excess of q."""
+        """Ratio of the excess to the relative excess of q, if both are small."""
         return 1.0 if self is Measure.PLAIN else 2.0
 
     def relative(self, excess: Array) -> Array:
-        """Return the relative excess of q."""
+        """Convert the excess to the relative excess of q over its limit."""
         if self is Measure.ABOVE:
             return relative(excess)
         if self is Measure.BELOW:
@@ -139,7 +140,7 @@ class Measure(enum.Enum):
 
 
 def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return each rotor's thrust above its maximum, then below its minimum, over the maximum."""
+    """Return the rotors' thrusts above maximum, then below minimum, divided by the maximum."""
     rotors = limits.rotors
     assert rotors is not None
     thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
@@ -150,12 +151,12 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """Limits that a quadrotor has together or not at all."""
+    """A group of limits that a quadrotor has either completely or not at all."""
 
-    field: str  # of `QuadrotorLimits`; None there without these limits
+    field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
-    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # takes the gravity, too
-    orders: tuple[int, ...]  # derivatives of the motion in the excess
+    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # of motion and gravity
+    orders: tuple[int, ...]  # orders of the motion's derivatives on which the excess depends
 
 
 _ABOVE, _BELOW, _PLAIN = Measure
@@ -187,7 +188,7 @@ _KINDS = (
 
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
-    """Return the kinds of limits that a quadrotor has."""
+    """Return the groups of limits that a quadrotor has."""
     return [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
 
 
@@ -199,7 +200,7 @@ def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 
 def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
-    """Return the measures of the excesses of `flight_excess`."""
+    """Return the formula of each excess that `flight_excess` returns."""
     return tuple(measure for kind in _kinds(limits) for measure in kind.measures)
 
 
@@ -209,7 +210,7 @@ def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
 
 
 def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
-    """Return the relative excesses, given the results of `flight_excess`."""
+    """Convert the excesses that `flight_excess` returns to relative excesses."""
     measures = flight_measures(limits)
     return [of.relative(each) for of, each in zip(measures, excess, strict=True)]
 
@@ -217,9 +218,10 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Return the penalties of all limits along a flight; squares get twice the relative margin.
+    """Return the penalties of all limits along a flight, for `integrate_along`.
 
-    Of the case only the existence of its `limits` and `extras` matters, not their values.
+    Excesses with squares get twice the relative margin. Only the existence of the case's limits
+    and extras matters, not their values.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
@@ -231,7 +233,7 @@ def flight_along(
 
 
 def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Return the slots (order, axis) of the motion in common limits; of positions, the height."""
+    """Return groups of derivatives (order, axis) in common limits; of positions, the height."""
     together: list[set[int]] = []
     for kind in _kinds(limits):
         joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))
@@ -248,7 +250,8 @@ def greatest_excess(
     """Return the greatest relative excess over each limit in N segments of a plan, (N,) each.
 
     Peaks between the samples count, by parabolas for limits of flight and by tangents for extras.
-    The other arguments are as for `greatest_along`.
+    The other arguments are as for `greatest_along`. Peaks between samples count: they are computed
+    by parabolas for limits of flight and by tangents for extras.
     """
     bare = dataclasses.replace(case, extras=())
     along = flight_along(maps, nodes, bare, 0.0, 1.0)

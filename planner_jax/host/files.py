@@ -1,4 +1,4 @@
-"""Read regular files only, and write files atomically."""
+"""Functions that read regular files only, and write files atomically."""
 
 import contextlib
 import errno
@@ -21,7 +21,7 @@ def open_plain(path: str | os.PathLike) -> BinaryIO:
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
-    """Provide a scratch file that replaces a file when the block ends without an error.
+    """Provide a scratch file, which replaces the file `path` if the block ends without an error.
 
     The scratch file is flushed to the disk before it is renamed, and the folder afterwards. Its
     name holds the number of the process, and ends with the name of the file, because some writers
@@ -50,7 +50,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 
 def new_file_problem(path: str | os.PathLike) -> str:
-    """Return what a path must be for a new file to be created there; "" if one can be."""
+    """Return the rule that a path breaks if no new file can be created there, otherwise ""."""
     place = Path(path)
     if os.path.lexists(place):
         return "a new file"
@@ -69,6 +69,6 @@ def to_disk(path: Path) -> None:
 
 
 def is_scratch(path: Path) -> bool:
-    """Return whether `replacing` left a file because its process was killed."""
+    """Return whether a file has the name of a scratch file that `replacing` left when killed."""
     first, _, rest = path.name.removeprefix(".").partition(".")
     return path.name.startswith(".") and first.isdigit() and rest.startswith("tmp.")

@@ -1,4 +1,4 @@
-"""Memory, disk, processor and threads of the machine.
+"""Functions that measure the machine's memory, disk, processor and threads.
 
 The command line imports this module before it imports JAX.
 """
@@ -25,7 +25,7 @@ def available_memory() -> int | None:
 
 
 def _of_system() -> int | None:
-    """Return the free memory of the system."""
+    """Return the free memory of the system in bytes; None if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -38,7 +38,7 @@ def _of_system() -> int | None:
 
 
 def _of_container() -> int | None:
-    """Return the free memory of the container; None outside of one."""
+    """Return the free memory of the container in bytes; None outside of a container."""
     try:
         most = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         taken = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
@@ -65,7 +65,7 @@ def free_disk(folder: str | os.PathLike) -> int | None:
 
 
 def format_size(size: float) -> str:
-    """Return a number of bytes as text with a unit."""
+    """Format a number of bytes as text with a unit."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1e3:
             return f"{size:.3g} {unit}"
@@ -82,7 +82,7 @@ def resident_memory() -> int | None:
     return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
-_VECTORS = ("avx512f", "avx2", "avx", "sve2", "sve", "asimd")  # the widest first
+_VECTORS = ("avx512f", "avx2", "avx", "sve2", "sve", "asimd")  # instruction sets, widest first
 
 
 def usable_cores() -> int:
@@ -98,8 +98,8 @@ def threads_of_a_computation() -> int:
     """Return the number of threads that XLA uses for one computation on a CPU.
 
     The environment variable PJRT_NPROC or NPROC sets the number. Its default is the number of
-    usable cores. On some CPUs it affects the last digits of results. Call this function when JAX
-    has started, or is about to start.
+    usable cores. On some CPUs the number affects the last digits of results. Call this function
+    when JAX has started, or is about to start.
     """
     number = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
     return max(int(number), 1) if number.isdecimal() else usable_cores()
@@ -109,7 +109,7 @@ def threads_of_a_computation() -> int:
 def processor() -> str:
     """Return the name of the processor and its widest vector instructions.
 
-    NumPy and XLA choose their algorithms by both, which affects the last digits of results.
+    NumPy and XLA select their algorithms by them, which affects the last digits of results.
     """
     entries: dict[str, str] = {}
     try:
@@ -135,7 +135,7 @@ def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Re
     here = jax.config.jax_enable_x64  # type: ignore[attr-defined]
 
     def call(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
-        # Enabling a precision that is enabled would compile programs again.
+        # Setting the precision that is set already would compile programs again.
         is_equal = jax.config.jax_enable_x64 == here  # type: ignore[attr-defined]
         with contextlib.nullcontext() if is_equal else jax.enable_x64(here):
             return function(*args, **kwargs)

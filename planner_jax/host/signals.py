@@ -1,11 +1,11 @@
 """Handling of Ctrl-C, SIGTERM and SIGHUP: the command prints one line and exits with its own code.
 
-By default a signal ends the process at once, from a thread of its own: the main thread may be
-inside the compiler. Files are whole at any moment, because they are renamed into place. Within
-`under_way` the first signal only sets a flag. The main thread calls `check` where it can stop
-cleanly, and has `GRACE` seconds to do so. No exception is raised elsewhere, so that no signal is
-lost or causes a traceback. The process exits without shutting the interpreter down, because
-threads of XLA that still compute would crash.
+By default a signal ends the process at once. A separate thread does this, because the main thread
+may be inside the compiler. No file is half-written then, because files are renamed into place when
+they are complete. Within `under_way` the first signal only sets a flag. The main thread calls
+`check` where it can stop cleanly, and has `GRACE` seconds to do so. No exception is raised
+elsewhere, so that no signal is lost or causes a traceback. The process exits without shutting the
+interpreter down, because XLA's threads that still compute would crash.
 """
 
 import contextlib
@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-GRACE = 5.0  # [s] for the main thread to stop cleanly
+GRACE = 5.0  # [s] time in which the main thread can stop cleanly
 NOTHING = "there is nothing to resume"
 _WORDS = {
     signal.SIGINT: "interrupted",
@@ -29,7 +29,7 @@ class Stopped(KeyboardInterrupt):
 
 
 class _State:
-    """State of the process, which has one set of signal handlers."""
+    """The state of signal handling, which exists once for each process."""
 
     def __init__(self) -> None:
         self.number: int | None = None  # number of the first signal
@@ -103,7 +103,7 @@ def leave() -> NoReturn:
 
 
 def _watch(reader: int) -> None:
-    """Read the numbers of signals, which the interpreter's own handler writes to a pipe."""
+    """Read the numbers of received signals from a pipe, and stop the process when one arrives."""
     while True:
         for number in os.read(reader, 64):
             if number not in _WORDS:

@@ -1,9 +1,9 @@
-"""Functions of one lane that have a kernel for CUDA, and the switch for all kernels.
+"""The functions that have a CUDA kernel for batches, and the switch for all kernels.
 
-A function with a kernel is compiled by `jax.jit` under a name of its own, the only mark that every
-transformation of an enclosing function preserves. `over_lanes` finds a call of that name and calls
-the kernel instead. A kernel's module is imported when a program for a GPU is traced, and never on a
-machine without a GPU.
+A lane is one problem of a batch. A function of one lane that has a kernel is compiled by `jax.jit`
+under its own name, because only this name survives all transformations of an enclosing function.
+`over_lanes` finds a call with that name and calls the kernel for all lanes instead. The module of a
+kernel is imported when a program for a GPU is traced, and never on a machine without a GPU.
 """
 
 import dataclasses
@@ -28,13 +28,13 @@ SWITCH = "PLANNER_JAX_KERNELS"
 Results = TypeVar("Results")
 Shape = tuple[int, ...]
 Treedef = Any  # a PyTreeDef, whose class JAX hides from type checkers
-# Takes the leaves of a function's arguments, with the lanes last; returns the leaves of the
-# results, or None if the kernel does not support such shapes or types.
+# Takes the leaves of a function's arguments, with the lanes (problems) on the last axis. Returns
+# the leaves of the results, or None if the kernel does not support such shapes or types.
 Kernel = Callable[[Sequence[Array]], Sequence[Array] | None]
 
 
 class Kernels(enum.Enum):
-    """The state of kernels in programs for CUDA, in words."""
+    """Whether programs for CUDA use the library's kernels; the values are texts for users."""
 
     ON = "on"
     OFF = f"off, by {SWITCH}"
@@ -42,7 +42,7 @@ class Kernels(enum.Enum):
 
 
 def kernels() -> Kernels:
-    """Return whether programs for CUDA have kernels.
+    """Return whether programs for CUDA use the library's kernels.
 
     Raises:
         ValueError: the environment variable PLANNER_JAX_KERNELS is neither "on" nor "off".
@@ -53,7 +53,7 @@ def kernels() -> Kernels:
 
 
 def in_use() -> bool:
-    """Return whether a function that is traced at present gets kernels. Raises as `kernels`."""
+    """Return whether a function that is being traced gets kernels; raises as `kernels` does."""
     return is_switched_on() and has_gpu() and _has_triton()
 
 
@@ -63,7 +63,7 @@ def has_gpu() -> bool:
 
 
 def is_switched_on() -> bool:
-    """Return whether the environment variable allows kernels. Raises as `kernels`."""
+    """Return whether the environment variable allows kernels; raises as `kernels` does."""
     value = os.environ.get(SWITCH, "on")
     if value not in ("on", "off"):
         raise ArgumentError(SWITCH, "one of on, off", value)
@@ -80,12 +80,12 @@ def _has_triton() -> bool:
 
 @dataclasses.dataclass
 class _Entry:
-    """A compiled function that has a kernel."""
+    """A compiled function that has a kernel: the kernel's factory, and the function's shapes."""
 
     path: str
     constants: tuple[Hashable, ...]
     treedef: Treedef  # of the arguments
-    shapes: list[Shape]  # of the leaves of one lane's arguments and results
+    shapes: list[Shape]  # of the leaves of arguments and results of one lane (problem)
 
 
 _ENTRIES: dict[str, _Entry] = {}  # by the names of compiled functions
@@ -97,10 +97,10 @@ def with_kernel(
     *constants: Hashable,
     jvp: Callable[[tuple, tuple], tuple[Results, Results]] | None = None,
 ) -> Callable[..., Results]:
-    """Attach a kernel to a function; `over_lanes` calls it in programs for CUDA.
+    """Attach a kernel to a function of one problem; `over_lanes` calls it for a batch on a GPU.
 
     Args:
-        function: takes pytrees of arrays of ONE lane, and returns a pytree of arrays.
+        function: takes pytrees of arrays of ONE lane (problem), and returns a pytree of arrays.
         path: "module:name" of a factory of kernels, which takes the constants. A kernel takes the
             tree of the arguments and their leaves with the lanes last, and returns the leaves of
             the results, or None. `jax.vmap` within a lane adds axes in front of some leaves. If it
@@ -127,7 +127,7 @@ def with_kernel(
         call.__name__ = call.__qualname__ = name
         return jax.jit(call)
 
-    # JAX's own derivative of the named function would have its name, and get its kernel.
+    # JAX's own derivative of the named function would keep the name, and wrongly get the kernel.
     @jax.custom_jvp
     def call_named(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
@@ -146,11 +146,11 @@ def shape_of(atom: Any) -> Shape:
 
 
 def kernel_of(eqn: JaxprEqn) -> Kernel | None:
-    """Return the kernel for a call in a jaxpr; None if its function has none."""
+    """Return the kernel for a call in a jaxpr, or None if the called function has no kernel."""
     entry = _ENTRIES.get(eqn.params.get("name", ""))
     if entry is None:
         return None
-    # Reverse mode splits a function in two that keep its name, but not all of its shapes.
+    # Reverse mode splits a function into two parts with the same name, but without all its shapes.
     shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(entry.shapes) and all(
         of_call[len(of_call) - len(of_lane) :] == of_lane

@@ -1,9 +1,9 @@
-"""`over_lanes`: `jax.vmap` that keeps the lanes on the last axis of every array.
+"""`over_lanes`: it works as `jax.vmap`, but keeps the batch axis last in every array.
 
-`vmap` puts the lanes first, so that the few numbers of one lane are neighbours in memory. In a loop
-that is bound by memory, the neighbours should be the same number of other lanes: then every read is
-one whole line of memory, a sum over samples needs no exchange between threads, and the product with
-a constant matrix is one large product. The numbers are the same in another layout.
+A lane is one problem of the batch. `vmap` puts the lanes first, so that the few numbers of one lane
+are neighbours in memory. If a loop is limited by memory speed, neighbours should be the same number
+of different lanes. Then every read is one whole line of memory, a sum over samples needs no
+exchange between threads, and the product with a constant matrix is one large product.
 """
 
 import functools
@@ -23,8 +23,8 @@ Results = TypeVar("Results")
 _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
-# Operations that return their operands. In a program for several devices `jnp.where` and others use
-# `reshard` to mark an array as local to a device; within one lane every array is.
+# Operations that return their operands unchanged. In a program for several devices `jnp.where` and
+# others use `reshard` to mark arrays as local to a device; within one lane all arrays are local.
 _UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "
@@ -32,7 +32,7 @@ _ELEMENTWISE = frozenset(
     "lt max min mul ne neg not or pow reduce_precision rem round rsqrt select_n sign sin sinh "
     "sqrt square sub tan tanh xor".split()
 )
-# Operations whose parameters count axes from the front, which the lanes do not change.
+# Operations whose parameters count axes from the front, so that a last axis changes nothing.
 _BY_AXIS = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
     "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
@@ -40,7 +40,7 @@ _BY_AXIS = frozenset(
 
 
 class _Lanes:
-    """An array with lanes on its last axis."""
+    """An array whose last axis runs over the lanes, which are the problems of the batch."""
 
     def __init__(self, array: Array) -> None:
         self.array = array
@@ -50,7 +50,7 @@ _Value = Any  # `_Lanes`, or an array or a number that is the same for all lanes
 
 
 def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
-    """Map a function of one lane over many lanes at once.
+    """Map a function of one lane (problem of a batch) over many lanes at once.
 
     Args:
         function: takes pytrees of arrays of ONE lane, and returns a pytree of arrays.
@@ -77,21 +77,21 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
 
 
 def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    """Return the array of a value, of (*shape, lanes)."""
+    """Return a value as an array (*shape, lanes); a value common to all lanes is repeated."""
     if isinstance(value, _Lanes):
         return value.array
     return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    """Evaluate a function of one lane; arguments and results have the lanes last."""
+    """Evaluate a function of one lane for all lanes; arguments and results have them last."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]
 
 
 def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
-    """Evaluate a function of one lane operation by operation."""
+    """Evaluate a function of one lane for all lanes, operation by operation."""
     jaxpr = closed.jaxpr
     values: dict[Var, _Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -108,7 +108,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
-    """Evaluate one operation, by a kernel or a rule if it has one."""
+    """Evaluate one operation for all lanes, by a kernel or by a rule of `_RULES` if it has one."""
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
@@ -138,8 +138,8 @@ def _by_kernel(
 ) -> list[_Value]:
     """Evaluate a call of a function that has a kernel.
 
-    The program contains both: the kernel, which is compiled for CUDA, and the function's
-    operations, which are compiled for other devices, and for shapes that the kernel does not
+    The program contains two versions: the kernel, which is compiled for CUDA, and the function's
+    operations, which are compiled for other devices and for shapes that the kernel does not
     support.
     """
     pairs = zip(inputs, eqn.invars, strict=True)
@@ -153,7 +153,7 @@ def _by_kernel(
         results = kernel(leaves)
         if results is None:
             return by_operations(*leaves)
-        # A result that does not vary along an axis of `vmap` lacks this axis.
+        # A result that is constant along an axis of `vmap` lacks this axis.
         pairs = zip(results, shapes, strict=True)
         results = [result[(0,) * (result.ndim - len(shape))] for result, shape in pairs]
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))
@@ -170,7 +170,7 @@ def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Ar
 
 
 def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    """Return an operand of an elementwise operation, of (*shape, lanes)."""
+    """Return an operand of an elementwise operation, broadcast to (*shape, lanes)."""
     array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
     if array.ndim == 1 and shape:  # one number for each lane, such as the bound of a clamp
         array = array.reshape((1,) * len(shape) + array.shape)
@@ -214,7 +214,7 @@ def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
 
 
 def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
-    """Multiply by a matrix that all lanes share: one product, the lanes among its columns."""
+    """Multiply by a matrix that all lanes share: one product, with the lanes as columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
     if both or batch != ((), ()):

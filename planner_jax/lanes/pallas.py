@@ -1,7 +1,7 @@
-"""The only module that imports Pallas, JAX's language for kernels.
+"""Helpers for CUDA kernels: the only module that imports Pallas, JAX's language for kernels.
 
-Kernels use Pallas' Triton backend. When JAX removes it, this is the only module to rewrite
-(docs/lanes_and_kernels.md).
+The kernels use Pallas' Triton backend. If JAX removes this backend, only this module must be
+rewritten (docs/lanes_and_kernels.md).
 """
 
 import importlib.util
@@ -17,17 +17,17 @@ from jax.experimental import pallas
 from jax.experimental.pallas.triton import CompilerParams, load, store
 from jax.typing import DTypeLike
 
-# Shape of a block, None for an axis that it lacks; and its index, counted in blocks, as a function
-# of the index in the grid.
+# The part of an array that one run of a kernel's body accesses: its shape, with None for an axis
+# that it lacks, and a function from the index in the grid to the block's index, counted in blocks.
 Block = tuple[tuple[int | None, ...], Callable[..., tuple]]
 
-_FEWEST = 16  # least lanes of a block of a kernel
+_FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kernel
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the width of a kernel's block in lanes, or None if it would be too small.
+    """Return the number of lanes (problems) in a kernel's block, or None if it would be too small.
 
-    The width divides the number of lanes, and is at most `most`, a power of two.
+    The result divides the number of lanes, and is at most `most`, a power of two.
     """
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
@@ -47,14 +47,15 @@ def kernel_call(
     """Make a kernel: a function of arrays that runs a body once for every index of a grid.
 
     Args:
-        body: takes references to a block of each input, then of each output, which it writes.
-        grid: size along each axis.
-        inputs: block of every input.
-        outputs: shape, type and block of every output.
+        body: function that takes references to a block of each input and of each output, and writes
+            the outputs.
+        grid: number of indices along each axis.
+        inputs: the block of every input.
+        outputs: the shape, type and block of every output.
         name: name of the kernel in profiles and compiled programs.
-        threads: threads that run the body.
+        threads: number of threads that run the body.
         in_place: number of first inputs that the outputs of the same index overwrite.
-        interpret: run it without a GPU, for tests.
+        interpret: whether to run the kernel without a GPU, for tests.
     """
     _spare_searches()
     return pallas.pallas_call(
@@ -82,7 +83,7 @@ def kernel_by_lanes(
     in_place: int = 0,
     interpret: bool = False,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a `kernel_call` in float32 whose blocks hold all numbers of `width` lanes.
+    """Make a `kernel_call` in float32 whose blocks contain all numbers of `width` lanes (problems).
 
     `inputs` and `outputs` are shapes without the lanes, which are the last axis. There is one
     thread for each lane by default. The other arguments are as for `kernel_call`.
@@ -114,15 +115,15 @@ def store_masked(ref: Ref, index: tuple, value: Array, mask: Array) -> None:
 
 
 def grid_index(axis: int) -> Array:
-    """Return the index along an axis of the grid at which a body runs."""
+    """Return the index along an axis of the grid at which the kernel's body is running."""
     return pallas.program_id(axis)
 
 
 def _spare_searches() -> None:
-    """Reduce the time to lower a kernel by a third.
+    """Provide an empty module that JAX looks for, which makes kernels a third faster to lower.
 
-    For every value that MLIR passes to Python, it imports a module of Triton's dialect that jaxlib
-    does not contain. An empty module saves thousands of searches of the path.
+    For every value that MLIR passes to Python, it tries to import a module of Triton's dialect that
+    jaxlib does not contain. The empty module saves thousands of searches of the import path.
     """
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:

@@ -1,1 +1,1 @@
-"""Trajectories to standstill that follow the end of a plan."""
+"""Recovery trajectories, which lead from the end of a plan to standstill."""

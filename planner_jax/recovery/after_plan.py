@@ -1,4 +1,4 @@
-"""Recovery trajectories for an existing plan of any robot."""
+"""Append a recovery trajectory, which leads to standstill, to an existing plan of any robot."""
 
 import dataclasses
 
@@ -18,8 +18,8 @@ from planner_jax.robot.car import CarPlan
 from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
-_ARM_AT_REST = 0.01  # [rad/s], fastest joint of an arm at standstill
-_NODES = 40  # intervals of a piece, in the search for the exceeded limit
+_ARM_AT_REST = 0.01  # [rad/s] greatest joint rate of an arm that counts as standing still
+_NODES = 40  # intervals of each piece at which the search for the exceeded limit samples it
 
 
 def is_rested(found: Plan) -> bool:
@@ -33,19 +33,19 @@ def is_rested(found: Plan) -> bool:
 
 
 def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
-    """Return one plan that ends at standstill.
+    """Extend a plan by a recovery trajectory, so that it ends at standstill.
 
     Args:
         case: one case, whose limits and obstacles the recovery respects.
-        found: plan of a quadrotor, a car or an arm for this case; it is kept up to its end.
-        to: "brake", or of a quadrotor "home"; see `with_recovery.add_recovery`.
+        found: plan of a quadrotor, a car or an arm for this case; its motion is not changed.
+        to: "brake", or for a quadrotor also "home"; see `with_recovery.add_recovery`.
 
     Returns:
-        The plan with its `recovery`; of a car or an arm one `CarPlan` or `ArmPlan` to standstill.
+        The quadrotor's plan with a `recovery`, or one `CarPlan` or `ArmPlan` to standstill.
 
     Raises:
-        NoRecovery: no recovery trajectory keeps every limit; one line that names the limit.
-        ValueError: only quadrotors go home.
+        NoRecovery: no recovery trajectory keeps every limit; the text names the broken limit.
+        ValueError: `to` is "home", but the robot is not a quadrotor.
     """
     if isinstance(found, QuadrotorPlan):
         return _end_flight(case, found, to)

@@ -1,7 +1,7 @@
 """Braking of cars and arms from the end of a plan to standstill.
 
-A few candidate motions keep the robot's limits by construction. The first one without a collision
-is selected, by the distance functions of the planners.
+A few candidate motions keep the robot's limits by construction. The first motion without a
+collision is selected. The distance functions of the planners detect collisions.
 """
 
 import dataclasses
@@ -23,23 +23,23 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 
 PlanT = TypeVar("PlanT", CarPlan, ArmPlan)
 
-_SPARE = 0.98  # share of each limit that is used
-_SAMPLES = 400  # of the distances
-_GAP = 1e-3  # [m], least distance at a sample, since it may be smaller between samples
-_DECELERATIONS = (1.0, 0.7, 0.4)  # shares of a car's greatest deceleration
-# Shares of a car's greatest curvature, positive to the left. The plan's last curvature is another
-# candidate.
+_SPARE = 0.98  # fraction of each limit that braking uses
+_SAMPLES = 400  # number of times at which distances are computed
+_GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
+_DECELERATIONS = (1.0, 0.7, 0.4)  # decelerations that are tried / the car's greatest deceleration
+# Final curvatures that are tried, as fractions of the car's greatest curvature, positive to the
+# left. The plan's last curvature is tried before them.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
-_USUAL = 1.0  # [m/s^2] and [1/m], for a limit that is infinite
-_SLOWER = (1.5, 2.0, 3.0)  # multiples of the shortest duration in which all joints can stop
+_USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
+_SLOWER = (1.5, 2.0, 3.0)  # durations that are tried / shortest one in which all joints can stop
 
 
 def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
-    """Extend a plan of a car until the car is at standstill.
+    """Extend the plan of a car by braking, until the car stands still.
 
     Args:
-        case: with limits, body, map and obstacles; one case.
-        plan: of the case.
+        case: one case, with limits, body, map and obstacles.
+        plan: the plan of this case.
 
     Raises:
         NoRecovery: every candidate collides.
@@ -72,12 +72,14 @@ def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, n
         for limit in (limits.acceleration, limits.curvature)
     )
     targets = [bend, *(_SPARE * share * sharpest for share in _CURVATURES)]
-    # d(delta)/d(kappa) = L / (1 + (L kappa)^2) is greatest for zero curvature.
+    # For the steering angle delta, d(delta)/d(kappa) = L / (1 + (L kappa)^2) is greatest at kappa =
+    # 0.
     turn = _SPARE * float(limits.steering_rate) / float(case.body.wheelbase) * step
     for share in _DECELERATIONS:
         num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)
         speed = first * np.linspace(1.0, 0.0, num + 1)
-        # The lateral acceleration bounds the curvature, at the speed of the preceding knot.
+        # The limit of lateral acceleration bounds the curvature, by the speed at the preceding
+        # knot.
         before = np.maximum(speed[:-1] ** 2, 1e-9)
         most = np.maximum(_SPARE * float(limits.lateral_acceleration) / before, abs(bend))
         for target in targets:
@@ -94,7 +96,7 @@ def _car_problem(
     """Describe the collision of a car that brakes from a pose (3,), or return "".
 
     Args:
-        case: see `brake_car`.
+        case: one case, as for `brake_car`.
         begin: (3,), pose at the end of the plan.
         since: [s], duration of the plan.
         time: [s], duration of braking.
@@ -127,14 +129,15 @@ _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 
 
 def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
-    """Extend a plan of an arm until the arm is at standstill.
+    """Extend the plan of an arm by braking, until the arm stands still.
 
     Each joint has a constant deceleration. Candidates are that all joints stop together in the
-    shortest time, that each stops as soon as it can, and that all stop together but later.
+    shortest possible time, that each joint stops as soon as it can, and that all joints stop
+    together later.
 
     Args:
-        case: a `BlockCase`, of one case.
-        plan: of the case.
+        case: one `BlockCase`.
+        plan: the plan of this case.
 
     Raises:
         NoRecovery: in every candidate a joint leaves its range, or the arm collides.
@@ -183,7 +186,7 @@ def _arm_candidates(
 
 
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
-    """Describe the fault of a motion, coefficients (M, 3, 6) and durations (M,), or return ""."""
+    """Return why a motion with coefficients (M, 3, 6) and durations (M,) is bad, or "" if not."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
     angles = (first + tau * (second + tau * third)).reshape(-1, 6)
@@ -198,6 +201,6 @@ def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
 
 
 def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
-    """Return a plan of class `kind` with the fields of `plan`, some of them replaced."""
+    """Return a plan of class `kind` with the fields of `plan`, of which some are replaced."""
     values = {field.name: vars(plan)[field.name] for field in dataclasses.fields(kind)}
     return kind(**{**values, **fields})

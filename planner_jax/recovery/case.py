@@ -15,7 +15,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class RecoveryCase:
-    """One recovery to plan, or a batch. Every number is a leaf."""
+    """The start and limits of one recovery trajectory, or of a batch; all numbers are leaves."""
 
     rules: ClassVar[Table] = (
         Field("head_state", (4, 3)),
@@ -31,7 +31,7 @@ class RecoveryCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch."""
         return np.shape(self.gravity)
 
 

@@ -1,4 +1,4 @@
-"""Planner of a quadrotor's trajectories from any state to standstill, within all limits."""
+"""Planner of recovery trajectories: a quadrotor from any state to standstill, within limits."""
 
 import dataclasses
 
@@ -16,15 +16,15 @@ from planner_jax.optimise.settings import LbfgsConfig, Round
 from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_ABOVE_GROUND = 0.2  # [m] above the least height, lowest guess of the position of standstill
-# Starting points, best first: base duration [s], to which the time for the distance at half the
-# greatest speed is added, and the distance as a share of the distance of uniform braking.
+_ABOVE_GROUND = 0.2  # [m] lowest guess of the position of standstill, above the least height
+# Starting points, best first. Column 1 is a base duration [s], to which the time for the distance
+# at half the greatest speed is added. Column 2 is the distance / the distance of uniform braking.
 _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3), (4.0, 1.0)])
 
 
 @struct.dataclass
 class RecoveryContext:
-    """A case in the form that `ChainPlanner` reads."""
+    """The context that `ChainPlanner` reads; it has nothing but the case."""
 
     case: RecoveryCase
 
@@ -32,7 +32,7 @@ class RecoveryContext:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
-    """Minimum-snap trajectories to standstill, of free duration.
+    """Plans minimum-snap trajectories to standstill, whose durations are free.
 
     Decision variables, n = 3 (M - 1) + 4, in units of `scale`: whitened waypoint offsets, log
     duration, and the position of standstill. With `to="home"` the position is the case's `home`,
@@ -49,8 +49,8 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     guess_table = _GUESSES
     decode_nodes = (40, 40)
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
-    to: str = "brake"  # to standstill anywhere, or "home"
-    # The preceding plan may end at its limits, so later rounds reduce the margin.
+    to: str = "brake"  # position of standstill: "brake" for anywhere, "home" for the case's `home`
+    # The preceding plan may end at its limits, so later rounds reduce the margin below the limits.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),
@@ -67,11 +67,11 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
             raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
 
     def prepare(self, case: RecoveryCase) -> RecoveryContext:
-        """Return the context of a case; nothing else is computed."""
+        """Return the context of a case, which has nothing but the case."""
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
-        """Return guesses of log duration and position of standstill, (num, 1, 4)."""
+        """Return guesses of log duration and of the displacement to standstill, (num, 1, 4)."""
         case = context.case
         pos, vel = case.head_state[0], case.head_state[1]
         base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]
@@ -102,7 +102,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         violation: Array,
         context: RecoveryContext,
     ) -> RecoveryPlan:
-        """Return the plan of a trajectory."""
+        """Return the plan of a trajectory; the solver sets its cost and status later."""
         return RecoveryPlan(
             trajectory=trajectory, gravity=context.case.gravity, **pending(violation)
         )

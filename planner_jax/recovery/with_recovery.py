@@ -16,7 +16,7 @@ from planner_jax.core.protocol import Status, is_solved
 from planner_jax.recovery.case import RecoveryCase, end_state
 from planner_jax.recovery.planner import RecoveryPlanner
 
-# Shares of the speed limit for which a plan is searched again if no recovery from its end exists.
+# Fractions of the speed limit with which a plan is searched again if its recovery fails.
 _SLOWER = (0.8, 0.65, 0.5)
 
 
@@ -24,8 +24,8 @@ _SLOWER = (0.8, 0.65, 0.5)
 class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     """A planner of a quadrotor's task, followed by a planner of recovery trajectories.
 
-    A plan whose recovery exceeds a limit is searched again with a lower speed limit, and is not
-    solved if no recovery is found.
+    If the recovery exceeds a limit, the plan is searched again with a lower speed limit. Without
+    a recovery the plan counts as unsolved.
     """
 
     recovery_planner: RecoveryPlanner
@@ -33,14 +33,14 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Raise `TypeError`: plan and recovery are separate minimisations, without a gradient."""
+        """Raise `TypeError`: two separate minimisations, of plan and recovery, have no gradient."""
         raise TypeError(
             "plans with a recovery have no gradient, as plan and recovery are minimised one after "
             "the other: leave `recovery` out"
         )
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the plans of one case or of a batch, with their recoveries."""
+        """Return the plans of one case or of a batch, each with its recovery trajectory."""
         if cases.batch_shape == ():
             one = self.plan_by(drive, jax.tree.map(lambda leaf: np.asarray(leaf)[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], one)
@@ -56,7 +56,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
         return plans
 
     def _plan_at(self, factor: float, drive: Drive, cases: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan with a share of the speed limit; return plans, and which only lack a recovery."""
+        """Plan with a lower speed limit; return plans, and which of them lack only a recovery."""
         limits = cases.limits
         slower = dataclasses.replace(
             limits, speed=(factor * limits.speed).astype(limits.speed.dtype)
@@ -81,7 +81,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
     """Return the cases of the recoveries from the ends of plans (B,).
 
-    Leaves are NumPy arrays if the plans' leaves are.
+    Leaves are NumPy arrays if the leaves of the plans are NumPy arrays.
     """
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
@@ -99,15 +99,15 @@ _end_states = jax.jit(jax.vmap(end_state))
 
 
 def add_recovery(planner: Planner[CaseT, PlanT], recovery: str) -> RecoveringPlanner[CaseT, PlanT]:
-    """Return a quadrotor's planner whose plans continue to standstill behind their last contact.
+    """Make a planner whose plans of a quadrotor continue from the last contact to standstill.
 
     Args:
-        planner: of plans with the trajectory of a quadrotor.
+        planner: a planner whose plans have the trajectory of a quadrotor.
         recovery: "brake" for the cheapest trajectory to standstill anywhere; "home" for the
             trajectory back to the position at which the case starts.
 
     Raises:
-        ValueError: `recovery` is neither.
+        ValueError: `recovery` is another word.
     """
     require_one_of(RECOVERIES, "recovery", recovery)
     return RecoveringPlanner(planner, RecoveryPlanner(to=recovery))

@@ -20,10 +20,10 @@ class PiecewisePolynomial:
 
 @struct.dataclass
 class Motion:
-    """Samples of a trajectory at N times, from which limits are evaluated.
+    """Samples of a trajectory at N times, at which limits are evaluated.
 
-    In a kernel each vector is a tuple of its three components, and only the height of the position
-    is present.
+    In a CUDA kernel each vector is a tuple of its three components, and of the position only the
+    height is present.
     """
 
     height: Array  # (N,) [m]
@@ -74,7 +74,7 @@ def total_duration(trajectory: PiecewisePolynomial) -> Array:
 
 
 def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integral of the squared `order`-th derivative as a quadratic form.
+    """Return the integral of the squared `order`-th derivative of a polynomial, a quadratic form.
 
     Returns:
         The form in the coefficients over a unit of time, (degree + 1, degree + 1), and for each
@@ -126,7 +126,7 @@ def join(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePoly
 
 
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
-    """Evaluate position to jerk of one trajectory, or of a batch with a time each, on the host.
+    """Evaluate position to jerk on the host, for one trajectory or a batch with a time for each.
 
     Args:
         trajectory: one trajectory, or a batch with a leading axis B on every leaf.
@@ -150,7 +150,7 @@ def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors and powers (4, size) of t by which coefficients enter position to jerk."""
+    """Return factors and powers (4, size) of t by which coefficients give position to jerk."""
     factors = np.stack([derivative_factors(size - 1, order) for order in range(4)])
     return factors, np.maximum(np.arange(size) - np.arange(4)[:, None], 0)
 

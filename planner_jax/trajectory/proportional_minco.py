@@ -1,4 +1,4 @@
-"""MINCO with piece durations in fixed proportion: constant matrices in normalised time.
+"""MINCO splines with piece durations in fixed proportion, computed by constant matrices.
 
 MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints
 [Wang2022; Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times
@@ -47,7 +47,7 @@ from planner_jax.trajectory.polynomial import (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ProportionalMinco:
-    """Constant float64 maps for M pieces of energy order s."""
+    """Constant float64 matrices of splines with M pieces that minimise the energy |p^(s)|^2."""
 
     order: int
     proportions: np.ndarray  # (M,) durations over h, mean one
@@ -116,7 +116,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """Return the energy as a form in its first `num` unknowns, minimised over the others."""
+    """Return a quadratic form in its first `num` unknowns, minimised over the other unknowns."""
     first, free = np.s_[:num], np.s_[num:]
     best = np.linalg.solve(energy[free, free], energy[free, first])
     return energy[first, first] - energy[first, free] @ best
@@ -126,7 +126,7 @@ def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
 def proportional_minco(
     order: int, proportions: tuple[float, ...], velocities: bool = False
 ) -> ProportionalMinco:
-    """Build the constant maps; the results are cached.
+    """Build the constant matrices for given proportions; the results are cached.
 
     Args:
         order: s, the derivative whose square is integrated: 2, 3 or 4.
@@ -159,8 +159,9 @@ def proportional_minco(
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
     from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # Measure this kind from its best values for the columns before it, while the columns after
-        # it take their best values for both.
+        # Offsets of this kind (positions or velocities) are deviations from the values of least
+        # energy for the columns before them; the columns after them take their values of least
+        # energy.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         reduced = _least_energy(energy, end)
@@ -187,7 +188,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return the boundary rows (2s, 3), derivative d times h^d, of two states (s, 3)."""
+    """Return the boundary rows (2s, 3) of two states (s, 3): the d-th derivatives times h^d."""
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -233,9 +234,9 @@ def by_pieces(
 
 
 def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
-    """Return the motion at N samples, by matrices (orders, N, C)."""
-    # One product for all orders: on a CPU the call of an operation costs more than its arithmetic.
-    # The matrix comes first, so that a batch adds columns.
+    """Return the motion at N samples, computed by the matrices (orders, N, C)."""
+    # One product serves all orders, because on a CPU the call of an operation costs more than its
+    # arithmetic. The matrix is the left factor, so that a batch adds columns to the right factor.
     orders = matrices.shape[0]
     unit = jnp.matmul(
         matrices.reshape(-1, matrices.shape[-1]), columns, precision=lax.Precision.HIGHEST
@@ -258,7 +259,7 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """Return the boundary part () of `trajectory_energy`: its least value for the boundary."""
+    """Return the part () of `trajectory_energy` without offsets: the least for these ends."""
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
@@ -270,7 +271,7 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the least energy () for boundary rows (2s, 3), in time over h."""
+    """Return the least energy () for boundary rows (2s, 3), with times in units of h."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -295,7 +296,7 @@ def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
 def proportional_trajectory(
     maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array
 ) -> PiecewisePolynomial:
-    """Return the trajectory in real time; arguments as in `trajectory_energy`."""
+    """Return a trajectory in real time from the same arguments as `trajectory_energy`."""
     unit = jnp.einsum(
         "mkc,ci->mki",
         jnp.asarray(maps.coefficients, rows.dtype),
@@ -311,7 +312,7 @@ def proportional_trajectory(
 
 @struct.dataclass
 class Chain:
-    """Boundary rows, offsets and mean piece durations of N segments."""
+    """N segments of a trajectory: boundary rows, whitened offsets and mean piece durations."""
 
     rows: Float[Array, "N rows 3"]
     offsets: Float[Array, "N offsets 3"]  # whitened
@@ -328,7 +329,7 @@ def chain_rows(
     tail_states: Float[Array, "N 4 3"],
     piece_durations: Float[Array, " N"],
 ) -> Float[Array, "N 8 3"]:
-    """Return the boundary rows of every segment of a chain, by the states at their ends."""
+    """Return the boundary rows of every segment of a chain, from the states at the ends."""
     heads = jnp.concatenate([head_state[None], tail_states[:-1]])
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 
@@ -336,7 +337,7 @@ def chain_rows(
 def chain_trajectory(
     maps: ProportionalMinco, chain: Chain, active: Bool[Array, " N"]
 ) -> PiecewisePolynomial:
-    """Return the trajectory of N * M pieces; pieces of absent segments rest and last 0 s."""
+    """Return the trajectory of N * M pieces; pieces of absent segments stand still for 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
     ends = chain.rows[:, maps.order, :]  # positions at the ends of the segments
