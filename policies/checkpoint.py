@@ -22,7 +22,7 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
 FORMAT = 2  # version number of the format of checkpoints
-# Policies that are part of the package: "catch" is trained on eight suites, "rush6" on `rush6`.
+# Policies in the package: "catch" is trained on eight families of cases, "rush6" on one of them.
 SHIPPED = ("catch", "rush6")
 _OF_FLAX = ("parent", "name")  # fields of every Flax module, which are not sizes of the network
 

@@ -100,7 +100,7 @@ def _line(
     relative: bool = False,
     **look: Any,
 ) -> None:
-    """Draw the mean over runs of a quantity, with a band of one standard deviation if several.
+    """Draw the mean of a quantity over runs; for several runs also a band of one deviation.
 
     The x axis is the number of decisions. `value` extracts the quantity from a row, and `scale`
     multiplies it. With `relative` each run is drawn relative to its first value.

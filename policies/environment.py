@@ -179,7 +179,8 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
             estimate for the decision `Greedy`; zero in suites with optional targets.
         caught: (n - n_greedy) / n_greedy, where n is the number of targets that the decision
             includes; zero in suites without optional targets.
-        ratio: optimal time ratio [Yu2023catch, eq. 29]; zero with the estimate.
+        ratio: optimal time ratio [Yu2023catch, eq. 29], the mean relative difference of decided and
+            planned catch times; zero with the estimate.
         violation: largest relative excess over a limit, at most 2. With the estimate log(1 + d),
             where d [m] is the summed distance by which the quadrotor misses the targets.
     """
@@ -243,8 +244,8 @@ def _attempt(iterations: int) -> Round:
 def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Array:
     """Return the rewards (B,) of a batch of decisions.
 
-    A solved case is rewarded by the weighted sum of the terms in `_GATED`, an unsolved case by its
-    weighted violation.
+    The reward of a solved case is the weighted sum of its terms without `violation`. The reward of
+    an unsolved case is its weighted violation.
 
     Args:
         terms: unweighted terms (B,) from `evaluate_actions`, by name.

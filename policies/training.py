@@ -64,7 +64,7 @@ class Part:
     """One part of a training: one call of Brax's PPO."""
 
     steps: int  # number of decisions
-    # Number of planner iterations for each suite. () rewards by an estimate instead of the planner.
+    # Number of planner iterations for each suite. If empty, rewards come from a rough estimate.
     iterations: tuple[int, ...] = ()
     # Learning rate at the start. PPO adapts it to the KL divergence of the updates.
     learning_rate: float = LEARNING_RATE

@@ -103,7 +103,7 @@ class Dataset:
     def damages(self, num: int | None = None) -> dict[Path, str]:
         """Return the reasons why files are damaged, by path.
 
-        If all files are sound but do not hold `num` rows, the folder gets a reason.
+        If all files are sound but do not hold `num` rows, a reason is returned for the folder.
         """
         found, counted = {}, 0
         for place, path in enumerate(self.files()):

@@ -22,7 +22,7 @@ Row: TypeAlias = Mapping[str, Any]  # values of a row by column
 
 
 class JsonError(PlannerJaxError, ValueError):
-    """A text is not a JSON object as `to_write` made it; the message states the reason."""
+    """A text is not JSON of the expected format, or was changed; the message states the reason."""
 
 
 def digest_of(entries: Mapping[str, object]) -> str:
@@ -33,7 +33,7 @@ def digest_of(entries: Mapping[str, object]) -> str:
 
 
 def to_write(entries: Mapping[str, object]) -> Entries:
-    """Return a JSON object with `entries`, the version number of the format, and their digest."""
+    """Return `entries` with the version number of the format and a digest, to write as JSON."""
     kept = {"format": FORMAT, **{k: v for k, v in entries.items() if k not in ("format", "digest")}}
     return {**kept, "digest": digest_of(kept)}
 
@@ -52,7 +52,7 @@ def parse_object(text: bytes | str) -> Entries:
 
 
 def parse_written(text: bytes | str) -> Entries:
-    """Parse a text written from `to_write`; raise `JsonError` if format or digest do not match."""
+    """Parse JSON text made from `to_write`; raise `JsonError` if format or digest do not match."""
     entries = parse_object(text)
     if type(found := entries.get("format")) is not int or found != FORMAT:
         shown = "no format" if found is None else f"format {str(found)[:40]}"

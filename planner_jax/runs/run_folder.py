@@ -186,7 +186,7 @@ class RunFolder:
             raise ArgumentError(self.name, rule, shown=why) from None
 
     def require_whole(self, rows: Dataset, remedy: str, num: int | None = None) -> None:
-        """Raise `ArgumentError`, with advice `remedy`, unless files are sound with `num` rows."""
+        """Raise `ArgumentError` with the advice `remedy` if rows are missing or files damaged."""
         for path, why in rows.damages(num).items():
             place = path.relative_to(self.path)
             rule = f"a run whose {place} is whole"

@@ -26,11 +26,11 @@ Options = dict[str, Any]  # keyword arguments: values by name
 
 
 class WorkersFailed(PlannerJaxError, RuntimeError):
-    """Worker processes could not plan a chunk of cases ("workers must ..."); resume the run."""
+    """Worker processes could not plan a chunk of cases; the run can be resumed."""
 
 
 def option(default: object, metavar: str, text: str) -> Any:
-    """Return a dataclass field with the help text of its option; a switch has `metavar` ""."""
+    """Return a dataclass field for a command-line option; "" as `metavar` makes a switch."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": text})
 
 
@@ -47,7 +47,7 @@ def recovery_options(value: str) -> dict[str, str]:
 
 
 def require_count(name: str, value: int | None, least: int, *, none: bool = False) -> None:
-    """Raise unless a setting is a whole number >= `least`, or None where `none` is true."""
+    """Raise unless a setting is a whole number >= `least`; with `none`, None is accepted too."""
     if value is not None or not none:
         require_size(name, value, least)  # type: ignore[arg-type]
 
@@ -131,7 +131,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
     """Return the settings of a run that is resumed, from the `parameters` in its manifest.
 
     Raises:
-        ArgumentError: one of the settings `given` again by the user differs from the stored
+        ArgumentError: a setting in `given`, which the user repeats, differs from the stored
             setting, or the class `kind` does not accept the stored settings.
     """
     settings = settings_of_manifest(kind, parameters, "out")

@@ -1,4 +1,4 @@
-"""One style for all figures, in Okabe and Ito's colours, which colour-blind people distinguish."""
+"""One style for all figures, in Okabe and Ito's colours, made for colour-blind readers."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -24,7 +24,7 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
 
 
 def percent(successes: int, num: int) -> str:
-    """Return a rate in percent, as "100.00" or "0.00" only if all or no trials succeed."""
+    """Return a rate in percent; rounding gives "0.00" or "100.00" only for the exact rates."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)

@@ -84,7 +84,7 @@ class Maker:
         return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
-        """Plan a chunk; return plans and record, whose compile time `clock` has measured."""
+        """Plan a chunk; return the plans and a record of times, with compile time from `clock`."""
         plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,
@@ -188,7 +188,10 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return the manifest's times except `wall_seconds`; plan chunk 0 again if too few are warm."""
+    """Return the times for the manifest, except `wall_seconds`.
+
+    If few cases were planned without compilation, chunk 0 is planned again to measure the speed.
+    """
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -101,7 +101,7 @@ def _start(ray: ModuleType, folder: str) -> None:
 def _make_parts(
     ray: ModuleType, on_gpus: bool, maker: Maker, numbers: Iterable[int]
 ) -> Generator[Callable[[], Made], None, None]:
-    """Submit chunks to Ray, a few per worker at a time; yield functions that wait for each part."""
+    """Submit chunks to Ray, a few per worker at a time; yield functions that wait for each."""
     cores, gpus = (int(ray.cluster_resources().get(name, 0)) for name in ("CPU", "GPU"))
     num, threads = max(cores, 1), threads_of_a_computation()
     environ, config, how = {}, {"jax_platforms": "cpu"}, {}
@@ -131,7 +131,7 @@ def _make_parts(
 
 
 def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
-    """Return the finished part of a chunk from its worker, or raise the worker's exception."""
+    """Return a chunk's finished file of rows from its worker, or raise the worker's exception."""
     try:
         return ray.get(promise)
     except ray.exceptions.RayTaskError as error:
@@ -143,13 +143,13 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
 
 
 def _make(job: bytes, number: int) -> Made:
-    """Plan and judge chunk `number` in a worker process, and return its part."""
+    """Plan and judge chunk `number` in a worker process, and return its file of rows."""
     return _maker_of(job).make(number)
 
 
 @functools.lru_cache(maxsize=1)
 def _maker_of(job: bytes) -> Maker:
-    """Return the `Maker` of a pickled run; raise `WorkersFailed` if this worker's code differs."""
+    """Return the `Maker` that plans a pickled run; raise `WorkersFailed` if the code differs."""
     environ, config, (task, settings, makers, run) = pickle.loads(job)
     # JAX raises an error if this variable and XLA_CLIENT_MEM_FRACTION are both set.
     os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)

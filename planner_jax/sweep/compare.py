@@ -1,4 +1,4 @@
-"""Comparison of finished sweeps: success rates, costs, speeds, and cases that only some solve."""
+"""Comparison of finished sweeps by success, cost, speed, and cases that only some runs solve."""
 
 import csv
 import dataclasses
@@ -30,11 +30,11 @@ class ComparedRun:
     name: str  # path of the run's folder, as the user wrote it
     manifest: Entries
     deciding: tuple[str, ...]  # names of the settings that determine which cases are planned
-    index: np.ndarray  # (B,) int
+    index: np.ndarray  # (B,) int, indices of the cases
     success: np.ndarray  # (B,) bool
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
-    cost: np.ndarray  # (B,)
-    iterations: np.ndarray  # (B,)
+    cost: np.ndarray  # (B,) costs of the plans
+    iterations: np.ndarray  # (B,) numbers of the planner's iterations
 
     @property
     def settings(self) -> Entries:
@@ -125,7 +125,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # Both runs solve the same cases: the interval is the upper bound for 0 events in `num` trials.
+    # If no case is solved by exactly one run, the interval ends at the Clopper-Pearson bound of a
+    # probability after 0 events in `num` trials.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
@@ -136,7 +137,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
 
 
 def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
-    """Return the rates, costs and times of each run by name; the first run has no `Difference`."""
+    """Return rates, costs and times of each run by name; the first run's differences are None."""
     rows = []
     for index, run in enumerate(runs):
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]
@@ -178,7 +179,7 @@ def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
 
 
 def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
-    """Return the comparison as lines of text, with at most `most` cases that only some solve."""
+    """Return the comparison as lines of text; list at most `most` cases that only some solve."""
     first, *others = runs
     own, rows = first.settings, table_of(runs)
     lines = [f"{first.manifest['kind']}, suite {own['suite']}, seed {own['seed']}", ""]
@@ -222,7 +223,7 @@ def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> It
 
 
 def _cells(rows: Sequence[Entries]) -> list[list[str]]:
-    """Return the table of all runs as text cells: a line for each figure, a column for each run."""
+    """Return a table as text cells, with a line for each quantity and a column for each run."""
     spread = [
         f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
     ]
@@ -251,8 +252,8 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
 def as_csv(runs: Sequence[ComparedRun]) -> str:
     """Return the comparison as CSV text with one column for each run.
 
-    The first rows hold the figures of `table_of`. Then one row follows for each case that only some
-    runs solve, with the first limit that fails in each run, or "success".
+    The first rows hold the quantities of `table_of`. Then one row follows for each case that only
+    some runs solve, with the first limit that fails in each run, or "success".
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -125,7 +125,7 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
-    """Draw hover thrust and thrust limits; without limits, a grey bound from the acceleration."""
+    """Draw hover thrust and thrust limits, or a grey bound that follows from acceleration."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:
@@ -134,7 +134,7 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
     most = setting.get("acceleration")
-    # Without this limit only the thrust of single rotors is limited, which has no panel.
+    # If only the thrust of each rotor is limited, there is no limit of their sum to draw.
     if most is None:
         return
     bound = gravity + most

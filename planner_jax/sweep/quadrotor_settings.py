@@ -67,7 +67,7 @@ class QuadrotorSettings(SweepSettings):
     recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
-    WITHOUT_EFFORT: ClassVar[str]  # planner without a minimisation, which rejects `effort`
+    WITHOUT_EFFORT: ClassVar[str]  # planner that minimises no cost, so that `effort` is rejected
 
     def __post_init__(self) -> None:
         super().__post_init__()

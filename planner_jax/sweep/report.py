@@ -27,7 +27,7 @@ def count_rows(sweep: Sweep, settings: SweepSettings, rows: Dataset) -> Tally:
 
 
 def read_finished(folder: RunFolder) -> tuple[Entries, Sweep]:
-    """Return a run's manifest and sweep; raise `ArgumentError` if it is unfinished or damaged."""
+    """Return a run's manifest and `Sweep`; raise `ArgumentError` if it is unfinished or damaged."""
     manifest = folder.read_manifest()
     sweep = sweep_of_run(manifest, folder.name)
     if "summary" not in manifest:

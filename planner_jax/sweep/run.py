@@ -239,7 +239,7 @@ def _finish(
 def plan_baselines(
     sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
 ) -> pa.Table:
-    """Plan case `index` with each of some planners; return one row a planner, with its name."""
+    """Plan case `index` with several other planners; return a row for each, with its name."""
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
         stopping.check()

@@ -37,7 +37,7 @@ class RunFigure:
 
 
 class Sweep(Generic[AnySettings]):
-    """What a sweep does for one task: open cases, plan, judge, and report.
+    """What a sweep does for one task: provide cases, plan, judge, and report.
 
     This class serves any task. A task may name a subclass in `SweepSettings.RUN` that overrides
     methods, for example to add its own columns and figures.
@@ -155,7 +155,7 @@ def sweep_of(task: Task) -> Sweep:
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep object for a run's task; messages call the run's path by the name `name`.
+    """Return the sweep object for a run's task; errors name the run's path as argument `name`.
 
     Raises:
         ArgumentError: the run is not a sweep, or its task is not installed.

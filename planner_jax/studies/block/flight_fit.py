@@ -50,7 +50,7 @@ class FlightFit:
     time: Array  # () [s], weighted mean of the times of the observations
     misfit: Array  # () root mean square residual in standard deviations, about 1 for a good fit
     num: Array  # () int32, number of fitted observations
-    status: Array  # () int32, a `Sight`
+    status: Array  # () int32, a `Sight`: whether there were enough observations
 
     @property
     def ball(self) -> BallState:

@@ -49,10 +49,11 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
     """Return a camera 1.6 m above the arm's base, on a mast on the rig's beam behind the arm.
 
     Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
-    throws of all suites almost until they enter the outer box. From the mast it looks over the arm;
-    0.3 m to the left of the arm's axis it looks past the pole. [Natarajan2024] mounts its camera on
-    the beams of the rig. Its authors' model has the camera in front of the arm, where 110 degrees
-    do not cover throws that come from up to 60 degrees to either side.
+    throws of all suites almost until they enter the outer box, the region in which the arm may
+    block them. From the mast it looks over the arm; 0.3 m to the left of the arm's axis it looks
+    past the pole. [Natarajan2024] mounts its camera on the beams of the rig. Its authors' model has
+    the camera in front of the arm, where 110 degrees do not cover throws that come from up to 60
+    degrees to either side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])

@@ -54,7 +54,7 @@ class Aim:
 
     offset: float  # [m] greatest distance of the contact from the shield's centre
     at_rest: bool = False  # whether the arm must be at rest at the contact
-    edge: float = 0.0  # [m] length cut from both ends of the ball's path between the boxes
+    edge: float = 0.0  # [m] length cut from both ends of the ball's usable path
 
 
 # Requirements in the order in which they are tried, the strictest first. Each is tried for the
@@ -93,7 +93,7 @@ def plan_with_aims(
 ) -> BlockPlan:
     """Plan cases with estimated balls; each case gets the plan of the first aim that is solved.
 
-    Later aims are less strict. If none is solved, the best failed plan is returned.
+    Later aims require less of the contact. If none is solved, the best failed plan is returned.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
@@ -209,8 +209,8 @@ class _Arms:
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
         """Count for each arm the aims (B,) that would bring the contact nearer to the centre.
 
-        `known` holds the newly estimated balls. All aims count for an arm without a motion, and for
-        an arm whose motion misses its ball.
+        Aims are requirements on the contact. `known` holds the estimated balls. All aims count for
+        an arm without a motion, and for an arm whose motion misses its ball.
         """
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
@@ -227,10 +227,11 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Plan new motions where some aims are useful, and switch to those that are solved.
+        """Plan new motions for the arms with useful aims, and switch to motions that are solved.
 
         `known` holds the estimated balls, and in its delays the times at which new motions may
-        start. `useful` (B,) is the number of aims that are tried for each arm, from the first.
+        start. For each arm the first `useful` (B,) of `aims`, requirements on the contact, are
+        tried.
         """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)

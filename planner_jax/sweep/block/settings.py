@@ -44,5 +44,5 @@ class BlockSettings(StudySettings):
             require(self.delay == 0.0, "delay", rule, self.delay)
 
     def draw_options(self) -> Entries:
-        """Return keyword arguments for the task's `draw`; motions start at the option `delay`."""
+        """Return keyword arguments for the task's `draw`; from `delay` on the arm may move."""
         return {**super().draw_options(), "delay": self.delay + self.first_motion}

@@ -41,7 +41,7 @@ class BlockTally(Tally):
         self._study.add(rows)
 
     def summary(self) -> Entries:
-        """Return rates and means, and errors [m] of flight fits or planning times [s] if stored."""
+        """Return success rates and means; also errors of flight fits and planning times, if any."""
         return super().summary() | self._study.summary()
 
 
@@ -52,11 +52,11 @@ class BlockSweep(Sweep[BlockSettings]):
     plan_of_row = staticmethod(arm_plan)
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of blocks, with columns on camera or planning time if simulated."""
+        """Return the columns of the rows, and more if a camera or planning time is simulated."""
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Return the run's planner, wrapped to simulate a camera or its planning time if set."""
+        """Return the run's planner; it simulates a camera or planning time if the settings ask."""
         return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:

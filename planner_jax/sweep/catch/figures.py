@@ -51,11 +51,11 @@ class SampledCatch(NamedTuple):
     centre: np.ndarray  # (K, 3) [m], centre of the hoop
     radius: float  # [m], radius of the hoop
     targets: np.ndarray  # (N, K, 3) [m]
-    catches: np.ndarray  # (n,) indices of the times of the catches
+    catches: np.ndarray  # (n,) indices, among the K times, of the n catches
 
 
 def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
-    """Sample net and targets at the times of `motion`; `setting` is an entry of the manifest."""
+    """Sample net and targets at the times of `motion`; `setting` holds net size and gravity."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -119,7 +119,7 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
 
 
 def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return bounds (3,) [m] that contain the plan and each target's path up to its catch."""
+    """Return lower and upper bounds (3,) [m] of the plan and of targets up to their catches."""
     caught = zip(plan.row["order"], plan.catches, strict=False)
     paths = [plan.targets[target][: at + 1] for target, at in caught]
     points = np.concatenate([plan.motion.pos, plan.centre, *paths])
@@ -132,7 +132,7 @@ def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = None) -> None:
-    """Draw a plan over x and axis `second` (1: y, 2: z), around catch `only` or completely."""
+    """Draw a plan over x and axis `second` (1: y, 2: z); with `only`, just around one catch."""
     where, catches, time = [0, second], plan.catches, plan.motion.time
     for index, at in enumerate(catches):
         if only not in (None, index):

@@ -1,4 +1,4 @@
-"""The sweep of catches by quadrotors with a net, reported beside the rates of [Yu2023catch]."""
+"""The sweep of catches by quadrotors with a net, compared with the rates of [Yu2023catch]."""
 
 import numpy as np
 import pyarrow as pa
@@ -32,7 +32,10 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts of successes, and means of targets caught, catch times and optimal time ratios."""
+    """Counts of successes, and means of targets caught, catch times and optimal time ratios.
+
+    The optimal time ratio is the mean relative difference of decided and optimised catch times.
+    """
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
@@ -94,7 +97,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return the run's success and time ratio, beside [Yu2023catch, Tables I and III]."""
+        """Return success and time ratio of the run and of [Yu2023catch, Tables I and III]."""
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:

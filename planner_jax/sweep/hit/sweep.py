@@ -1,4 +1,4 @@
-"""The sweep of hits: quadrotors return serves in 36 court scenarios, beside published rates."""
+"""The sweep of hits: quadrotors return serves in the 36 scenarios of a court."""
 
 import dataclasses
 
@@ -77,7 +77,8 @@ class ServeSource(Source):
 class HitTally(Tally):
     """Counts of successes by scenario.
 
-    The report's example is a success from the left to the far target, as in [Yu2023bat, Fig. 7].
+    The report's example is a success with a serve from court region L and a target in region F, as
+    in [Yu2023bat, Fig. 7].
     """
 
     READS = (*COUNTED, *ScenarioCounts.READS)
@@ -98,7 +99,7 @@ class HitTally(Tally):
         return [left_to_far, *super().examples(rows, success)]
 
     def summary(self) -> Entries:
-        """Return success rates from 0 to 1, by scenario beside published rates on its serves."""
+        """Return success rates from 0 to 1, in total and by scenario, with published rates."""
         return {**super().summary(), "per_scenario": self._scenarios.summary()}
 
 

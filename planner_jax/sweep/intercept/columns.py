@@ -1,6 +1,6 @@
 """Columns of the rows that a sweep of interceptions stores: case, plan and verdict.
 
-For N obstacles of V corners each, a list column has N entries, or the coordinates of all N V
+For N obstacles of V corners each, a list column has N entries, or the coordinates of all N x V
 corners. A polygon with fewer than V corners repeats one of its corners.
 """
 
@@ -32,7 +32,7 @@ def _positions(targets: PyTree, times: jax.Array) -> jax.Array:
 
 
 def _corners(name: str) -> Callable[[RefereedBatch], np.ndarray]:
-    """Return a function that computes corners (B, N, V, 2) [m] of "walls" or "movers" at time 0."""
+    """Return a function that computes obstacle corners (B, N, V, 2) [m] of field `name`."""
 
     def values(batch: RefereedBatch) -> np.ndarray:
         group = vars(batch.cases)[name]

@@ -31,16 +31,16 @@ class SampledDrive:
 
     row: Row
     setting: Entries  # entry `setting` of the manifest
-    walls: list[np.ndarray]  # (V, 2) [m] each
-    movers: list[np.ndarray]  # (V, 2) [m] each, at time 0
-    velocities: np.ndarray  # (N, 2) [m/s], velocities of the movers
+    walls: list[np.ndarray]  # corners (V, 2) [m] of each wall
+    movers: list[np.ndarray]  # corners (V, 2) [m] of each moving obstacle at time 0
+    velocities: np.ndarray  # (N, 2) [m/s], velocities of the moving obstacles
     time: np.ndarray  # (K,) [s]
     pose: np.ndarray  # (K, 3), rear axle: x, y [m], heading [rad]
-    middle: np.ndarray  # (K, 2) [m], middle of the body
+    middle: np.ndarray  # (K, 2) [m], middle of the car's body
     speed: np.ndarray  # (K,) [m/s]
     acceleration: np.ndarray  # (K,) [m/s^2], along the path
     curvature: np.ndarray  # (K,) [1/m]
-    target: np.ndarray  # (K, 2) [m]
+    target: np.ndarray  # (K, 2) [m], predicted positions of the target
 
     def target_at(self, times: np.ndarray | float) -> np.ndarray:
         """Interpolate the predicted positions (T, 2) [m] of the target at times (T,) [s]."""
@@ -87,7 +87,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
-    """Return the corners (V, 2) [m] of each wall or mover (`kind`) that exists in a row."""
+    """Return the corners (V, 2) [m] of each obstacle of a row; `kind` is "wall" or "mover"."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -206,7 +206,7 @@ def instants(end: float, most: int) -> np.ndarray:
 
 
 def draw_map(axes: Axes, setting: Entries, walls: list[np.ndarray]) -> None:
-    """Draw the walls (V, 2) [m], and set the axes to the bounds of the map."""
+    """Draw walls, each with corners (V, 2) [m], and set the axes to the bounds of the map."""
     look: Look = {"facecolor": style.PALE, "edgecolor": style.GREY, "linewidth": 0.8}
     axes.add_collection(PolyCollection(walls, zorder=1, **look))
     (left, low), (right, high) = setting["lower"], setting["upper"]
