@@ -1,4 +1,4 @@
-"""Closed-loop flights and drives in MuJoCo MJX: quadrotors, a car and an arm."""
+"""Closed-loop simulations in MuJoCo MJX of quadrotors, a car and an arm that execute plans."""
 
 import importlib.util
 

@@ -1,7 +1,8 @@
 """Calibration of a camera from a board that the arm holds up, without rendered images.
 
-The board covers the face of the shield and is as large as the shield. Each corner is measured with
-the independent noise of a stereo camera. Poses of the arm are not checked for collisions.
+The board covers the face of the arm's shield and has the same size. Each corner of the board's
+grid is measured with the independent noise of a stereo camera. Poses of the arm are not checked
+for collisions.
 """
 
 from typing import NamedTuple
@@ -15,15 +16,15 @@ from planner_jax.sims.calibrate import Calibration, calibrate, pose
 from planner_jax.studies.block.camera import Camera, in_view, move_camera, to_camera
 from planner_jax.studies.block.noise import StereoNoise, depth_std
 
-_CORNERS = 6  # corners of the board along each edge
+_CORNERS = 6  # number of grid corners along each edge of the board
 _FACING = 0.5  # least cosine between the board's normal and the direction to the camera
 
 
 class BoardViews(NamedTuple):
     """K views of the board: the arguments of `calibrate`."""
 
-    flange: np.ndarray  # (K, 4, 4), poses of the flange in the base frame
-    points: np.ndarray  # (M, 3) [m], corners in the flange's frame
+    flange: np.ndarray  # (K, 4, 4), poses of the arm's flange in the base frame
+    points: np.ndarray  # (M, 3) [m], positions of the corners in the flange's frame
     seen: np.ndarray  # (K, M, 3) [m], measured corners in the camera's frame
     std: np.ndarray  # (K, M, 3) [m], standard deviations of the measured corners
 
@@ -31,18 +32,18 @@ class BoardViews(NamedTuple):
 def show_board(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int, *, seed: int = 0, draws: int = 20000
 ) -> BoardViews:
-    """Return views of the board from `num` poses, drawn uniformly within the joint limits.
+    """Return views of the board in `num` poses of the arm, drawn within the joint limits.
 
     Args:
-        arm: NumPy leaves.
+        arm: the arm, with NumPy leaves.
         camera: the camera at its true pose.
         noise: parameters of the stereo camera's noise.
         num: number of views, >= 1.
         seed: random seed of poses and noise.
-        draws: number of drawn poses; poses from which the camera cannot see the board are dropped.
+        draws: number of drawn poses; poses in which the camera cannot see the board are dropped.
 
     Raises:
-        ValueError: the camera sees the board in fewer than `num` of the drawn poses; one line.
+        ValueError: the camera sees the board in fewer than `num` of the drawn poses.
     """
     rng = np.random.default_rng(seed)
     angles = rng.uniform(arm.lower, arm.upper, (draws, 6)).astype(np.float32)
@@ -76,9 +77,10 @@ def show_board(
 def calibrate_camera(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int = 20, *, seed: int = 0
 ) -> tuple[Camera, Calibration]:
-    """Return the camera at its calibrated pose, and the calibration itself.
+    """Calibrate a camera by `num` simulated views of a board on the arm.
 
-    The calibration uses `num` views of the board.
+    Returns:
+        The camera at its calibrated pose, and the calibration itself.
     """
     found = calibrate(*show_board(arm, camera, noise, num, seed=seed))
     return move_camera(camera, found.camera), found

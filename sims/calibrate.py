@@ -3,9 +3,9 @@
 The robot holds a board of known points before the camera, which does not move. Four poses are
 involved: A_k of the flange in the robot's base frame, Z of the board on the flange, X of the camera
 in the base frame, and B_k of the board in the camera's frame. They satisfy  A_k Z = X B_k.  Two
-views eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. It
-is solved in closed form, and the solution is refined on the measured points. Poses are (4, 4)
-matrices, lengths [m].
+views eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. This
+equation is solved in closed form, and the solution is refined on the measured points. Poses are
+(4, 4) matrices, lengths are in metres.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-_LEAST_TURN = 0.05  # [rad], least rotation between two views that are used as a pair
+_LEAST_TURN = 0.05  # [rad], least rotation between two views whose equation A X = X B is used
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,11 +23,11 @@ class Calibration:
 
     camera: np.ndarray  # (4, 4), pose of the camera in the robot's base frame
     board: np.ndarray  # (4, 4), pose of the board on the flange
-    residual: float  # root mean square of the misfit, in standard deviations
+    residual: float  # root mean square distance of measured points, in standard deviations
 
 
 def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
-    """Return poses (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3) [m]."""
+    """Return pose matrices (..., 4, 4) of rotations (..., 3, 3) and positions (..., 3) [m]."""
     found = np.zeros((*np.shape(rotation)[:-2], 4, 4))
     found[..., :3, :3], found[..., :3, 3], found[..., 3, 3] = rotation, place, 1.0
     return found
@@ -36,11 +36,11 @@ def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
 def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return the pose (4, 4) that maps points (M, 3) [m] onto measured points (M, 3) [m].
 
-    It minimises the sum of squared distances in closed form, by a singular value decomposition
-    [Kabsch1976]. The result is never a reflection.
+    The pose minimises the sum of squared distances in closed form, by a singular value
+    decomposition [Kabsch1976]. The result is never a reflection.
 
     Raises:
-        ValueError: there are fewer than three points, or all lie on one line; one line.
+        ValueError: there are fewer than three points, or all points lie on one line.
     """
     points, seen = np.asarray(points, float), np.asarray(seen, float)
     if points.shape != seen.shape or points.ndim != 2 or points.shape[1] != 3 or len(points) < 3:
@@ -59,17 +59,17 @@ def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
 def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
     """Return the pose X (4, 4) of the camera that solves A X = X B over every pair of views.
 
-    The rotation is the one that best maps the rotation vectors of the camera's motions onto the
-    rotation vectors of the robot's motions, by a singular value decomposition as in [Park1994]. The
-    position then follows from linear least squares.
+    The rotation of X is the rotation that best maps the rotation vectors of the camera's motions
+    onto the rotation vectors of the robot's motions, by a singular value decomposition as in
+    [Park1994]. The position then follows from linear least squares.
 
     Args:
         flange: (K, 4, 4) A_k, poses of the flange in the base frame, K >= 3.
         views: (K, 4, 4) B_k, poses of the board in the camera's frame.
 
     Raises:
-        ValueError: there are too few views, or all rotate about one axis, so that the camera's
-            position along that axis is undetermined; one line.
+        ValueError: there are too few views, or all views rotate about one axis, so that the
+            camera's position along that axis is undetermined.
     """
     flange, views = np.asarray(flange, float), np.asarray(views, float)
     if flange.shape != views.shape or flange.shape[1:] != (4, 4):
@@ -96,7 +96,7 @@ def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
 def calibrate(
     flange: np.ndarray, points: np.ndarray, seen: np.ndarray, std: np.ndarray | float = 1.0
 ) -> Calibration:
-    """Return the camera's pose from views of a board that the robot holds.
+    """Return the poses of the camera and the board from views of a board that the robot holds.
 
     `rigid_motion` gives the board's pose in each view, and `hand_eye` the camera's pose from all
     views. Levenberg-Marquardt then refines both poses together: it minimises the distances between
@@ -104,9 +104,10 @@ def calibrate(
 
     Args:
         flange: (K, 4, 4), poses of the flange in the base frame, K >= 3.
-        points: (M, 3) [m], of the board in its own frame, M >= 3.
+        points: (M, 3) [m], points of the board in its own frame, M >= 3.
         seen: (K, M, 3) [m], the measured points in the camera's frame.
-        std: [m], of the measured points: a number, or (K, M, 3) along the camera's axes.
+        std: [m], standard deviations of the measured points: one number, or (K, M, 3) along the
+            camera's axes.
 
     Raises:
         ValueError: the points or the views do not determine the poses; see `rigid_motion` and
@@ -115,7 +116,7 @@ def calibrate(
     flange, points, seen = (np.asarray(each, float) for each in (flange, points, seen))
     views = np.stack([rigid_motion(points, each) for each in seen])
     camera = hand_eye(flange, views)
-    # The board does not move on the flange: its pose is the mean over all views.
+    # The board does not move on the flange. The initial guess of its pose is the mean of all views.
     boards = np.linalg.inv(flange) @ camera @ views
     turn = Rotation.from_matrix(boards[:, :3, :3]).mean().as_matrix()
     board = pose(turn, boards[:, :3, 3].mean(axis=0))

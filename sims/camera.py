@@ -2,12 +2,12 @@
 # pyright: reportAttributeAccessIssue=false
 """A simulated camera beside the arm: colour and depth images, rendered off-screen by MuJoCo.
 
-Robot base frame, z up, SI units. The scene has the arm, the pole, the rig's beams, a floor, walls
-and a ball. The protected boxes of the task are invisible. The light is even. Exposure takes no
-time, so that there is no motion blur.
+Positions are in the robot's base frame, z up, in SI units. The scene contains the arm, the pole,
+the beams around the arm, a floor, walls and a ball. The two boxes of the block task are invisible.
+The light is even, and the exposure takes no time, so that images have no motion blur.
 
 Rendering needs OpenGL without a display. The default is EGL; MuJoCo's environment variable
-`MUJOCO_GL` selects another one.
+`MUJOCO_GL` selects another library.
 """
 
 import importlib.resources
@@ -29,20 +29,20 @@ from planner_jax.studies.block.noise import StereoNoise
 from planner_jax.task.block.scene import Scene
 
 _ARM = importlib.resources.files("planner_jax.robot") / "models" / "irb1600.xml"
-_POLE_TOP = 2.52  # [m]: 3 m from the floor, as in the authors' model
-_WALLS, _HIGH = 13.0, 6.0  # [m], distance of the walls from the arm, and their height
-_NEAR, _FAR = 0.1, 40.0  # [m], clipping planes of the renderer
+_POLE_TOP = 2.52  # [m], height of the pole's top in the base frame, 3 m above the floor
+_WALLS, _HIGH = 13.0, 6.0  # [m], distance of the walls from the arm, and height of the walls
+_NEAR, _FAR = 0.1, 40.0  # [m], clipping distances of the renderer
 _BALL, _POLE, _STEEL, _ARM_COLOUR, _WALL = "#FF7A0A", "#E59BC0", "#A7AFB5", "#D9D9D4", "#9AA7B4"
 
 
 class RenderError(PlannerJaxError, RuntimeError):
-    """Rendering is impossible on this machine; the message is one line."""
+    """Rendering is impossible on this machine; the message is a single line."""
 
 
 class SceneCamera:
-    """A camera that renders images of the arm's scene.
+    """A camera that renders images of the scene around the arm.
 
-    Close it after use, or use it in a `with` statement.
+    Close the camera after use, or use it in a `with` statement.
     """
 
     def __init__(
@@ -51,13 +51,13 @@ class SceneCamera:
         """Create the scene and the OpenGL context.
 
         Args:
-            camera: NumPy leaves.
+            camera: size, focal length and pose of the camera, with NumPy leaves.
             scene: the surroundings of the arm in one case.
             ball_radius: [m].
             arm_xml: MJCF text of the arm; by default the arm of the paper.
 
         Raises:
-            RenderError: OpenGL is not available; one line.
+            RenderError: OpenGL is not available.
         """
         text = _ARM.read_text("utf-8") if arm_xml is None else arm_xml
         self.camera = camera
@@ -91,19 +91,19 @@ class SceneCamera:
         self.close()
 
     def close(self) -> None:
-        """Release the OpenGL context."""
+        """Release the renderer and the OpenGL context."""
         self._to.free()
         self._context.free()
 
     def take(
         self, ball: np.ndarray | None, angles: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return one frame, without noise.
+        """Render one frame, without noise.
 
         Args:
             ball: (3,) [m], centre of the ball; None for a scene without a ball.
-            angles: (6,) [rad], of the arm's joints; by default the angles of the previous frame, at
-                first the home position.
+            angles: (6,) [rad], joint angles of the arm; by default the angles of the previous
+                frame, and for the first frame the home position.
 
         Returns:
             image: (rows, columns, 3) bytes, red, green and blue.
@@ -181,7 +181,7 @@ def measure_balls(
 
 
 def _context_class() -> Any:
-    """Return MuJoCo's class of OpenGL contexts: EGL unless `MUJOCO_GL` selects another one."""
+    """Return MuJoCo's class of OpenGL contexts: EGL unless `MUJOCO_GL` selects another library."""
     if os.environ.get("MUJOCO_GL", "").lower().strip() in ("", "egl") and os.name == "posix":
         from mujoco.egl import GLContext
 
@@ -190,16 +190,16 @@ def _context_class() -> Any:
 
 
 def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float) -> mujoco.MjModel:
-    """Return the model of the arm, its surroundings, a ball and the camera."""
+    """Return the MuJoCo model of the arm, its surroundings, a ball and the camera."""
     root = ET.fromstring(arm_xml)
     for geom in root.iter("geom"):
         geom.set("rgba", xml_colour(_ARM_COLOUR))
     width, height = camera.size
-    root.append(_element("statistic", extent=1.0))  # near and far are then in metres
+    root.append(_element("statistic", extent=1.0))  # makes `near` and `far` distances in metres
     visual = _element("visual")
     visual.append(_element("map", znear=_NEAR, zfar=_FAR))
     visual.append(_element("global", offwidth=width, offheight=height))
-    # Antialiasing blends samples and would shift small objects by up to half a pixel.
+    # Antialiasing is off: it blends samples and would shift small objects by up to half a pixel.
     visual.append(_element("quality", offsamples=0, numslices=48, numstacks=48))
     visual.append(_element("headlight", ambient=[0.45] * 3, diffuse=[0.25] * 3))
     root.append(visual)
@@ -227,7 +227,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
     ball = _element("body", name="ball", mocap="true")
     ball.append(_element("geom", type="sphere", size=[ball_radius], rgba=xml_colour(_BALL)))
     world.append(ball)
-    # MuJoCo's cameras have y up and look along -z.
+    # Cameras of MuJoCo have the y axis up and look along -z.
     axes = np.asarray(camera.rotation, float)
     angle = np.rad2deg(2.0 * np.arctan(0.5 * height / float(camera.focal)))
     eye = {"pos": camera.position, "xyaxes": [*axes[:, 0], *-axes[:, 1]], "fovy": angle}
@@ -236,7 +236,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
 
 
 def _element(tag: str, **attributes: Any) -> ET.Element:
-    """Return an element of MJCF; numbers of lists and arrays are separated by blanks."""
+    """Return an MJCF element; lists and arrays become numbers separated by blanks."""
     written = {
         name: value if isinstance(value, str) else xml_numbers(*np.atleast_1d(value))
         for name, value in attributes.items()

@@ -1,11 +1,12 @@
 """Drives of a car in closed loop: state estimation, tracking, and replanning between frames.
 
-A physics step is also a control step. A frame is a fixed number of steps; the pose at its end is
-stored. The caller may replace the plan between frames (`sims.tasks.intercept` does). Measured poses
-of the car are noisy and one latency old. Between measurements the car integrates its own speed and
-steering angle (dead reckoning). A measurement corrects the estimate of the time at which it was
-taken. The code is written for one drive; `drive_on` batches it. Times count from the start of the
-first plan.
+Each physics step is also a control step. A frame is a fixed number of steps, at whose end the pose
+is stored. The caller may replace the plan between frames (`sims.tasks.intercept` does).
+
+Measured poses of the car are noisy and arrive one latency late. Between measurements the car
+integrates its own speed and steering angle (dead reckoning). A measurement corrects the estimate of
+the time at which the measurement was taken. The code is written for one drive; `drive_on` batches
+it. Times count from the start of the first plan.
 """
 
 import dataclasses
@@ -26,20 +27,20 @@ from planner_jax.sims.robot import Physics
 from planner_jax.sims.robots.car.control import CarState
 from planner_jax.sims.robots.car.robot import Car
 
-_TRUST = 0.1  # gain of the pose estimator: share of the innovation that is added at every step
+_TRUST = 0.1  # gain of the pose estimator: fraction of the innovation that a step adds
 
 
 @dataclasses.dataclass(frozen=True)
 class DriveLoop:
     """World and sensing of a drive; static under jit.
 
-    A change of the noise alone recompiles nothing.
+    Changing only the noise does not compile the program again.
 
     Raises:
         ValueError: the world has no car, or its time step is not the control step.
     """
 
-    world: World  # must hold a car
+    world: World  # the simulated world, which must hold a car
     sensing: PlaneSensing = PlaneSensing()
 
     def __post_init__(self) -> None:
@@ -52,18 +53,18 @@ class DriveLoop:
 
     @property
     def car(self) -> Car:
-        """The simulated car."""
+        """The simulated car of the world."""
         return _car(self.world)
 
     @property
     def late_steps(self) -> int:
-        """The age of a measured pose, in control steps."""
+        """The age of a measured pose at its arrival, in control steps."""
         return round(self.sensing.latency * CONTROL_RATE)
 
 
 @struct.dataclass
 class DriveState:
-    """Everything that changes during a drive."""
+    """The variables that change during a drive: physics, estimates, plan and scores."""
 
     physics: Physics
     shown: Array  # (L + 1, 3), true poses of the last steps, the newest last
@@ -81,7 +82,7 @@ class DriveState:
 
 @struct.dataclass
 class Frame:
-    """The state at the end of a frame."""
+    """The pose of a car at the end of a frame, and its planned position."""
 
     time: Array  # () [s]
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
@@ -94,7 +95,7 @@ def _car(world: World) -> Car:
 
 
 def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
-    """Return the pose (3,) after a short time [s] at a speed () along a path of a curvature ()."""
+    """Return the pose (3,) after a short time [s] at constant speed () and path curvature ()."""
     turned = speed * curvature * span
     middle = pose[2] + 0.5 * turned
     way = speed * span
@@ -102,11 +103,11 @@ def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array
 
 
 def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
-    """Return drives at the start of their plans.
+    """Return the states of drives at the start of their first plans.
 
     Args:
         loop: settings of the loop, with the world.
-        plans: leaves (B, ...).
+        plans: first plans, leaves (B, ...).
         keys: (B,) random keys of the noise.
     """
 
@@ -131,14 +132,14 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
 
 
 def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
-    """Return the estimated pose (3,), the speed () [m/s] and the path curvature () [1/m]."""
+    """Return estimated pose (3,), own speed () [m/s] and own path curvature () [1/m] of a drive."""
     state = loop.car.state(drive.physics)
     curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
     return drive.believed[-1], state.speed, curvature
 
 
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
-    """Return the drive one frame later; tracking and saturation are summed up to a time () [s]."""
+    """Simulate a drive for one frame; errors and saturation are summed up to `until` () [s]."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
     steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)
@@ -157,7 +158,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         over = car.saturation(physics, command)
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
-        # The measurement is one latency old; compare it with the estimate of that time.
+        # The measurement shows the pose of one latency ago. Compare it with the estimate of then.
         seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
@@ -195,7 +196,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
 def _advance_estimate(
     car: Car, pose: Array, before: CarState, after: CarState, span: float
 ) -> Array:
-    """Return an estimated pose one step later, from the car's own speed and steering angle."""
+    """Integrate an estimated pose over one step, by the car's own speed and steering angle."""
     steering = 0.5 * (before.steering + after.steering)
     curvature = jnp.tan(steering) / car.vehicle.wheelbase
     return dead_reckon(pose, after.speed, curvature, span)
@@ -209,8 +210,8 @@ def drive_on(
 
     Args:
         world: a world with a car.
-        drives: leaves (B, ...).
-        until: (B,) [s], up to when tracking and saturation are summed.
+        drives: states of the drives, leaves (B, ...).
+        until: (B,) [s], time up to which tracking errors and saturation are summed.
         num_frames: number of frames (static).
 
     Returns:

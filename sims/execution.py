@@ -1,9 +1,9 @@
 """Execution of an arm's plans in closed loop: measure the joints, command torques, step the world.
 
-A physics step is also a control step. Two steps make a frame, at whose end the joint angles are
-stored. The arm waits until its motion starts, follows it, and brakes where it ends. The code is
-written for one arm; `execute` batches it. Times count from the moment at which the ball is first
-seen.
+Each physics step is also a control step. Two steps make a frame, at whose end the joint angles are
+stored. The arm waits until its motion starts, follows the motion, and brakes at the motion's end.
+The code is written for one arm; `execute` batches it. Times count from the moment at which the ball
+is first seen.
 """
 
 import dataclasses
@@ -25,13 +25,13 @@ from planner_jax.sims.robots.arm.drives import IDEAL, Drives
 from planner_jax.sims.robots.arm.robot import ShieldArm
 
 TIMESTEP = 1e-3  # [s], time step of physics and control
-_STEPS, _FRAMES = 2, 50  # steps per frame, frames per compiled call
+_STEPS, _FRAMES = 2, 50  # number of steps per frame, and of frames per compiled call
 FRAME = _STEPS * TIMESTEP  # [s], duration of a frame
 
 
 @struct.dataclass
 class ArmState:
-    """Everything that changes while an arm follows a course."""
+    """The variables that change while an arm follows a course: physics, torques and errors."""
 
     physics: Physics
     torques: Array  # (6,) [N m], acting torques
@@ -46,7 +46,7 @@ class ArmState:
 
 @struct.dataclass
 class _Setting:
-    """The motion and the drives of an arm, constant during its execution."""
+    """The course and the drives of an arm, constant during its execution."""
 
     course: Course
     since: Array  # () [s], start of the interval in which errors and torques are summed
@@ -54,7 +54,7 @@ class _Setting:
     torques: Array  # (6,) [N m], torque limits
     lag: Array  # () [s], first-order lag of the torques
     stds: Array  # (2,), standard deviations of measured angles [rad] and rates [rad/s]
-    mass_error: Array  # () relative error of the masses in the controller's model
+    mass_error: Array  # (), relative error of the masses in the controller's model
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,15 +66,15 @@ class Executed:
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
     angles: np.ndarray  # (B, S, 6) [rad]
-    wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without delays
+    wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without the drives' delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
-    # (B, 6) [rad], rms distance from the commanded course, which may start late
+    # (B, 6) [rad], rms error of each joint from the commanded course, which may start late.
     error_rms: np.ndarray
-    error_worst: np.ndarray  # (B, 6) [rad], greatest distance from it
-    torque_rms: np.ndarray  # (B, 6) [N m]
-    torque_worst: np.ndarray  # (B, 6) [N m]
-    saturation: np.ndarray  # (B, 6), share of the time in which a drive was at its limit
-    last_rates: np.ndarray  # (B, 6) [rad/s], at the last frame, where another plan may start
+    error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from that course
+    torque_rms: np.ndarray  # (B, 6) [N m], rms torque of each joint
+    torque_worst: np.ndarray  # (B, 6) [N m], greatest torque of each joint
+    saturation: np.ndarray  # (B, 6), fraction of the time in which a drive was at its torque limit
+    last_rates: np.ndarray  # (B, 6) [rad/s], rates at the last frame, where another plan may start
 
 
 def _arm(world: World) -> ShieldArm:
@@ -85,12 +85,12 @@ def _arm(world: World) -> ShieldArm:
 def _one_frame(
     world: World, setting: _Setting, state: ArmState
 ) -> tuple[ArmState, tuple[Array, Array]]:
-    """Return the arm one frame later, and its angles (6,) and rates (6,) then."""
+    """Simulate an arm for one frame; return its state, and the angles (6,) and rates (6,)."""
     robot, dtype, span = _arm(world), state.time.dtype, world.timestep
     key, noise_key = jax.random.split(state.key)
     noise = jax.random.normal(noise_key, (_STEPS, *robot.noise_shape), dtype)
     times = state.time + span * jnp.arange(_STEPS, dtype=dtype)
-    # The feedforward acceleration leads by the drives' lag, to compensate it.
+    # The torques lag. The feedforward acceleration is taken from one lag ahead to compensate this.
     references = robot.references(setting.course, times, world)
     ahead = robot.references(setting.course, times + setting.lag, world)
     references = dataclasses.replace(references, accelerations=ahead.accelerations)
@@ -130,7 +130,7 @@ def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState,
 
 
 def _start(world: World, setting: _Setting, key: Array) -> ArmState:
-    """Return an arm at time 0 of its course, with the torques that hold it on the course."""
+    """Return an arm at time 0 of its course, with the torques that keep it on the course."""
     robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
     reference = jax.tree.map(
         lambda leaf: leaf[0], robot.references(setting.course, zero[None], world)
@@ -143,7 +143,7 @@ def _start(world: World, setting: _Setting, key: Array) -> ArmState:
 
 @functools.cache
 def _compile(world: World) -> tuple[Callable, Callable, Callable]:
-    """Return compiled functions that start a batch, advance it, and evaluate its courses."""
+    """Return compiled functions that start a batch, advance a batch, and evaluate courses."""
     options = compiler_options()
     start = jax.jit(jax.vmap(functools.partial(_start, world)))
     advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
@@ -157,11 +157,11 @@ def _compile(world: World) -> tuple[Callable, Callable, Callable]:
 
 @functools.cache
 def compiler_options() -> dict[str, Any] | None:
-    """Return the XLA options for compiling steps of an arm; None for the defaults.
+    """Return the XLA options with which steps of an arm are compiled; None for the defaults.
 
-    On a CPU, XLA's fusion emitters recompute a link's position in every expression that uses it. In
-    a chain of six links that means hundreds of evaluations. A step is 200 times as fast without
-    them.
+    On a CPU, XLA's fusion emitters recompute a link's position in every expression that uses the
+    position. In a chain of six links this causes hundreds of evaluations. Without fusion emitters a
+    step is 200 times as fast.
     """
     if jax.default_backend() != "cpu":
         return None
@@ -184,17 +184,17 @@ def execute(
     late: np.ndarray | float = 0.0,
     drives: Drives = IDEAL,
 ) -> Executed:
-    """Execute a batch of courses.
+    """Simulate arms that execute a batch of courses, and return their motions and errors.
 
     Args:
         world: a world with an arm, and steps of `TIMESTEP`.
-        courses: leaves (B, ...), as planned.
+        courses: the planned courses, leaves (B, ...).
         keys: (B,) random keys of the noise.
         since: (B,) [s], start of the interval in which errors and torques are evaluated.
         until: (B,) [s], end of that interval.
         end: [s], least duration of the simulation.
         late: (B,) or () [s], delay of the start of a course, in addition to the drives' latency.
-        drives: limits and errors of the drives of all arms.
+        drives: limits and errors of the drives, equal for all arms.
 
     Raises:
         ValueError: the world has no arm, or its time step is not `TIMESTEP`.

@@ -1,4 +1,4 @@
-"""Pictures and films of a flight, drawn without a display: target, robot, plan and ghost images."""
+"""Pictures and films of a flight, drawn without a display: robot, plan, balls and ghost images."""
 
 import shutil
 from pathlib import Path
@@ -21,12 +21,12 @@ from planner_jax.sims.task import FlightTask
 
 BALL_COLOURS = (ORANGE, PURPLE, GREEN)
 FORMATS = (".gif", ".mp4")
-_FRAME = 2  # recorded samples per film frame
+_FRAME = 2  # number of recorded samples from one frame of a film to the next
 _GHOSTS, _APART = 7, 0.45  # greatest number of ghost images, and their spacing on the path [m]
 
 
 def require_film(path: Path) -> None:
-    """Raise `ArgumentError` unless this machine can write a film of that file format."""
+    """Raise `ArgumentError` unless this machine can write a film in the file's format."""
     if path.suffix not in FORMATS:
         raise ArgumentError("video", " or ".join(FORMATS), path.name, verb="end in")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
@@ -34,7 +34,7 @@ def require_film(path: Path) -> None:
 
 
 class Scene:
-    """One flight, drawn in 3-D axes."""
+    """A drawing of one flight in 3-D axes."""
 
     def __init__(
         self,
@@ -45,15 +45,15 @@ class Scene:
         title: str | None = None,
         view: tuple[float, float] | None = None,
     ):
-        """Draw everything that does not move.
+        """Draw all parts that do not move.
 
         Args:
             figure: an empty figure.
             task: the task of the run.
             recording: the recorded flights of the run.
-            flight: row of the recording.
+            flight: index of the flight in the recording.
             title: title of the picture; by default the title that the task composes.
-            view: elevation and azimuth of the eye [degree]; by default the task's.
+            view: elevation and azimuth of the view [degree]; by default the task's view.
         """
         world = task.world()
         self.world, self.recording, self.flight = world, recording, flight
@@ -62,7 +62,7 @@ class Scene:
         balls, met = recording.balls[flight], np.nan_to_num(self.met, nan=np.inf)
         after = self.times[:, None] > met
         self.balls = np.where(after[..., None], np.nan, balls)
-        self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # path of the returned ball
+        self.back = np.where(after[:, :1], balls[:, 0], np.nan)  # trajectory of the returned ball
         self.axes: Any = figure.add_subplot(projection="3d")
         wanted = self.plan_path()
         plan = self.axes.plot(*wanted.T, color=INK, lw=1.0, ls="--", label="plan")
@@ -95,7 +95,7 @@ class Scene:
         if task.BOUNDS is None:
             points = np.concatenate([wanted, balls.reshape(-1, 3), *edges, *patches])
             low, high = np.nanmin(points, axis=0), np.nanmax(points, axis=0)
-            thin = np.maximum(1.6 - (high - low), 0.0)  # [m], padding of thin axes
+            thin = np.maximum(1.6 - (high - low), 0.0)  # [m], padding of axes with a short range
             low, high = low - 0.2 - 0.5 * thin, high + 0.2 + 0.5 * thin
             low[2] = 0.0
         else:
@@ -125,9 +125,9 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the balls (K, N, 3), with NaN outside the bounds of the axes.
+        """Return the trajectories (K, N, 3) of balls, with NaN outside the bounds of the axes.
 
-        Balls in flight and returned balls are clipped to the same bounds.
+        The stored trajectories of flying and returned balls are clipped to the same bounds.
         """
         balls = self.recording.balls[self.flight]
         inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)
@@ -136,36 +136,36 @@ class Scene:
         return np.where(inside, balls, np.nan)
 
     def _fill(self, prism: Prism, time: float) -> list[Any]:
-        """Draw a prism's top as a filled polygon at a time [s]; return what was drawn."""
+        """Draw a prism's top as a filled polygon at a time [s]; return the drawn artists."""
         top = prism.outlines(time)[1]
         style = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
         return [self.axes.add_collection3d(Poly3DCollection([top], **style))]
 
     def _add_solid(self, solid: Solid, colour: str, opacity: float, shade: bool = False) -> Any:
-        """Draw the faces of a solid in the world frame; return what was drawn."""
+        """Draw the faces of a solid in the world frame; return the drawn artist."""
         faces = solid.corners[solid.triangles]
         style = {"facecolors": colour, "edgecolors": colour, "linewidth": 0.0}
         style |= {"alpha": opacity, "shade": shade}
         return self.axes.add_collection3d(Poly3DCollection(faces, **style))
 
     def plan_path(self) -> np.ndarray:
-        """Return the path of the executed plans (M, 3) [m], up to the last contact."""
+        """Return the path (M, 3) [m] of the executed plans, up to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.find_last_contact() + 1]
         return wanted[np.isfinite(wanted).all(axis=1)]
 
     def find_last_contact(self) -> int:
-        """Return the index of the sample at the last contact; by default the last sample."""
+        """Return the index of the sample at the last contact; without one, of the last sample."""
         end = np.nanmax(np.append(self.met, -np.inf))
         at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_samples
         return min(at, self.num_samples - 1)
 
     def _machine(self) -> list[Part]:
-        """Return the parts of the pitching machine at the launch position, if there is one."""
+        """Return the pitching machine's parts at the launch position; empty without a machine."""
         launch = self.recording.launch(self.flight)
         return machine_parts(*launch) if launch and self.world.mouth else []
 
     def robot(self, at: int, alpha: float = 1.0) -> list[Any]:
-        """Draw the robot at a sample, with its tool filled; return what was drawn."""
+        """Draw the robot at a sample, with its tool filled; return the drawn artists."""
         robot = self.world.robot
         pose = frame(self.recording, robot, self.flight, at).robot
         drawn: list[Any] = []
@@ -183,7 +183,7 @@ class Scene:
         return drawn
 
     def ghosts(self, last: int) -> None:
-        """Draw the robot and the balls at equal distances along the path up to a sample.
+        """Draw images of robot and balls at equal distances along the path up to a sample.
 
         Later images are more opaque.
         """
@@ -210,9 +210,9 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def show(self, at: int, back: int | None = None) -> None:
-        """Draw the moving parts at a sample.
+        """Draw the moving objects at a sample.
 
-        The returned ball's path ends at the sample `back`, if given.
+        The trajectory of the returned ball ends at the sample `back`, by default at this sample.
         """
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
@@ -240,15 +240,15 @@ def draw_flight(
     title: str | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Write a picture of one flight with ghost images.
+    """Write a picture of one flight, with ghost images of robot and balls at earlier times.
 
     Args:
-        path: ends in .png.
+        path: path of the picture, which ends in .png.
         task: the task of the run.
         recording: the recorded flights of the run.
-        flight: row of the recording.
+        flight: index of the flight in the recording.
         title: title of the picture; by default the title that the task composes.
-        view: elevation and azimuth of the eye [degree]; by default the task's.
+        view: elevation and azimuth of the view [degree]; by default the task's view.
     """
     figure = Figure(figsize=(7.6, 6.0))
     FigureCanvasAgg(figure)
@@ -263,16 +263,16 @@ def draw_flight(
 def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -> None:
     """Write a film of the first flights, one after the other.
 
-    An interrupted film leaves no file.
+    If the film is interrupted, no file remains.
 
     Args:
-        path: ends in .gif, or in .mp4 where ffmpeg is installed.
+        path: path of the film, which ends in .gif, or in .mp4 where ffmpeg is installed.
         task: the task of the run.
         recording: the recorded flights of the run.
         num: number of flights in the film.
 
     Raises:
-        ArgumentError: this machine cannot write a film of that file format.
+        ArgumentError: this machine cannot write a film in the file's format.
     """
     require_film(path)
     fps = 20

@@ -1,12 +1,13 @@
-"""Access control of the viewer's web server.
+"""Access control of the web server of the flight viewer, `view.py`.
 
-Pages of other sites in the same browser are rejected: the origin of a request must be the server
-itself, under one of its own host names. Beyond the loopback address every request also needs the
-token, in its address or, after the first page, in a cookie. Traffic is not encrypted: whoever can
-read the network traffic can read the token. Across networks use a tunnel such as `ssh -L`.
+Requests from pages of other sites in the same browser are rejected: the origin of a request must be
+the server itself, under one of its own host names. If the server listens on another address than
+the loopback address, every request also needs the token, in its address or, after the first page,
+in a cookie. Traffic is not encrypted: whoever can read the network traffic can read the token.
+Across networks use a tunnel such as `ssh -L`.
 
-Viser has no setting for this. Therefore the function that starts its web server is replaced while
-the server is created.
+The viewer's library viser has no setting for access control. Therefore the function that starts its
+web server is replaced while the server is created.
 """
 
 import contextlib
@@ -21,13 +22,13 @@ _OWN = {"localhost", "127.0.0.1", "::1"}
 
 
 def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> bool:
-    """Return whether a request may be answered.
+    """Return whether the server may answer a request.
 
     Args:
         headers: headers of the request.
         path: path of the request, with its query.
         names: host names of this machine.
-        token: required of the request, or None.
+        token: token that the request must contain, or None if no token is needed.
     """
     here = headers.get("Host", "")
     if token is None and urlsplit(f"//{here}").hostname not in names | _OWN:

@@ -1,7 +1,7 @@
-"""The start of a flight: a robot at rest, launched balls, and the first observations of them.
+"""The start of a flight: a robot at standstill, launched balls, and first observations of them.
 
-A ball has been in flight for a while when the first plan starts: the papers observe it for the
-first 2 m of its path [Yu2023catch, Section VII-A]. This first part is not simulated in MuJoCo. It
+A ball is already in flight when the first plan starts: the papers observe it for the first 2 m of
+its path [Yu2023catch, Section VII-A]. This first part of the flight is not simulated in MuJoCo. It
 is integrated backwards from the ball's state at the start of the plan.
 """
 
@@ -24,16 +24,16 @@ from planner_jax.sims.sensing import Estimate
 
 
 def flight_keys(seed: int, index: np.ndarray) -> Array:
-    """Return random keys (B,) of the flights at these indices of the run.
+    """Return random keys (B,) of flights, from a seed and their indices in the run.
 
-    A flight's key does not depend on its batch.
+    A flight's key does not depend on the batch to which the flight belongs.
     """
     return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(jax.random.key(seed), jnp.asarray(index))
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
-    """Return flights with the robots at rest and no ball launched.
+    """Return flights in which the robots stand still and no ball has been launched.
 
     Args:
         loop: settings of the loop, with the world.
@@ -76,18 +76,18 @@ def launch_ball(
     ball: int,
     seen: float,
 ) -> FlightState:
-    """Return the flights with one more ball in the air.
+    """Return the flights after one more ball has been launched.
 
     Args:
         loop: settings of the flights' loop.
-        flights: leaves (B, ...).
-        balls: leaves (B, N, 3), each at the start of the plan for it.
-        drag: (B, N) K_D [1/m], the true one.
-        believed: (B, N) K_D [1/m], initial estimate.
-        ball: index of the launched ball among the N.
-        seen: [s], how long the ball has been in flight (static).
+        flights: states of the flights, leaves (B, ...).
+        balls: leaves (B, N, 3), state of each ball at the start of the plan for it.
+        drag: (B, N), true K_D [1/m].
+        believed: (B, N), initial estimate of K_D [1/m].
+        ball: index of the launched ball among the N balls.
+        seen: [s], how long the ball has already been in flight (static).
     """
-    without = dataclasses.replace(flights, plan=None)  # plans stay as they are
+    without = dataclasses.replace(flights, plan=None)  # the launch does not change the plans
     after = _launch_ball(loop, without, balls, drag, believed, ball, seen)
     return dataclasses.replace(after, plan=flights.plan)
 
@@ -102,7 +102,7 @@ def _launch_ball(
     ball: Array,
     seen: float,
 ) -> FlightState:
-    """Add a ball to flights without plans; see `launch_ball`."""
+    """Launch a ball in flights without plans; see `launch_ball`."""
 
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
@@ -129,16 +129,16 @@ def await_ball(
 ) -> FlightState:
     """Return the flights with a guess of one more ball that has not been observed yet.
 
-    The estimate of the ball is the guessed flight, integrated backwards from the start of the plan
-    for it.
+    The estimate of this ball is the guessed flight, integrated backwards from the start of the plan
+    for the ball.
 
     Args:
         loop: settings of the flights' loop.
-        flights: leaves (B, ...).
+        flights: states of the flights, leaves (B, ...).
         coming: leaves (3,), guessed state of the ball at the start of the plan for it.
-        believed: (B, N) K_D [1/m], initial estimate.
-        ball: index of the awaited ball among the N.
-        ahead: [s] until the plan for it starts (static).
+        believed: (B, N), initial estimate of K_D [1/m].
+        ball: index of the awaited ball among the N balls.
+        ahead: [s], time until the plan for the ball starts (static).
     """
     gravity = jnp.asarray(loop.world.gravity, believed.dtype)
 
@@ -164,19 +164,19 @@ def await_ball(
 def watch_ball(
     loop: Loop, ball: BallState, drag: Array, believed: Array, key: Array, duration: float
 ) -> tuple[Array, Estimate, Estimate]:
-    """Return the observations of one ball before the start of the plan for it.
+    """Simulate the observations of one ball before the start of the plan for this ball.
 
     Args:
         loop: settings of the loop, with sensing and planning period.
         ball: true state at the start of the plan.
-        drag: () K_D [1/m], the true one.
-        believed: () K_D [1/m], initial estimate.
+        drag: (), true K_D [1/m].
+        believed: (), initial estimate of K_D [1/m].
         key: random key of the observation noise.
-        duration: [s], how long the ball has been in flight by then (static).
+        duration: [s], how long the ball has been in flight at the start of the plan (static).
 
     Returns:
-        Positions (L, 3) [m] that are still to be observed because of the latency, and the estimates
-            of one planning period ago and of now.
+        Positions (L, 3) [m] that are observed later because of the latency, and the estimates of
+            one planning period ago and of now.
     """
     sensing, dtype = loop.sensing, drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
@@ -201,14 +201,14 @@ def watch_ball(
 
 
 def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None:
-    """Raise `ValueError` unless the simulated world is the one for which plans are made.
+    """Raise `ValueError` unless the simulated world is the world for which plans are made.
 
     Args:
         loop: settings of the loop, with the world.
-        kind: required kind of the tool.
+        kind: required kind of the tool, net or racket.
         num_balls: required number of balls of a flight.
         planned: (B,) each, the values of `gravity`, `net_height`, `net_radius`, `racket_height` or
-            `racket_radius` in the plans' cases; only the passed ones are compared.
+            `racket_radius` in the plans' cases; only the passed values are compared.
     """
     world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:
@@ -229,12 +229,12 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
 
 
 def require_plan(plan: Any, kind: type, head_state: Any) -> None:
-    """Raise `ValueError` unless a plan is one of the task and starts at the position of the robot.
+    """Raise `ValueError` unless plans belong to the task and start at the robots' positions.
 
     Args:
         plan: plans with a trajectory, leaves (B, ...).
         kind: class of the task's plans.
-        head_state: (B, 4, 3) of the robot.
+        head_state: (B, 4, 3), states of the robots at the start, position first.
     """
     if not isinstance(plan, kind):
         raise ArgumentError("plan", f"a {kind.__name__}", shown=f"a {type(plan).__name__}")

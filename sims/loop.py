@@ -1,14 +1,15 @@
 """The closed loop of a batch of flights, period by period: observe, estimate, replan, track, hit.
 
-Three periods are nested. A physics step is also a control step. An observation of the balls follows
-after a fixed number of steps. A planning period is a fixed number of observations. A plan uses what
-is known at the start of its planning period and takes effect at the end, so that it may take one
-period to compute. Extrapolating the estimates compensates the known latency of observations.
+Three periods are nested. Each physics step is also a control step. An observation of the balls
+follows after a fixed number of steps. A planning period is a fixed number of observations. A plan
+uses the estimates at the start of its planning period and is flown from the period's end, so that
+planning may take one period. Observations arrive late by a known latency, which the prediction
+compensates.
 
 The robot (`sims.robot.Robot`, in the world) defines its references and commands. The task's pilot
-defines what is planned and what counts as a contact with a ball. Both are written for one flight;
-`fly_leg` batches them. Planning and physics of a period run concurrently. Times count from the
-start of the first plan.
+(`loop_state.Pilot`) defines what is planned and what counts as a contact with a ball. Both are
+written for one flight; `fly_leg` batches them. Planning and physics of a period run concurrently.
+Times count from the start of the first plan.
 """
 
 import dataclasses
@@ -30,11 +31,11 @@ from planner_jax.sims.model import ball_states, ball_velocity, step
 from planner_jax.sims.scoring import moment, nearest
 from planner_jax.sims.sensing import Estimate
 
-_FEW = 1024  # largest batch for which compilation takes longer than the flights themselves
+_FEW = 1024  # largest batch for which compiling takes longer than the flights themselves
 
 
 def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> FlightState:
-    """Simulate physics and control up to the next observation, and update the estimates with it."""
+    """Simulate a flight up to the next observation, and update the estimates by it."""
     world, robot, dtype = loop.world, loop.world.robot, flight.time.dtype
     key, noise_key, look_key = jax.random.split(flight.key, 3)
     noise = jax.random.normal(noise_key, robot.noise_shape, dtype)
@@ -85,7 +86,7 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
 
 
 def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
-    """Return the estimates (N, ...) after one observation (N, 3)."""
+    """Update the estimates (N, ...) of all balls with one observation of each ball, (N, 3)."""
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
@@ -97,7 +98,7 @@ def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
 
 
 def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
-    """Return the predicted states of the balls `ahead` [s] from now, leaves (N, 3)."""
+    """Return the predicted states of the balls, `ahead` [s] from now, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
     span = jnp.asarray(ahead + loop.sensing.latency, dtype)
@@ -110,7 +111,7 @@ def _pose_problems(
 ) -> tuple[Outlook, Any]:
     """Return the expected situation at the end of this period, and the planning problem for it.
 
-    Both have leaves (B, ...).
+    Both results have leaves (B, ...), one entry per flight.
     """
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
@@ -131,7 +132,7 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """Return the plans (B, ...) that one of the pilot's searches finds."""
+    """Run one of the pilot's searches, and return the plans (B, ...) that it finds."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -139,7 +140,7 @@ def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
 def _fly(
     loop: Loop, pilot: Pilot, flights: FlightState, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Fly some periods by the current plans; return flights (B, ...) and records (B, K, ...)."""
+    """Fly some periods along the current plans; return states (B, ...) and records (B, K, ...)."""
 
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
         def next_observation(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -180,7 +181,7 @@ def _with_plans(
 
 
 def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
-    """Return the state of the flight, and the errors of the predicted ball positions."""
+    """Record the state of a flight, and the errors of the predicted ball positions."""
     world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)
@@ -203,7 +204,7 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Return whether each part of a period is compiled as its own program."""
+    """Return whether planning and flying of a period are compiled as separate programs."""
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
 
@@ -211,16 +212,16 @@ def in_parts(flights: FlightState) -> bool:
 def _next_period(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, begin: Callable
 ) -> tuple[FlightState, Any]:
-    """Return flights (B, ...) one period later, with plans made meanwhile, and their records.
+    """Fly one period and plan meanwhile; return the flights (B, ...) and their records.
 
     Args:
         loop: settings of the flights' loop.
         pilot: the task's part of the loop.
         flights: the flights at the start of the period.
         cases: cases of the task, leaves (B, ...).
-        drag: (B, N) K_D [1/m].
-        begin: starts one part of the period with its arguments, and returns a function that waits
-            for the result.
+        drag: (B, N), true K_D [1/m] of the balls.
+        begin: function that starts one part of the period with its arguments, and returns a
+            function that waits for the result.
     """
     outlook, asked = _pose_problems(loop, pilot, flights, cases)
     found = [begin(_search_plans, pilot, number, asked) for number in range(len(pilot.searches))]
@@ -233,7 +234,7 @@ def _next_period(
 def _fly_and_plan(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Fly some periods with replanning, in one program; return the same as `_fly`."""
+    """Fly some periods with replanning, in one program; return states and records as `_fly`."""
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
     def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -247,17 +248,18 @@ def _fly_and_plan(
 def fly_leg(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, *, num_periods: int
 ) -> tuple[FlightState, list[Record]]:
-    """Fly a batch of flights for some periods.
+    """Fly a batch of flights for some planning periods.
 
-    A large batch runs in one program. For a small batch on a GPU each part of a period is its own
-    program: compiled concurrently, these take half as long to compile and a third longer to run.
+    A large batch runs in one program. For a small batch on a GPU, planning and flying of a period
+    are separate programs, which are compiled concurrently. Compiling then takes half as long, and
+    running takes a third longer.
 
     Args:
-        loop: settings that shape the programs.
+        loop: settings that determine the programs.
         pilot: the task's part of the loop.
-        flights: the flights at the start of the leg, leaves (B, ...).
-        cases: cases of the task, leaves (B, ...); their times count like the flights'.
-        drag: (B, N) K_D [1/m], the true one.
+        flights: the flights at the start, leaves (B, ...).
+        cases: cases of the task, leaves (B, ...), with times that count like the flights' times.
+        drag: (B, N), true K_D [1/m] of the balls.
         num_periods: number of planning periods.
 
     Returns:
@@ -281,25 +283,25 @@ def fly_leg(
 def begin_compiling(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array
 ) -> Callable[[], Any]:
-    """Start to compile the programs of a leg in another thread.
+    """Start to compile the programs of `fly_leg` in another thread.
 
-    This applies only where each part of a period is its own program; elsewhere nothing is started.
-    The thread flies one period with plans of zeros, so that the programs are those that `fly_leg`
-    needs.
+    Only separate programs for planning and flying are compiled ahead; see `in_parts`. Otherwise
+    nothing is started. The thread flies one period with plans of zeros, which compiles the programs
+    that `fly_leg` needs.
 
     Args:
-        loop: settings that shape the programs.
+        loop: settings that determine the programs.
         pilot: the task's part of the loop.
-        flights: leaves (B, ...), which may be without plans.
+        flights: leaves (B, ...), which may have no plans.
         cases: cases of `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
-        drag: (B, N) K_D [1/m].
+        drag: (B, N), true K_D [1/m] of the balls.
 
     Returns:
         A function that waits for the compilation, to be called before `fly_leg`.
     """
     if loop.replan == 0.0 or not in_parts(flights):
         return lambda: None
-    # Created from NumPy arrays, like plans that are made on the host.
+    # Zeros are created from NumPy arrays, like plans that are made on the host.
     zeros = functools.partial(
         jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     )

@@ -1,4 +1,4 @@
-"""The state of a flight, the settings of its loop, and its records."""
+"""The state of a flight, the settings of its closed loop, and its records."""
 
 import dataclasses
 import functools
@@ -21,30 +21,30 @@ from planner_jax.sims.sensing import Estimate
 
 @struct.dataclass
 class Outlook:
-    """The expected situation at the time from which a new plan is flown."""
+    """The expected situation at the end of a planning period, when a new plan takes effect."""
 
-    time: Array  # () [s]
-    elapsed: Array  # () [s], since the current plan started
-    balls: BallState  # leaves (N, 3), predicted for that time
+    time: Array  # () [s], time of this situation
+    elapsed: Array  # () [s], time since the start of the current plan
+    balls: BallState  # leaves (N, 3), predicted states of the balls
     drag: Array  # (N,) K_D [1/m], estimated
-    present: Array  # (N,) bool, balls that are in flight and not yet met
-    head_state: Array  # state of the robot, (4, 3) for a quadrotor
+    present: Array  # (N,) bool, whether each ball is in flight and not yet met
+    head_state: Array  # planned state of the robot, (4, 3) for a quadrotor
 
 
 class Pilot(Protocol):
-    """A task's part of the loop: a frozen dataclass, static under jit."""
+    """A task's part of the closed loop: a frozen dataclass, static under jit."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
-        """Return the planning problem at the outlook, while a plan is flown."""
+        """Return the planning problem at the outlook, while `plan` is flown."""
         ...
 
     @property
     def searches(self) -> tuple[Callable[[Any], Any], ...]:
-        """Independent searches; each maps a planning problem to a plan."""
+        """Independent searches, each a function from a planning problem to a plan."""
         ...
 
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
-        """Return one of the plans that the searches found; and () bool, whether to fly it."""
+        """Select one of the found plans; return it, and whether it is good enough to be flown."""
         ...
 
     def times(self, plan: Any) -> Array:
@@ -62,9 +62,9 @@ class Pilot(Protocol):
 
 
 def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
-    """Return the shapes of plans (B, ...) of cases (B, ...), as leaves `jax.ShapeDtypeStruct`.
+    """Return the shapes of a planner's plans (B, ...), as leaves `jax.ShapeDtypeStruct`.
 
-    Leaves of the cases may be `jax.ShapeDtypeStruct`, too.
+    Leaves of the cases (B, ...) may be `jax.ShapeDtypeStruct`, too.
     """
 
     def plan(case: Any) -> Any:
@@ -76,7 +76,7 @@ def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """Everything that shapes a flight's program; static under jit.
+    """The settings that determine a flight's compiled program; static under jit.
 
     Raises:
         ValueError: a period is not a whole multiple of the next shorter one.
@@ -84,10 +84,10 @@ class Loop:
 
     world: World
     sensing: Sensing = Sensing()
-    replan: float = 0.0  # [Hz]; 0 flies the first plan to its end
-    kalman: bool = True  # filter the observations of the balls
-    estimate_drag: bool = True  # from the energy that a ball loses
-    record: bool = False  # store path and prediction errors at every observation
+    replan: float = 0.0  # [Hz], rate of replanning; 0 flies the first plan to its end
+    kalman: bool = True  # whether the observations of the balls are filtered
+    estimate_drag: bool = True  # whether drag is estimated from the energy that a ball loses
+    record: bool = False  # whether path and prediction errors are stored at every observation
 
     def __post_init__(self) -> None:
         sensing, control_rate = self.sensing, 1.0 / self.world.timestep
@@ -104,7 +104,7 @@ class Loop:
 
     @property
     def observations_per_plan(self) -> int:
-        """The number of observations from one plan to the next; one without replanning."""
+        """The number of observations from one plan to the next; 1 without replanning."""
         return self.sensing.observations_per_plan(self.replan)
 
     @property
@@ -114,7 +114,7 @@ class Loop:
 
     @property
     def late_observations(self) -> int:
-        """The latency of an observation, in observation periods."""
+        """The latency of an observation, as a number of observation periods."""
         return round(self.sensing.latency * self.sensing.rate)
 
     def num_periods(self, duration: float) -> int:
@@ -124,7 +124,7 @@ class Loop:
 
 @struct.dataclass
 class FlightState:
-    """Everything that changes during a flight."""
+    """The variables that change during a flight: physics, estimates, plan and scores."""
 
     physics: Physics
     shown: Array  # (L, N, 3) [m], true ball positions that are still to be observed
@@ -134,10 +134,10 @@ class FlightState:
     present: Array  # (N,) bool, balls with a plan whose contact time has not passed
     plan: Any
     began: Array  # () [s], start time of the plan
-    contact: Contact  # leaves (N, ...)
+    contact: Contact  # leaves (N, ...), nearest passage of each ball so far
     worst_tracking: Array  # () [m], greatest distance from the plan, up to the last contact
     squared_tracking: Array  # () [m^2 s], integral of the squared distance
-    tracked: Array  # () [s], time over which it is integrated
+    tracked: Array  # () [s], duration over which the squared distance is integrated
     time: Array  # () [s]
     key: Array
 
@@ -158,7 +158,7 @@ class Flown:
     """The result of a batch of flights, on the host; leaves with a leading axis B."""
 
     contact: Contact  # leaves (B, N, ...)
-    plan: Any  # the last one
+    plan: Any  # the last plan of each flight
     began: np.ndarray  # (B,) [s], start time of that plan
     tracking: np.ndarray  # (B, 2) [m], rms and worst, up to the last planned contact
     record: Record | None  # leaves (B, K, ...)

@@ -2,17 +2,18 @@
 # pyright: reportAttributeAccessIssue=false
 """The simulated world: MJCF of a robot, balls and ground, for MuJoCo and for MJX.
 
-World frame, z up, SI units. `qpos` holds the robot's joint positions and then the balls' positions;
-`qvel` the robot's joint velocities and then the balls' velocities. A ball does not spin [Yu2023bat,
-Section II], so that its joint consists of three slides. Ball drag is a force in `qfrc_applied`.
+Positions are in the world frame, z up, in SI units. `qpos` holds the robot's joint positions and
+then the balls' positions, `qvel` the robot's joint velocities and then the balls' velocities. A
+ball does not spin [Yu2023bat, Section II], so that its joint consists of three slides. Ball drag is
+a force in `qfrc_applied`.
 
-The model has no contacts. The racket's impact is a map of the library, and a ball counts as caught
-when it has crossed the hoop's disc (`scoring`). Scenery and pitching machine are visual only: they
-touch nothing and cost no computing time.
+The model has no contacts. The racket's impact is computed by a function of the library, and a ball
+counts as caught when it has crossed the hoop's disc (`scoring`). Scenery and pitching machine are
+visual only: they touch nothing and cost no computing time.
 
 MuJoCo's Euler integrator is semi-implicit: its stored velocity belongs to half a step before the
-position. `place_balls` and `ball_velocity` correct for this half step, so that the flight of a ball
-is integrated with second order.
+position. `place_balls` and `ball_velocity` correct for this half step, so that a ball's flight is
+integrated with second order.
 """
 
 import contextlib
@@ -27,7 +28,7 @@ import mujoco
 import numpy as np
 from jax import Array
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, not needed here, is missing
+with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
     from mujoco import mjx
 
 from planner_jax.ball.flight import BallState, ball_acceleration
@@ -44,19 +45,19 @@ from planner_jax.sims.scenery import (
 )
 
 BALL_RADIUS, BALL_MASS = 0.02, 0.0027  # [m], [kg]: a table tennis ball
-_TOWARDS_NET = np.pi  # [rad], heading of a machine that throws along -x
+_TOWARDS_NET = np.pi  # [rad], heading of a pitching machine that throws along -x
 
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """The settings of the simulated model; static under jit."""
+    """The settings of the simulated world; static under jit."""
 
     robot: Robot
     gravity: float  # [m/s^2], magnitude
     num_balls: int = 1
     timestep: float = 0.002  # [s]
     scenery: tuple[Part, ...] = ()  # visual parts of the surroundings
-    mouth: tuple[float, float, float] | None = None  # [m], where balls leave the machine
+    mouth: tuple[float, float, float] | None = None  # [m], where balls leave the pitching machine
 
     def __post_init__(self) -> None:
         if self.num_balls < 0:
@@ -66,10 +67,10 @@ class World:
 
     @property
     def carrier(self) -> ToolRobot:
-        """The robot, as one that carries a tool.
+        """The robot, typed as a robot that carries a tool.
 
         Raises:
-            TypeError: it carries no tool.
+            TypeError: the robot carries no tool.
         """
         if not hasattr(self.robot, "tool"):
             raise ArgumentTypeError(
@@ -79,7 +80,7 @@ class World:
 
 
 def mjcf(world: World) -> str:
-    """Return the model as MJCF text."""
+    """Return the model of a world as MJCF text."""
     body, actuators = world.robot.mjcf()
     machine = machine_parts(world.mouth, _TOWARDS_NET) if world.mouth else []
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
@@ -112,15 +113,15 @@ def mjcf(world: World) -> str:
 
 @functools.cache
 def mujoco_model(world: World) -> mujoco.MjModel:
-    """Return the model for plain MuJoCo."""
+    """Return the compiled model of a world for plain MuJoCo."""
     return mujoco.MjModel.from_xml_string(mjcf(world))
 
 
 @functools.cache
 def _mjx_model(world: World) -> tuple[mjx.Model, mjx.Data]:
-    """Return the model for MJX's JAX implementation, and data whose state is to be filled in.
+    """Return the model for MJX's JAX implementation, and MJX data as a template for states.
 
-    Leaves are NumPy arrays, so that cached values belong to no trace.
+    Leaves are NumPy arrays, so that cached values belong to no JAX trace.
     """
     model = mujoco_model(world)
     with jax.ensure_compile_time_eval():
@@ -130,12 +131,12 @@ def _mjx_model(world: World) -> tuple[mjx.Model, mjx.Data]:
 
 
 def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics:
-    """Return the physics after one time step of one world in MJX; pure, so scan, vmap and jit it.
+    """Simulate one time step of one world in MJX; pure, so that it can be scanned and batched.
 
     Args:
         world: settings of the model.
-        physics: before the step.
-        command: (A,), for the robot's actuators.
+        physics: state before the step.
+        command: (A,), command for the robot's actuators.
         drag: (N,) K_D [1/m] of the balls.
     """
     model, data = _mjx_model(world)
@@ -160,7 +161,7 @@ def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
 
 
 def at_rest(world: World, place: Array) -> Physics:
-    """Return the robot at rest at a position (3,) [m]; the balls lie far away."""
+    """Return the state of a robot at standstill at a position (3,) [m]; balls lie far away."""
     place = jnp.asarray(place)
     qpos, qvel, act = world.robot.at_rest(place, world.gravity)
     away = jnp.tile(jnp.array([100.0, 0.0, 0.0], place.dtype), world.num_balls)
@@ -174,14 +175,14 @@ def at_rest(world: World, place: Array) -> Physics:
 def place_balls(
     world: World, physics: Physics, balls: BallState, drag: Array, which: Array
 ) -> Physics:
-    """Return the physics with some balls set to new states.
+    """Return the state of one world after some balls have been set to new states.
 
     Args:
         world: settings of the model.
         physics: state of one world.
-        balls: leaves (N, 3).
+        balls: new states, leaves (N, 3).
         drag: (N,) K_D [1/m].
-        which: (N,) bool, the balls to place; the others stay as they are.
+        which: (N,) bool, the balls to set; other balls do not change.
     """
     acc = _ball_accelerations(world, balls.vel, drag)
     pos, vel = ball_states(world, physics)
@@ -195,13 +196,13 @@ def place_balls(
 
 
 def ball_states(world: World, physics: Physics) -> tuple[Array, Array]:
-    """Return positions and stored velocities of the balls, (N, 3) each."""
+    """Return the positions [m] and MuJoCo's stored velocities [m/s] of the balls, (N, 3) each."""
     pos, vel = physics.qpos[world.robot.num_pos :], physics.qvel[world.robot.num_vel :]
     return pos.reshape(world.num_balls, 3), vel.reshape(world.num_balls, 3)
 
 
 def ball_velocity(world: World, vel: Array, drag: Array) -> Array:
-    """Return velocities (N, 3) at the time of the positions, from the stored ones and K_D (N,)."""
+    """Return ball velocities (N, 3) at the positions' time, from stored velocities and K_D (N,)."""
     return vel + 0.5 * world.timestep * _ball_accelerations(world, vel, drag)
 
 

@@ -9,7 +9,7 @@ from planner_jax.core.errors import ArgumentError
 
 
 def require_whole(ratio: float, name: str, rule: str, value: float) -> None:
-    """Raise `ValueError`, "name must be rule, got value", unless a ratio is a whole number."""
+    """Raise `ValueError`, "NAME must be RULE, got VALUE", unless a ratio is a whole number."""
     if abs(ratio - round(ratio)) > 1e-6 or (ratio > 0.0 and round(ratio) == 0):
         raise ArgumentError(name, rule, value)
 
@@ -26,8 +26,8 @@ class Sensing:
     position_std: float = 0.0  # [m], standard deviation of a ball's coordinate
     dropout: float = 0.0  # probability that an observation is missing
     latency: float = 0.0  # [s], age of an observation when it arrives
-    # Standard deviations of the robot's own state, one for each field of the state in its units.
-    # The errors are redrawn at every observation of the balls. Empty: the state is known exactly.
+    # Standard deviations of the robot's estimated state, one for each field, in the field's units.
+    # The errors are drawn again at every observation of the balls. Empty: the state is exact.
     robot_stds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -41,7 +41,7 @@ class Sensing:
             raise ArgumentError("dropout", "< 1", self.dropout)
 
     def observations_per_plan(self, replan: float) -> int:
-        """Return the number of observations from one plan to the next; one without replanning.
+        """Return the number of observations from one plan to the next; 1 without replanning.
 
         Args:
             replan: [Hz], rate of replanning; 0 for never.
@@ -60,17 +60,17 @@ class Sensing:
 
 NOISES = {
     "none": Sensing(),
-    # [Yu2023bat] and [Yu2023catch] observe with Vicon and run every module within 20 ms
-    # [Yu2023bat, Section VI-C]; that is the latency here. They give no noise, rate or dropout, so
-    # that all other numbers are assumptions: 5 mm a coordinate for a 40 mm ball, 100 observations
-    # a second, 2 % of them lost, and the errors of the quadrotor's own state. Both papers estimate
-    # that state with an EKF of pose and IMU: position [m], velocity [m/s], attitude [rad] and body
-    # rate [rad/s].
+    # [Yu2023bat] and [Yu2023catch] observe with Vicon. Every module runs within 20 ms [Yu2023bat,
+    # Section VI-C], which is the latency here. The papers report no noise, rate or dropout. All
+    # other numbers are assumptions: 5 mm a coordinate for a 40 mm ball, 100 observations a second,
+    # of which 2 % are lost, and the errors of the quadrotor's estimated state: position [m],
+    # velocity [m/s], attitude [rad] and body rate [rad/s]. Both papers estimate this state with an
+    # EKF of pose and IMU.
     "lab": Sensing(
         position_std=0.005, dropout=0.02, latency=0.02, robot_stds=(0.002, 0.02, 0.005, 0.02)
     ),
-    # Worse than the papers' laboratories: three times the noise, twice the latency, and one
-    # observation in ten lost. All numbers are assumptions.
+    # Worse than the papers' laboratories: three times the noise, twice the latency, and one of ten
+    # observations lost. All numbers are assumptions.
     "harsh": Sensing(
         position_std=0.015, dropout=0.1, latency=0.04, robot_stds=(0.006, 0.06, 0.015, 0.06)
     ),
@@ -78,12 +78,12 @@ NOISES = {
 
 
 CONTROL_RATE = 200  # [Hz], rate of the control steps of a drive
-FRAME_RATE = 50  # [Hz], rate of the stored poses of a drive, which are checked for collisions
+FRAME_RATE = 50  # [Hz], rate of a drive's stored poses, at which collisions are checked
 
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSensing:
-    """Sensing of a car's target, of movers, and of the car's own pose; static under jit.
+    """Sensing of a car's target, of moving obstacles, and of its own pose; static under jit.
 
     Observations arrive one latency late. Poses of the car are measured at every control step. The
     car knows its own speed and steering angle without delay.
@@ -92,13 +92,12 @@ class PlaneSensing:
         ValueError: a value is out of its range.
     """
 
-    target_std: float = 0.0  # [m], standard deviation of a coordinate of the target or of a mover
-    # Standard deviations of a coordinate [m] and of the heading [rad]
+    target_std: float = 0.0  # [m], standard deviation of an observed coordinate
+    # Standard deviations of a measured coordinate [m] and heading [rad] of the car.
     pose_stds: tuple[float, float] = (0.0, 0.0)
-    # [Hz], of observations of the target during the drive; 0 for none
-    # [Hz], rate of observations of the target while driving; 0 for none
+    # [Hz], rate of observations of the target while driving; 0 for none.
     observation_rate: float = 1.0
-    latency: float = 0.05  # [s], latency, which includes the latency of the planner
+    latency: float = 0.05  # [s], age of a measurement at its arrival, planning time included
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
@@ -109,7 +108,7 @@ class PlaneSensing:
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
-        """Return the number of frames per plan; the frames of one second without replanning.
+        """Return the number of frames from one plan to the next; without replanning, of 1 s.
 
         Args:
             replan: [Hz], rate of replanning; 0 for never.
@@ -128,6 +127,7 @@ class PlaneSensing:
 PLANE_NOISES = {
     "none": PlaneSensing(),
     # [Qu2022, Section V-A] observes targets once a second with a variance of 0.01 m^2 a coordinate.
-    # It does not specify the error of the car's own pose: 1 cm and 0.01 rad are assumptions.
+    # The paper does not report the error of the car's own pose. The values 1 cm and 0.01 rad are
+    # assumptions.
     "paper": PlaneSensing(target_std=0.1, pose_stds=(0.01, 0.01)),
 }
