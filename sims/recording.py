@@ -1,8 +1,9 @@
 """Recordings of a run's first flights, from which they are drawn, filmed and replayed.
 
-A recording is the dataset `flights/` in the run folder: one row per flight, flat lists, SI units,
-meanings in the column metadata. Samples are equally spaced in time. They start when the first ball
-leaves its machine, before the first plan, and end when the last returned ball is on the ground.
+A recording is stored as the dataset `flights/` in the run folder, with one row per flight and flat
+lists in SI units; the column metadata explain the columns. Samples are equally spaced in time. They
+start when the first ball leaves its machine, before the first plan, and end when the last returned
+ball is on the ground.
 """
 
 import dataclasses
@@ -20,38 +21,38 @@ from planner_jax.sims.model import World
 from planner_jax.sims.robot import Robot
 from planner_jax.task.hit.court import fly, landing
 
-FLIGHTS = "flights"
-_FAR = 20.0  # [m], distance at which balls wait that are not in flight
-_LONGEST = 3.0  # [s], longest path of a returned ball that is recorded
+FLIGHTS = "flights"  # name of the dataset in the run folder
+_FAR = 20.0  # [m], distance beyond which a ball counts as not in flight
+_LONGEST = 3.0  # [s], longest flight of a returned ball that is recorded
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """F flights of N balls at K samples each; NumPy leaves, world frame, z up.
+    """F recorded flights of N balls at K samples each; NumPy leaves, world frame, z up.
 
     The robot has R joint positions. For a quadrotor these are the position of the propeller plane's
     centre [m] and the quaternion w x y z. A target that drives counts as a ball. Times count from
-    the start of the first plan. NaN stands for a ball that is not in flight, a robot that is no
-    longer simulated, a ball that is never met, and a flight without a target.
+    the start of the first plan. A value is NaN if a ball is not in flight or never met, if the
+    robot is no longer simulated, or if the flight has no target.
     """
 
-    index: np.ndarray  # (F,) index in the run
+    index: np.ndarray  # (F,), index of the flight in the run
     success: np.ndarray  # (F,) bool
     time: np.ndarray  # (F, K) [s], times of the samples
-    robot: np.ndarray  # (F, K, R), its joint positions
+    robot: np.ndarray  # (F, K, R), joint positions of the robot
     wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot
     balls: np.ndarray  # (F, K, N, 3) [m]
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
     target: np.ndarray  # (F, 3) [m], target of a returned ball
-    # (F, K, M, 3) [m], predicted path of the first ball from each sample on; M = 0 if not recorded
+    # (F, K, M, 3) [m], path of the first ball as predicted at each sample; M = 0 if not recorded.
     expected: np.ndarray
 
     def __len__(self) -> int:
         return len(self.index)
 
     def num_samples(self, flight: int) -> int:
-        """Return the number of samples of a flight up to the last one with a moving object."""
+        """Return the number of samples of a flight up to the last sample with a moving object."""
         there = np.isfinite(self.robot[flight]).all(axis=1)
         there |= np.isfinite(self.balls[flight]).all(axis=2).any(axis=1)
         return int(np.flatnonzero(there)[-1]) + 1
@@ -67,39 +68,40 @@ class Recording:
 
 
 class Frame(NamedTuple):
-    """The positions of robot and balls at one sample."""
+    """The positions of robot and balls at one sample of a recording."""
 
     time: float  # [s]
-    robot: np.ndarray  # (R,), its joint positions
+    robot: np.ndarray  # (R,), joint positions of the robot
     wanted: np.ndarray  # (3,) [m], planned position of the robot
-    balls: np.ndarray  # (N, 3) [m], NaN for invisible ones
+    balls: np.ndarray  # (N, 3) [m]; NaN for balls that are not in flight
 
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """The states of the N balls of F flights before and after the simulation; NumPy leaves."""
+    """The states of N balls of F flights before and after their simulation; NumPy leaves."""
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
-    drag: Any  # (F, N) K_D [1/m], the true one
+    drag: Any  # (F, N), true K_D [1/m]
     begins: np.ndarray  # (N,) [s], start of the plan for each ball
-    seen: float  # [s], how long a ball has been in flight by then
+    seen: float  # [s], how long a ball has been in flight at the start of its plan
     returned: BallState | None = None  # leaves (F, 3), the first ball just after its impact
-    target: Any = None  # (F, 3) [m], target of a returned ball
+    target: Any = None  # (F, 3) [m], where a returned ball should land
 
 
 def frame(recording: Recording, robot: Robot, flight: int, sample: int) -> Frame:
     """Return the positions of robot and balls at a sample of a flight.
 
-    After the end of its simulation the robot stays where it was. A caught ball lies in its net.
+    After the end of its simulation the robot stays at its last position. A caught ball lies in the
+    robot's net.
 
     Args:
         recording: the recorded flights of the run.
-        robot: the flown robot.
-        flight: row of the recording.
+        robot: the robot that flew.
+        flight: index of the flight in the recording.
         sample: index of the sample.
 
     Raises:
-        ValueError: there is no such flight or sample.
+        ValueError: the recording has no such flight or sample.
     """
     for name, value, number in (
         ("flight", flight, len(recording)),
@@ -122,12 +124,13 @@ def make_recording(
 ) -> Recording:
     """Return the recording of some flights.
 
-    It joins the balls' paths before the simulation, the simulated flight and the returned balls.
+    The recording joins the balls' flights before the simulation, the simulated flights, and the
+    flights of returned balls.
 
     Args:
         world: the simulated world.
-        flown: F flights with their record.
-        launches: states of their balls before and after the simulation.
+        flown: F simulated flights with their records.
+        launches: states of the balls before and after the simulation.
         index: (F,) indices in the run.
         success: (F,) bool.
     """
@@ -189,7 +192,7 @@ def make_recording(
 
 
 def _or_never(time: np.ndarray) -> np.ndarray:
-    """Replace NaN by infinity."""
+    """Replace NaN times, of events that never happen, by infinity."""
     return np.nan_to_num(time, nan=np.inf)
 
 
@@ -209,13 +212,13 @@ _COLUMNS = leaves_of(
 
 
 def to_rows(recording: Recording) -> pa.Table:
-    """Return a table with one row per flight."""
+    """Convert a recording to a table with one row per flight."""
     batch = RefereedBatch(Chunk(recording.index, None), None, recording)
     return rows_of(_COLUMNS, batch, "world, z up; times from the start of the first plan")
 
 
 def read_recording(table: pa.Table) -> Recording:
-    """Return the recording from a table that `to_rows` returned.
+    """Convert a table that `to_rows` returned back to a recording.
 
     Raises:
         ValueError: columns are missing, or their sizes do not fit each other.

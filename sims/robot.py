@@ -1,8 +1,9 @@
-"""The interface of a robot to the simulated world, the closed loop and the pictures.
+"""The protocol of a robot, by which the simulated world, the closed loop and pictures use it.
 
-A robot is a frozen dataclass, static under jit. `robots/quadrotor/robot.py` carries a tool;
-`robots/car/robot.py` and `robots/arm/robot.py` do not. The robot's part of MuJoCo's state comes
-first in `qpos` and `qvel`, before the balls. All of `act` belongs to the robot.
+A robot is a frozen dataclass, static under jit. The quadrotor in `robots/quadrotor/robot.py`
+carries a tool; the car and the arm in `robots/car/robot.py` and `robots/arm/robot.py` do not. The
+robot's part of MuJoCo's state comes first in `qpos` and `qvel`, before the balls. All of `act`
+belongs to the robot.
 """
 
 from typing import Any, ClassVar, NamedTuple, Protocol
@@ -22,13 +23,13 @@ class Physics:
     The robot has R joint positions and R' joint velocities; there are N balls and A actuators.
     """
 
-    qpos: Array  # (R + 3 N,)
-    qvel: Array  # (R' + 3 N,)
+    qpos: Array  # (R + 3 N,), joint positions of robot and balls
+    qvel: Array  # (R' + 3 N,), joint velocities of robot and balls
     act: Array  # (A,), states of the actuators, in their units
 
 
 class Solid(NamedTuple):
-    """The surface of a closed convex body."""
+    """The surface of a closed convex body, as a mesh of triangles."""
 
     corners: np.ndarray  # (V, 3) [m]
     triangles: np.ndarray  # (T, 3) int, counter-clockwise when seen from outside
@@ -48,7 +49,7 @@ def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
     """Return the rotation matrix (3, 3), body to world, of a unit quaternion (4,).
 
     Args:
-        quat_wxyz: w x y z.
+        quat_wxyz: the quaternion, w x y z.
         array_library: `jax.numpy`, or `numpy` for a result in float64.
     """
     w, x, y, z = quat_wxyz
@@ -62,49 +63,49 @@ def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
 
 
 class Robot(Protocol):
-    """A robot's part of a flight. `World` is `sims.model.World`, which holds the robot."""
+    """A robot in the simulation. `World` is `sims.model.World`, which holds the robot."""
 
-    WORDS: ClassVar[str]  # description of its simulation and control, for the report of a run
-    num_pos: ClassVar[int]  # R, number of its joint positions in `qpos`
-    num_vel: ClassVar[int]  # R', number of its joint velocities in `qvel`
+    WORDS: ClassVar[str]  # description of simulation and control, for the report of a run
+    num_pos: ClassVar[int]  # R, number of the robot's joint positions in `qpos`
+    num_vel: ClassVar[int]  # R', number of the robot's joint velocities in `qvel`
     noise_shape: ClassVar[tuple[int, ...]]  # shape of the standard normal noise that `sense` uses
 
     def mjcf(self) -> tuple[str, str]:
-        """Return its body and its actuators as MJCF text."""
+        """Return the robot's body and its actuators as MJCF text."""
         ...
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return its part of `qpos` and `qvel`, and `act`, at rest at a position (3,) [m]."""
+        """Return `qpos`, `qvel` and `act` of the robot at standstill at a position (3,) [m]."""
         ...
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
         """Return MuJoCo's controls (A,) for a command (A,), and extra forces on the joints (R',).
 
-        The forces are those that the model has no actuators for, such as tyre forces.
+        The extra forces are forces for which the model has no actuators, such as tyre forces.
         """
         ...
 
     def state(self, physics: Physics) -> Any:
-        """Return its state, a pytree."""
+        """Return the robot's true state, a pytree, from the simulated physics."""
         ...
 
     def sense(self, state: Any, noise: Array, stds: Any) -> Any:
-        """Return its estimated state: the true state with errors of some standard deviations."""
+        """Return the estimated state: the true state plus errors of standard deviations `stds`."""
         ...
 
     def references(self, plan: Any, times: Array, world: Any) -> Any:
-        """Return its references at times (K,) [s] since the start of a plan, leaves (K, ...).
+        """Return the references at times (K,) [s] since the start of a plan, leaves (K, ...).
 
         Every reference has a position `pos`.
         """
         ...
 
     def command(self, state: Any, reference: Any, world: Any) -> Array:
-        """Return the command (A,) that makes the actuators track one reference."""
+        """Return the command (A,) by which the actuators track one reference."""
         ...
 
     def shapes(self) -> list[Shape]:
-        """Return its rigid parts for drawing."""
+        """Return the robot's rigid parts for drawing."""
         ...
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -121,11 +122,11 @@ class Robot(Protocol):
 
 
 class ToolRobot(Robot, Protocol):
-    """A robot that hits or catches balls with a tool."""
+    """The protocol of a robot that hits or catches balls with a tool."""
 
     @property
     def model(self) -> QuadrotorModel:
-        """The model for which plans are made."""
+        """The model of the quadrotor for which plans are made."""
         ...
 
     @property
@@ -134,14 +135,14 @@ class ToolRobot(Robot, Protocol):
         ...
 
     def tool_motion(self, state: Any) -> tuple[Array, Array, Array, Array]:
-        """Return position, velocity, angular rate and z axis of the body with the tool, (3,) each.
+        """Return position, velocity, angular rate and z axis of the body that carries the tool.
 
-        All are in the world frame.
+        Each is (3,), in the world frame.
         """
         ...
 
     def head_state(self, plan: Any, time: Array) -> Array:
-        """Return its planned state at a time () [s] since the start of a plan.
+        """Return the robot's planned state at a time () [s] since the start of a plan.
 
         The first row is the position. A new plan may start from this state.
         """

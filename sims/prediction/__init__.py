@@ -1,1 +1,1 @@
-"""Predictions of targets in the plane from noisy observations."""
+"""Predictions of where a target in the plane will be, from noisy observations of its position."""

@@ -1,7 +1,8 @@
-"""Noisy observations of a target in the plane, centred for a fit.
+"""Noisy observations of a target in the plane, centred at their means for a fit.
 
 World frame, SI units, one target. An observation that is not finite, or has weight zero, counts as
-absent, so that shapes stay fixed. Inside the fits points are pairs (x, y) of arrays.
+absent, so that array shapes do not depend on the number of observations. In the fits of this
+package a point (or a complex number) is a pair (x, y) of arrays.
 """
 
 from typing import NamedTuple
@@ -16,15 +17,15 @@ Pair = tuple[Array, Array]  # x and y of points of the plane, each (...)
 
 
 class Centred(NamedTuple):
-    """Observations relative to their weighted means."""
+    """L observations of a target relative to their weighted means."""
 
-    weight: Array  # (L,), 0 where absent
+    weight: Array  # (L,), 0 where the observation is absent
     after: Array  # (L,) [s], time of each observation minus the mean time
     place: Pair  # each (L,) [m], position minus the mean position
     middle: Array  # () [s], weighted mean time
     centre: Pair  # each () [m], weighted mean position
-    total: Array  # () sum of the weights; 1 if all are absent
-    num: Array  # () number of present observations
+    total: Array  # (), sum of the weights; 1 if all observations are absent
+    num: Array  # (), number of present observations
 
 
 def centre(
@@ -33,8 +34,7 @@ def centre(
     """Return weighted observations of positions (L, 2) at times (L,), centred at their means.
 
     Raises:
-        ValueError: the shapes do not match, or the arrays hold fewer than `least` observations; one
-            line.
+        ValueError: the shapes do not match, or the arrays hold fewer than `least` observations.
     """
     times, positions = jnp.asarray(times), jnp.asarray(positions)
     if times.ndim != 1 or positions.shape != (*times.shape, 2):

@@ -18,9 +18,10 @@ def fit_polynomial(
 ) -> PolynomialPath:
     """Fit a polynomial to observations by least squares [Qu2022, eqs 9 and 10].
 
-    Orthogonal columns in normalised time replace the normal equations of eq. 11. The paper prints
-    their H as the sum T'T, which is squared once too often. With fewer observations than
-    coefficients the degree is reduced to what the observations determine.
+    The paper solves the normal equations (eq. 11). Here the columns are made orthogonal in
+    normalised time instead, which rounds less. The paper prints its H as the sum T'T, which is
+    squared once too often. If there are fewer observations than coefficients, the degree is reduced
+    to the degree that the observations determine.
 
     Args:
         times: (L,) [s].
@@ -30,8 +31,8 @@ def fit_polynomial(
             An observation of weight zero, or not finite, is absent.
 
     Raises:
-        ValueError: the degree is another one, the arrays hold fewer than degree + 1 observations,
-            or the shapes do not match; one line.
+        ValueError: the degree is not 1, 2 or 3, the arrays hold fewer than degree + 1 observations,
+            or the shapes do not match.
     """
     if degree not in (1, 2, 3):
         raise ArgumentError("degree", "1, 2 or 3", degree)
@@ -58,9 +59,10 @@ def fit_polynomial(
 
 
 def _coefficients(root: Array, values: Array, span: Array) -> Array:
-    """Solve R X = Y for X (n + 1, 2) [m/s^k], and undo the normalisation of time.
+    """Solve R X = Y for the coefficients X (n + 1, 2), and undo the normalisation of time.
 
-    A coefficient is zero where the diagonal of R (n + 1, n + 1) is zero up to rounding.
+    A coefficient is zero where the diagonal of R (n + 1, n + 1) is zero up to rounding, since the
+    observations do not determine this coefficient.
     """
     found = jnp.zeros_like(values)
     rounding = (32.0 * jnp.finfo(root.dtype).eps) ** 2
@@ -72,5 +74,5 @@ def _coefficients(root: Array, values: Array, span: Array) -> Array:
 
 
 def _powers(x: Array, degree: int) -> Array:
-    """Return the powers (..., degree + 1) of numbers (...)."""
+    """Return the powers 0 to `degree` of numbers (...), as an array (..., degree + 1)."""
     return jnp.stack([x**k for k in range(degree + 1)], axis=-1)

@@ -1,9 +1,9 @@
 """Prediction of a target's position in the plane, and of its error, from noisy observations.
 
-[Qu2022, Section III-A] fits a polynomial (`polynomial_fit.py`) of a degree that it does not
-specify. `select` compares a straight line with a path of constant turn rate instead. Its prediction
-also estimates its own error: `covariance`, `chance_within`. World frame in the plane, SI units, one
-target; use `jax.vmap` for several. Noise is Gaussian, equal on both axes.
+[Qu2022, Section III-A] fits a polynomial (`polynomial_fit.py`) of a degree that the paper does not
+report. `select` compares a straight line with a path of constant turn rate instead. Its prediction
+also estimates its own error by `covariance` and `chance_within`. World frame in the plane, SI
+units, one target; use `jax.vmap` for several. The noise is Gaussian and equal on both axes.
 """
 
 import jax
@@ -26,16 +26,16 @@ _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
 
 @struct.dataclass
 class TurnPrior:
-    """Prior knowledge about targets before the first observation.
+    """Prior knowledge about a target's turn rate before the first observation.
 
     A target moves straight, or turns left or right with equal probability, at a rate whose
     magnitude is log-normal. The default numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03
-    to 0.1 rad/s. For faster turns predictions are hardly worse. Slower turns are mistaken for
-    straight paths more often than the predicted errors state: use a wider prior for them, such as
-    `TurnPrior(0.5, 0.03, 1.0)`, which predicts straight targets less well.
+    to 0.1 rad/s. Predictions of faster turns are hardly worse. Slower turns are mistaken for
+    straight paths more often than the predicted errors state. For such targets use a wider prior,
+    such as `TurnPrior(0.5, 0.03, 1.0)`, which predicts straight targets less well.
     """
 
-    chance: ArrayLike = 0.4  # () probability that a target turns, between 0 and 1
+    chance: ArrayLike = 0.4  # (), probability that a target turns, between 0 and 1
     typical: ArrayLike = 0.065  # () [rad/s] > 0, median magnitude of the turn rate
     spread: ArrayLike = 0.4  # () > 0, standard deviation of the logarithm of the magnitude
 
@@ -53,16 +53,17 @@ class TurnPrior:
         return jnp.square(self.typical) * jnp.exp(2.0 * jnp.square(self.spread))
 
 
-USUAL = TurnPrior()
+USUAL = TurnPrior()  # the default prior
 
 
 @struct.dataclass
 class Alternatives:
-    """Paths that agree with the observations, and their probabilities; the first path is straight.
+    """K paths that agree with the observations, with probabilities; the first path is straight.
 
-    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers. Here g_k is the
-    displacement of a target with turn rate k that starts at unit velocity along x, minus the lever.
-    Its error there is Gaussian and isotropic, with variance  centre_variance + velocity_variance_k
+    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers. Let d_k be the
+    displacement of a target with turn rate k that starts at unit velocity along x. Then g_k is d_k
+    minus `lever` k, the weighted mean of d_k over the times of observation. The error of path k is
+    Gaussian and isotropic. Its variance is  centre_variance + velocity_variance_k
     |g_k(t - middle)|^2.
     """
 
@@ -78,13 +79,14 @@ class Alternatives:
 
 @struct.dataclass
 class Prediction:
-    """The expected path, and an estimate of its error."""
+    """The predicted path of a target, and an estimate of the prediction's error."""
 
     path: TurningPath  # with turn rate 0 if it is straight
     is_turning: Array  # () bool, which of the two models was selected
-    chance_turning: Array  # () probability that the target turns
-    gain: Array  # () reduction of the sum of squared residuals by the best turn, in noise^2
-    residual: Array  # () [m], root mean square per coordinate, of the observations from the path
+    chance_turning: Array  # (), probability that the target turns
+    # (), reduction of the sum of squared residuals by the best turn, in units of noise^2.
+    gain: Array
+    residual: Array  # () [m], root mean square of (observation - path), per coordinate
     noise: Array  # () [m], standard deviation of a coordinate, passed or estimated
     alternatives: Alternatives
 
@@ -99,36 +101,36 @@ def select(
     threshold: ArrayLike | None = None,
     fastest: ArrayLike = 1.0,
 ) -> Prediction:
-    """Select a straight path or a path of constant turn rate.
+    """Predict a target: select a straight path or a path of constant turn rate.
 
     The posterior probability of every turn rate follows from Bayes' rule and quadrature over the
     rate. The prior of position and velocity is flat. The selected path has the median turn rate.
-    The median is zero unless a turn to one side is more probable than everything else. So weak
-    turns are shrunk towards zero, and the path does not jump as observations change (posterior
-    median thresholding [Johnstone2004]). With a threshold, a test chooses between the straight line
-    and the least-squares turn instead. The error estimates are the same for both: they average over
-    all rates, zero included.
+    The median is zero unless turns to one side are more probable than all other alternatives
+    together. Weak turns are therefore shrunk towards zero, and the path does not jump as
+    observations change (posterior median thresholding [Johnstone2004]). With a threshold, a test
+    selects the straight line or the least-squares turn instead. Both methods have the same error
+    estimates, which average over all rates, zero included.
 
-    A residual well above the noise means that the target does neither: then do not trust the
-    prediction. With fewer than three observations, or four if the noise is to be estimated, the
-    path is straight and the error is unbounded.
+    A residual far above the noise means that neither model fits the target. Do not trust such a
+    prediction. With fewer than three observations, or four if the noise is estimated, the path is
+    straight and the error is unbounded.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far from them.
+        times: (L,) [s]. The path counts from time 0, which should not be far from these times.
         positions: (L, 2) [m].
         noise: () [m] > 0, standard deviation of a coordinate of an observation of weight 1. By
-            default it is estimated from the residuals of the best turn.
+            default the noise is estimated from the residuals of the best turn.
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
         prior: probability and rate of turns.
-        threshold: () of the gain, above which a target turns; the gain of a straight target exceeds
-            6.6 once in a hundred times.
+        threshold: (), the gain above which a target counts as turning. The gain of a straight
+            target exceeds 6.6 with a probability of 1 %.
         fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
             should turn by at most 24 rad within the observations, and by less than pi between two.
 
     Raises:
-        ValueError: the arrays hold too few observations, the shapes do not match, or the noise is a
-            number that is not positive; one line.
+        ValueError: the arrays hold too few observations, the shapes do not match, or the noise is
+            not positive.
     """
     if isinstance(noise, int | float) and not noise > 0.0:
         raise ArgumentError("noise", "> 0", noise)
@@ -141,7 +143,7 @@ def select(
         extent = jnp.sum(seen.weight * (seen.place[0] ** 2 + seen.place[1] ** 2))
         rounding = (4.0 * jnp.finfo(dtype).eps) ** 2 * extent
         variance = jnp.maximum(best.squares / freedom, jnp.maximum(rounding, 1e-30))
-        # With an estimated noise an error has Student's distribution, which has this variance.
+        # With an estimated noise an error has Student's distribution, whose variance is this one.
         error_variance = variance * freedom / (freedom - 2.0)
     else:
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
@@ -151,7 +153,7 @@ def select(
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
-    # Evaluate rates around the best one, or around zero where the observations determine little.
+    # Evaluate rates around the best rate, or around zero if the observations determine it poorly.
     information = tangent(seen, best)[1] / variance
     precision = information + 1.0 / jnp.asarray(prior.variance, dtype)
     reach = _REACH / jnp.sqrt(precision)
@@ -189,7 +191,7 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median () of a rate that is zero or in cells around increasing rates (K,)."""
+    """Return the median () of a rate that is zero with `of_zero` or in cells around rates (K,)."""
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)
@@ -211,7 +213,7 @@ def covariance(prediction: Prediction, time: ArrayLike) -> Array:
     """Return the mean square (2, 2) [m^2] of the error of the path's position at a time () [s].
 
     The error is measured from the position on the path, not from the mean of the alternatives. The
-    diagonal is infinite where there were too few observations.
+    diagonal is infinite if there were too few observations.
     """
     offset, variance = _errors(prediction, time)
     chance = prediction.alternatives.chance
@@ -221,9 +223,9 @@ def covariance(prediction: Prediction, time: ArrayLike) -> Array:
 
 
 def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) -> Array:
-    """Return the probability () that the target is within a radius () [m] of the path at a time.
+    """Return the probability () that a target is within a radius () [m] of its path at a time.
 
-    Zero where there were too few observations.
+    The result is 0 if there were too few observations.
     """
     offset, variance = _errors(prediction, time)
     centre_variance = prediction.alternatives.centre_variance
@@ -235,9 +237,10 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 
 
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
-    """Return each alternative minus the chosen path, (K, 2) [m], and its variance (K,) [m^2].
+    """Return the offsets of all alternatives from the selected path at a time, and variances.
 
-    The variance of the centre, which all alternatives share, is not included.
+    The offsets are (K, 2) [m], the variances (K,) [m^2]. The variance of the centre, which is equal
+    for all alternatives, is not included.
     """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)
@@ -250,10 +253,10 @@ def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
 
 
 def _chance_in_circle(distance: Array, std: Array, radius: Array) -> Array:
-    """Return the probability () of a circle at a distance from an isotropic Gaussian.
+    """Return the probability () that a Gaussian point lies in a circle at a distance from its mean.
 
-    The circle is integrated in strips across the line of centres, by quadrature in angle near the
-    Gaussian.
+    The circle is integrated in strips perpendicular to the line from the Gaussian's mean to the
+    circle's centre. The quadrature is over an angle, and only where the Gaussian is not negligible.
     """
 
     def angle(along: Array) -> Array:

@@ -2,8 +2,8 @@
 
 At a given turn rate w, such a path is linear in a position and a velocity. In complex numbers it is
 position + velocity g(t), with the arc g(t) = (exp(i w t) - 1) / (i w). Position and velocity then
-follow in closed form, and only w is searched for (variable projection). Their errors are Gaussian
-and isotropic, since a rotation of the plane rotates both. In this module complex numbers are pairs.
+follow in closed form, and only w is searched for (variable projection). The errors of position and
+velocity are Gaussian and isotropic. In this module a complex number is a pair of arrays.
 """
 
 from collections.abc import Callable
@@ -17,18 +17,18 @@ from jax.typing import ArrayLike
 from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import Centred, Pair, centre
 
-_RATES = 33  # number of turn rates from which the best one is refined
-_STEPS = 8  # Gauss-Newton iterations, over the turn rate alone
+_RATES = 33  # number of equally spaced turn rates among which the search selects its start
+_STEPS = 8  # number of Gauss-Newton iterations, over the turn rate alone
 
 
 class TurnFit(NamedTuple):
-    """The best position and velocity for one turn rate."""
+    """The best position and velocity of a path for one turn rate."""
 
     rate: Array  # () [rad/s]
     velocity: Pair  # each () [m/s], at the mean time of the observations
-    lever: Pair  # each () [s], weighted mean of the arcs
+    lever: Pair  # each () [s], weighted mean of the arcs g at the times of observation
     power: Array  # () [s^2], weighted sum of |arc - lever|^2
-    residual: Pair  # each (L,) [m]
+    residual: Pair  # each (L,) [m], observations minus the path
     squares: Array  # () [m^2], weighted sum of |residual|^2
 
 
@@ -41,11 +41,11 @@ def fit_turn(
 ) -> TurningPath:
     """Fit a path of constant speed and turn rate to observations by least squares.
 
-    Gauss-Newton refines the best of 33 equally spaced rates. The path is straight where fewer than
+    Gauss-Newton refines the best of 33 equally spaced rates. The path is straight if fewer than
     three observations are present.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far from them.
+        times: (L,) [s]. The path counts from time 0, which should not be far from these times.
         positions: (L, 2) [m].
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
@@ -53,15 +53,14 @@ def fit_turn(
             should turn by at most 24 rad within the observations, and by less than pi between two.
 
     Raises:
-        ValueError: the arrays hold fewer than three observations, or the shapes do not match; one
-            line.
+        ValueError: the arrays hold fewer than three observations, or the shapes do not match.
     """
     seen = centre(times, positions, weights, 3)
     return path_of(seen, best_turn(seen, fastest))
 
 
 def fit_rate(seen: Centred, rate: Array) -> TurnFit:
-    """Fit position and velocity for a turn rate () [rad/s] by least squares."""
+    """Fit a path's position and velocity to observations for a turn rate () [rad/s]."""
     arcs = arc(rate, seen.after)
     lever = _mean(seen, arcs)
     arm = _minus(arcs, lever)
@@ -72,18 +71,18 @@ def fit_rate(seen: Centred, rate: Array) -> TurnFit:
 
 
 def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array]:
-    """Return the derivative of the fitted path with respect to the turn rate.
+    """Return the derivative of the fitted path by the turn rate, as a function of time.
 
     Position and velocity are refitted as the rate changes.
 
     Returns:
         slope: function from times (...) [s] after the mean time to derivatives, each (...) [m
             s/rad].
-        information: () [m^2 s^2/rad^2], weighted sum of their squares over the observations.
+        information: () [m^2 s^2/rad^2], weighted sum of the squared slopes at the observations.
     """
 
     def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
-        """Return arcs, and the derivatives of the paths along them by the rate alone."""
+        """Return arcs, and the derivatives of paths along the arcs by the turn rate alone."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -100,7 +99,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit a turn by least squares; the fit is differentiable like the exact optimum."""
+    """Fit position, velocity and turn rate; derivatives of the fit are those of the optimum."""
 
     def downhill(rate: Array) -> Array:
         """Return minus half the derivative of the sum of squares by the rate, () [m^2 s/rad]."""
@@ -110,8 +109,8 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
 
     spacing = jnp.asarray(fastest, seen.after.dtype) * (2.0 / (_RATES - 1))
     rate = lax.stop_gradient(_search_rate(lax.stop_gradient(seen), spacing))
-    # By the implicit function theorem, a Newton step from a point of zero slope has the derivatives
-    # of the optimum; the curvature is treated as constant.
+    # The search itself is not differentiated. A Newton step from a point of zero slope has the
+    # derivatives of the optimum (implicit function theorem); its curvature is treated as constant.
     slope, curvature = jax.jvp(downhill, (rate,), (jnp.ones_like(rate),))
     curved = (curvature < 0.0) & (seen.num >= 3)
     step = slope / lax.stop_gradient(jnp.where(curved, curvature, -1.0))
@@ -140,35 +139,35 @@ def _search_rate(seen: Centred, spacing: Array) -> Array:
 
 
 def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
-    """Return the path of a fit, with times that count from time 0."""
+    """Return the path of a fit; its times count from time 0, not from the mean time."""
     place = jnp.stack(_minus(seen.centre, _times(fit.velocity, fit.lever)))
     start = TurningPath(place, jnp.stack(fit.velocity), fit.rate).at(-seen.middle)
     return TurningPath(start.pos, start.vel, fit.rate)
 
 
 def _minus(a: Pair, b: Pair) -> Pair:
-    """Return the difference of points."""
+    """Return the difference of two points."""
     return a[0] - b[0], a[1] - b[1]
 
 
 def _times(a: Pair, b: Pair) -> Pair:
-    """Return the product of complex numbers."""
+    """Return the product of two complex numbers."""
     return a[0] * b[0] - a[1] * b[1], a[0] * b[1] + a[1] * b[0]
 
 
 def _sum(seen: Centred, a: Pair, b: Pair) -> Array:
-    """Return the weighted sum () of the scalar products of points."""
+    """Return the weighted sum () of the scalar products of two series of points."""
     return jnp.sum(seen.weight * (a[0] * b[0] + a[1] * b[1]))
 
 
 def _mean(seen: Centred, a: Pair) -> Pair:
-    """Return the weighted mean, each ()."""
+    """Return the weighted mean of points, each coordinate ()."""
     x, y = (jnp.sum(seen.weight * each) / seen.total for each in a)
     return x, y
 
 
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
-    """Return the complex factor by which arms fit points best.
+    """Return the complex factor c that minimises the weighted sum of |a - c arm|^2.
 
     `power` is the weighted sum of the arms' squared lengths.
     """

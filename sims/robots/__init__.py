@@ -1,1 +1,1 @@
-"""The simulated robots, a folder each; `sims/robot.py` declares their protocols."""
+"""The simulated robots, one folder each; `sims/robot.py` declares the protocol that they follow."""

@@ -1,1 +1,1 @@
-"""The arm: its drives, its controller and its model in MuJoCo."""
+"""The simulated arm with a shield: its drives, its controller and its model in MuJoCo."""

@@ -1,8 +1,8 @@
-"""Tracking control of an arm: computed torque.
+"""Tracking control of an arm by computed torque.
 
 The commanded acceleration is the planned acceleration plus feedback. The feedback acts on the
 errors of angle and rate like a spring and a damper, with equal gains for all joints. Inverse
-dynamics convert the commanded acceleration to torques.
+dynamics then give the torques of the commanded acceleration.
 """
 
 import dataclasses
@@ -18,7 +18,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, tot
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """Feedback gains; static under jit."""
+    """Feedback gains of the arm's controller; static under jit."""
 
     frequency: float = 50.0  # [rad/s], natural frequency of the error dynamics
     damping: float = 1.0  # damping ratio; 1 for the fastest response without overshoot
@@ -29,13 +29,13 @@ class Course:
     """A motion of the joints, its start time, and how the joints brake after its end."""
 
     motion: PiecewisePolynomial  # (M, D + 1, 6) [rad]
-    begin: Array  # () [s], start time
+    begin: Array  # () [s], start time of the motion
     braking: Array  # (6,) [rad/s^2], deceleration of joints that still move when the motion ends
 
 
 @struct.dataclass
 class JointState:
-    """The joints at one instant: true, measured or estimated."""
+    """Angles and rates of the joints at one instant: true, measured or estimated."""
 
     angles: Array  # (6,) [rad]
     rates: Array  # (6,) [rad/s]
@@ -43,7 +43,7 @@ class JointState:
 
 @struct.dataclass
 class JointReference:
-    """The reference of the joints at one instant."""
+    """The planned angles, rates and accelerations of the joints at one instant."""
 
     angles: Array  # (6,) [rad]
     rates: Array  # (6,) [rad/s]
@@ -51,7 +51,7 @@ class JointReference:
 
 
 def reference_at(course: Course, time: Array) -> JointReference:
-    """Return the reference of a course at a time () [s].
+    """Return the planned state of the joints at a time () [s] of a course.
 
     Before the start each joint moves at its initial rate, which is mostly zero. After the end each
     joint brakes at a constant deceleration, and then stands still.
@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Return commanded torques (6,) [N m], from the controller's model of the arm."""
+    """Return commanded torques (6,) [N m]; `arm` is the controller's model of the arm."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

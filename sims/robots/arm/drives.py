@@ -7,22 +7,22 @@ import dataclasses
 
 from planner_jax.core.errors import ArgumentError
 
-# [N m] of the joints of an IRB 1600-6/1.2, an assumption: its maker publishes no torques. Plans
-# with the greatest accelerations of all regimes, 60 rad/s^2, need hardly more in joints 1 to 3.
-# The wrist never needs these torques: in the model neither the motors' rotors nor the shield have
-# a mass.
+# [N m], torque limits of the six joints of an IRB 1600-6/1.2. They are an assumption, since its
+# maker publishes no torques. Plans with the greatest accelerations of all regimes, 60 rad/s^2, need
+# hardly more in joints 1 to 3. The wrist never needs these torques, because neither the motors'
+# rotors nor the shield have a mass in the model.
 TORQUES = (700.0, 700.0, 250.0, 10.0, 5.0, 2.0)
 
 
 @dataclasses.dataclass(frozen=True)
 class Drives:
-    """Drives and encoders of six joints.
+    """Limits of the drives of six joints, and errors of their encoders.
 
     Raises:
         ValueError: a value is out of its range.
     """
 
-    torques: tuple[float, ...] = TORQUES  # [N m], greatest magnitude
+    torques: tuple[float, ...] = TORQUES  # [N m], greatest magnitudes
     lag: float = 0.0  # [s], first-order lag of the torques
     latency: float = 0.0  # [s], delay of a plan's start at the joints
     angle_std: float = 0.0  # [rad], standard deviation of a measured angle
@@ -40,7 +40,7 @@ class Drives:
             raise ArgumentError("mass_error", "> -1", self.mass_error)
 
 
-IDEAL = Drives()  # except for the torque limits
+IDEAL = Drives()  # drives and encoders without errors; only the torques are limited
 # Standard deviations of measured angles [rad] and rates [rad/s]. Both presets are assumptions:
 # "fine" is an encoder of 16 bits per turn behind a gear, "coarse" a joint with play in its gear.
 ENCODERS = {"none": (0.0, 0.0), "fine": (1e-4, 0.01), "coarse": (1e-3, 0.1)}

@@ -1,4 +1,4 @@
-"""Inverse dynamics of an arm: recursive Newton-Euler, its recursions written as cumulative sums."""
+"""Inverse dynamics of an arm by recursive Newton-Euler, written with cumulative sums."""
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -11,15 +11,15 @@ def inverse_dynamics(
 ) -> Array:
     """Return the joint torques (6,) [N m] of a motion, without friction and rotor inertia.
 
-    The recursions follow [Luh1980], in the base frame. The forward recursion adds each
-    joint's contribution to the motion of its link. The backward recursion adds up the forces and
-    moments of the links beyond a joint; moments are about the origin of the base frame.
+    The recursions follow [Luh1980], in the base frame. The forward recursion adds each joint's
+    contribution to the motion of its link. The backward recursion adds up the forces and moments
+    of the links beyond a joint; moments are about the origin of the base frame.
 
     Args:
         arm: one arm; the shield has no mass of its own.
-        angles: (6,) [rad].
-        velocity: (6,) [rad/s].
-        acceleration: (6,) [rad/s^2].
+        angles: (6,) [rad], joint angles.
+        velocity: (6,) [rad/s], joint rates.
+        acceleration: (6,) [rad/s^2], joint accelerations.
         gravity: () [m/s^2], magnitude, along -z of the base frame.
     """
     rotations, positions = link_frames(arm, angles)

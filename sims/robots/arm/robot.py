@@ -2,7 +2,8 @@
 
 `qpos` starts with the joint angles, `qvel` with the joint rates, and the actuators are joint
 torques. The base frame of plans is parallel to the world frame and lies above the ground. The
-simulation has no joint limit stops and no collisions; flights are scored for both afterwards.
+simulation has no joint stops and no collisions. The score of a flight checks position limits and
+collisions afterwards.
 """
 
 import dataclasses
@@ -38,21 +39,21 @@ _THICKNESS = 0.01  # [m], thickness of the shield
 
 @functools.cache
 def _arm(xml: str) -> Any:
-    """Return the `Arm` of MJCF text, NumPy float64 leaves."""
+    """Parse MJCF text into an `Arm` with NumPy float64 leaves."""
     return read_arm(xml, dtype=np.float64)
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Return one arm as a batch of one, by the leaf names of the referee's kinematics."""
+    """Return one arm as a batch of one, with the leaf names of the referee's kinematics."""
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
 
 @dataclasses.dataclass(frozen=True)
 class ShieldArm:
-    """A six-axis arm with a shield; static under jit."""
+    """The simulated six-axis arm with a shield; static under jit."""
 
-    # MJCF, in the form that `read_arm` accepts
+    # MJCF text of the arm, in the form that `read_arm` accepts.
     xml: str = dataclasses.field(default=_IRB1600, repr=False)
     base_height: float = 0.0  # [m], height of the base frame above the ground
     gains: Gains = Gains()
@@ -66,11 +67,11 @@ class ShieldArm:
 
     @property
     def arm(self) -> Any:
-        """The `Arm` for which plans are made, NumPy float64 leaves."""
+        """The `Arm` for which plans are made, with NumPy float64 leaves."""
         return _arm(self.xml)
 
     def mjcf(self) -> tuple[str, str]:
-        """Return the chain of links with capsules and shield, and one motor per joint."""
+        """Return MJCF of the links with capsules and shield, and of one motor per joint."""
         arm = self.arm
         solids = {k: [] for k in range(-1, 6)}
         for link, ends, radius in zip(
@@ -99,7 +100,7 @@ class ShieldArm:
         return base + "".join(solids[-1]) + chain + 7 * "</body>", motors
 
     def _link(self, k: int) -> str:
-        """Return the opening tag of link k + 1, with its joint and inertial."""
+        """Return the opening MJCF tag of link k + 1, with its joint and its inertia."""
         arm = self.arm
         inertia = arm.inertia[k]
         full = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
@@ -112,20 +113,20 @@ class ShieldArm:
         )
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at the home position; the argument `place` (3,) [m] is ignored."""
+        """Return the state at standstill in the home position; `place` (3,) [m] is ignored."""
         home = jnp.asarray(self.arm.home, place.dtype)
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command as torques (6,) [N m], and no other forces."""
+        """Return the command as joint torques (6,) [N m], and zero extra forces."""
         return command, jnp.zeros_like(command)
 
     def state(self, physics: Physics) -> JointState:
-        """Return the arm's part of the simulated state."""
+        """Return the true joint angles and rates from the simulated physics."""
         return JointState(angles=physics.qpos[:6], rates=physics.qvel[:6])
 
     def sense(self, state: JointState, noise: Array, stds: Any) -> JointState:
-        """Return the measurements of the encoders.
+        """Return joint angles and rates as the encoders measure them.
 
         Args:
             state: the true state.
@@ -136,10 +137,10 @@ class ShieldArm:
         return JointState(angles=state.angles + errors[0], rates=state.rates + errors[1])
 
     def references(self, plan: Course, times: Array, world: World) -> JointReference:
-        """Return the references at times (K,) [s]; leaves (K, ...).
+        """Return the references of the joints at times (K,) [s]; leaves (K, ...).
 
         MuJoCo's stored rates belong to half a step before the angles, and a torque acts until one
-        step later. The references are shifted accordingly.
+        step later. The references are shifted by these times.
         """
         half = 0.5 * world.timestep
 
@@ -153,7 +154,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return torques (6,) [N m] of a controller with a relative error in its masses."""
+        """Return torques (6,) [N m] of a controller whose masses have a relative error."""
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error
@@ -161,7 +162,7 @@ class ShieldArm:
         return control(state, reference, believed, self.gains, world.gravity)
 
     def shapes(self) -> list[Shape]:
-        """Return the base, links 1 to 6 with their capsules, and the shield."""
+        """Return the parts for drawing: base, links 1 to 6 with their capsules, and shield."""
         arm = self.arm
         solids: list[list[Solid]] = [[] for _ in range(7)]
         solids[0].append(box_solid(*arm.base_box))
@@ -182,7 +183,7 @@ class ShieldArm:
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and quaternion, w x y z, of base, links and shield."""
+        """Return positions [m] and quaternions, w x y z, of base, links and shield at a pose."""
         turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]
@@ -192,14 +193,14 @@ class ShieldArm:
         return [*found, found[-1]]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the centre of the shield's face, (..., 3) [m]."""
+        """Return the centre of the shield's face, (..., 3) [m], at joint angles (..., 6)."""
         case = lanes_of(self.arm)
         angles = np.moveaxis(np.reshape(poses, (1, -1, 6)), 2, 0)
         middle = shield_middle(case, *links_of(case, angles))[:, 0].T
         return middle.reshape(*np.shape(poses)[:-1], 3) + [0.0, 0.0, self.base_height]
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Return NaN (3,): the shield holds no ball."""
+        """Return NaN (3,), since the shield holds no ball."""
         return np.full(3, np.nan)
 
 

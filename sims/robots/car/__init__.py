@@ -1,1 +1,1 @@
-"""The car: its chassis, tyres, controller and model in MuJoCo."""
+"""The simulated car: its chassis, tyres, controller and model in MuJoCo."""

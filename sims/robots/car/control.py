@@ -1,9 +1,9 @@
 """Tracking control of the car: feedforward of the plan, and linear feedback on the path error.
 
-Lateral feedback is a linear-quadratic regulator in distance. Per metre, the lateral error e and the
-heading error psi obey e' = psi and psi' = the extra curvature. The gains minimise the integral of
-(e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2. These gains do not depend on the speed;
-as rates over time they grow with it, as in a time-varying regulator.
+Lateral feedback is a linear-quadratic regulator over distance instead of time. Per metre, the
+lateral error e and the heading error psi obey e' = psi and psi' = (extra curvature). The gains
+minimise the integral of (e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2 over distance.
+These gains do not depend on the speed, so that the feedback per second grows with the speed.
 """
 
 import dataclasses
@@ -21,9 +21,9 @@ from planner_jax.sims.robots.car.vehicle import Vehicle
 class Gains:
     """Weights of the lateral regulator, and gains along the path; static under jit."""
 
-    reach: float = 0.05  # [m], weight of the lateral error
-    turn: float = 0.15  # [rad], weight of the heading error
-    bend: float = 0.4  # [1/m], weight of the extra curvature
+    reach: float = 0.05  # [m], lateral error that adds 1 to the regulator's cost
+    turn: float = 0.15  # [rad], heading error that adds 1 to the regulator's cost
+    bend: float = 0.4  # [1/m], extra curvature that adds 1 to the regulator's cost
     place: float = 4.0  # [1/s^2], acceleration per position error along the path
     speed: float = 4.0  # [1/s], acceleration per speed error
 
@@ -36,7 +36,7 @@ class Gains:
 
 @struct.dataclass
 class CarState:
-    """The car at one instant, true or estimated."""
+    """Pose, speed and steering angle of the car at one instant, true or estimated."""
 
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
     speed: Array  # () [m/s], along the heading
@@ -45,7 +45,7 @@ class CarState:
 
 @struct.dataclass
 class Reference:
-    """The reference of the car at one instant."""
+    """The planned motion of the car at one instant, with inputs advanced by the lags."""
 
     pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
@@ -58,7 +58,8 @@ class Reference:
 def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
     """Return the plan at a time () [s] since its start, with inputs advanced by the actuator lags.
 
-    A first-order lag delays a ramp by exactly its time constant, and a step by it on average.
+    A first-order lag delays a ramp by exactly its time constant. Inputs that are taken from one lag
+    ahead therefore arrive in time, as long as they change slowly.
     """
     knots = plan.time, plan.speed, plan.curvature
     pose = pose_at(plan.start, *knots, time)
@@ -76,7 +77,7 @@ def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
 
 
 def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gains) -> Array:
-    """Return the commanded drive force [N] and steering angle [rad], (2,)."""
+    """Return the command (2,): drive force [N] and steering angle [rad], for one reference."""
     cos, sin = jnp.cos(reference.heading), jnp.sin(reference.heading)
     away = state.pose[:2] - reference.pos
     along, across = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
@@ -86,7 +87,8 @@ def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gain
     curvature = reference.curvature - per_place * across - per_heading * off
     speed_error = reference.speed - state.speed
     wanted = reference.acceleration - gains.place * along + gains.speed * speed_error
-    # Rotation adds to the effective mass. At curvature k it is m + turning k^2, by kinetic energy.
+    # Rotation adds to the effective mass: at curvature k the mass is m + turning k^2, since the
+    # kinetic energy is (m + turning k^2) v^2 / 2.
     turning = vehicle.yaw_inertia + vehicle.mass * vehicle.mass_ahead**2
     bent = jnp.tan(state.steering) / vehicle.wheelbase
     mass = vehicle.mass + turning * bent**2

@@ -2,7 +2,7 @@
 
 `qpos` starts with x, y of the rear axle's centre and the heading, `qvel` with their rates, in the
 world frame. A force with a first-order lag drives the rear wheels. The steering angle is the state
-of an actuator that integrates its rate; angle and rate are limited. The lateral tyre forces
+of an actuator that integrates a commanded rate; angle and rate are limited. The lateral tyre forces
 (`tyres.py`) act in addition to the actuators.
 """
 
@@ -27,7 +27,7 @@ _CLEARANCE = 0.03  # [m], clearance of the body above the ground
 
 @dataclasses.dataclass(frozen=True)
 class Car:
-    """A car with front steering; static under jit."""
+    """The simulated car with rear drive and front steering; static under jit."""
 
     vehicle: Vehicle = Vehicle()
     gains: Gains = Gains()
@@ -40,7 +40,7 @@ class Car:
     noise_shape: ClassVar[tuple[int, ...]] = (3,)
 
     def mjcf(self) -> tuple[str, str]:
-        """Return the body with its wheels, and the actuators of drive and steering."""
+        """Return MJCF of the body with its wheels, and of the actuators of drive and steering."""
         vehicle = self.vehicle
         middle = 0.5 * vehicle.length - vehicle.rear_overhang
         body = np.array([0.5 * vehicle.length, 0.5 * vehicle.width, 0.5 * _HEIGHT])
@@ -70,21 +70,21 @@ class Car:
         return text, actuators
 
     def _wheels(self) -> np.ndarray:
-        """Return the centres of the rear and then of the front wheels, (4, 3) [m]."""
+        """Return the centres of the rear wheels and then of the front wheels, (4, 3) [m]."""
         vehicle = self.vehicle
         aside = 0.5 * vehicle.width - 0.015
         ends = [(x, y) for x in (0.0, vehicle.wheelbase) for y in (-aside, aside)]
         return np.array([(x, y, vehicle.wheel_radius) for x, y in ends])
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at rest with the rear axle at a position (3,) [m], heading along x."""
+        """Return the state at standstill with the rear axle at (3,) [m] and the heading along x."""
         none = jnp.zeros(3, place.dtype)
         return none.at[:2].set(place[:2]), none, none[:2]
 
     def moving(self, pose: Array, speed: Array, curvature: Array) -> Physics:
         """Return the state at a pose (3,), speed () [m/s] and path curvature () [1/m].
 
-        The world has no balls.
+        The state is of a world without balls.
         """
         ahead = jnp.stack([jnp.cos(pose[2]), jnp.sin(pose[2]), curvature])
         steering = jnp.arctan(self.vehicle.wheelbase * curvature)
@@ -93,10 +93,10 @@ class Car:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the drive force and the rate of the steering angle, and the tyre forces.
+        """Return the drive force and the rate of the steering angle, and the tyre forces (3,).
 
         Args:
-            physics: before the step.
+            physics: state before the step.
             command: (2,), commanded drive force [N] and steering angle [rad].
             timestep: [s].
         """
@@ -126,7 +126,7 @@ class Car:
         )
 
     def state(self, physics: Physics) -> CarState:
-        """Return the car's part of the simulated state."""
+        """Return the true pose, speed and steering angle from the simulated physics."""
         heading, vel = physics.qpos[2], physics.qvel
         return CarState(
             pose=physics.qpos[:3],
@@ -135,7 +135,7 @@ class Car:
         )
 
     def sense(self, state: CarState, noise: Array, stds: Any) -> CarState:
-        """Return the car's estimated state.
+        """Return the car's state with errors in the pose.
 
         Args:
             state: the true state.
@@ -150,11 +150,11 @@ class Car:
         return jax.vmap(lambda time: reference_at(plan, time, self.vehicle))(times)
 
     def command(self, state: CarState, reference: Reference, world: World) -> Array:
-        """Return commanded drive force [N] and steering angle [rad]."""
+        """Return the commanded drive force [N] and steering angle [rad], (2,)."""
         return control(state, reference, self.vehicle, self.gains)
 
     def shapes(self) -> list[Shape]:
-        """Return the body as a box, and its wheels."""
+        """Return the part for drawing: the body as a box, with its wheels."""
         vehicle = self.vehicle
         low, high = -vehicle.rear_overhang, vehicle.length - vehicle.rear_overhang
         half = 0.5 * vehicle.width
@@ -170,16 +170,16 @@ class Car:
         return [Shape([*wheels, *corners, bottom, top], [], tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and quaternion, w x y z, of the one shape."""
+        """Return position [m] and quaternion, w x y z, of the only shape at a pose (3,)."""
         half = 0.5 * pose[2]
         return [
             (np.append(pose[:2], 0.0), np.array([np.cos(half), 0.0, 0.0, np.sin(half)])),
         ]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the rear axle's centre on the ground, (..., 3) [m]."""
+        """Return the rear axle's centre on the ground, (..., 3) [m], at poses (..., 3)."""
         return np.concatenate([poses[..., :2], 0.0 * poses[..., :1]], axis=-1)
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
-        """Return NaN (3,): the car holds no ball."""
+        """Return NaN (3,), since the car holds no ball."""
         return np.full(3, np.nan)

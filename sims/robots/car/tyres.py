@@ -1,9 +1,9 @@
 """Lateral forces of a car's tyres, with or without slip.
 
-The single-track model: an axle is one wheel at its centre. Forces are solved for together with the
-velocity at the end of their step (implicit Euler). So stiff tyres, and tyres at rest, are as stable
-as soft ones. A tyre that cannot slip is the limit of infinite stiffness. World frame in the plane,
-SI units; velocities are of the rear axle's centre.
+The car is a single-track model, in which an axle is one wheel at its centre. The forces are solved
+for together with the velocity at the end of the step (implicit Euler). Stiff tyres, and tyres at
+standstill, are therefore as stable as soft tyres. A tyre that cannot slip is the limit of infinite
+stiffness. World frame in the plane, SI units; velocities are of the rear axle's centre.
 """
 
 import jax.numpy as jnp
@@ -20,21 +20,22 @@ def tyre_forces(
 ) -> Array:
     """Return generalised forces (3,) [N, N, N m] of both axles on the rear axle's centre.
 
-    The unknowns are the lateral forces f of the axles. With mass matrix M, all other forces F, and
-    rows J that give the axles' lateral velocities, the velocity after a step of length h is v + h
-    M^-1 (F + J' f). A tyre of stiffness c at speed u then bears  f = -(c / u) J v_after.
+    The unknowns are the lateral forces f of the axles. Let M be the mass matrix, F all other
+    forces, and J the rows that map a velocity to the axles' lateral velocities. The velocity after
+    a step of length h is v_after = v + h M^-1 (F + J' f). A tyre of stiffness c at speed u exerts
+    f = -(c / u) J v_after.
 
     Args:
         vehicle: the car with its tyres.
         pose: (3,) x, y [m] of the rear axle's centre and heading [rad], at the start of the step.
-        vel: (3,) [m/s, m/s, rad/s].
+        vel: (3,) [m/s, m/s, rad/s], velocity at the start of the step.
         steering: () [rad], the front wheels' angle in the middle of the step.
-        drive: () [N], along the heading, at the rear axle.
+        drive: () [N], force along the heading, at the rear axle.
         timestep: h [s].
     """
     dtype, b = vel.dtype, vehicle.mass_ahead
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    # In the body frame M has one pair of off-diagonal entries, m b between lateral motion and yaw.
+    # In the body frame M couples lateral motion and yaw by its only off-diagonal entries, m b.
     coupling, turning = vehicle.mass * b, vehicle.yaw_inertia + vehicle.mass * b**2
     determinant = vehicle.mass * turning - coupling**2
     inverse = np.array(

@@ -1,1 +1,1 @@
-"""The simulated quadrotor: its parts, model in MuJoCo, references and controller."""
+"""The simulated quadrotor: its model in MuJoCo, its references and its controller."""

@@ -1,4 +1,4 @@
-"""Control allocation: distribution of a commanded thrust and torque among the limited rotors."""
+"""Control allocation: how the limited rotors share a commanded thrust and torque."""
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -7,12 +7,12 @@ from planner_jax.robot.quadrotor_model import Rotors
 
 
 def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) -> Array:
-    """Return rotor thrusts (4,) [N] that produce a wrench, each within the limits of a rotor.
+    """Return rotor thrusts (4,) [N] that produce a thrust and a torque, within the rotors' limits.
 
-    If the rotors cannot produce all of it, roll and pitch have priority over thrust, because
-    without them the thrust would point elsewhere. Thrust has priority over yaw, which does not
-    matter for a round tool. Roll and pitch torques are scaled down where they would need a rotor to
-    be raised by more than `spare`.
+    If the rotors cannot produce both completely, roll and pitch have priority over thrust, because
+    without them the thrust would point in a wrong direction. Thrust has priority over yaw, which
+    does not matter for a round tool. Roll and pitch torques are scaled down if they would require
+    that a rotor's thrust is raised by more than `spare`.
 
     Args:
         rotors: parameters of the rotors.
@@ -21,7 +21,7 @@ def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) ->
         spare: [N], greatest increase of a rotor's thrust in favour of a torque.
     """
     least, most = rotors.min_thrust, rotors.max_thrust
-    # Shares of a thrust without torque: 1 for each rotor if all are equally far from the centre.
+    # Fractions of a thrust without torque, times 4: all 1 if the rotors are equally far away.
     share = jnp.asarray(4.0 * rotors.shares, torque.dtype)
     inverse = jnp.asarray(rotors.mixer, torque.dtype)
     turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)

@@ -1,9 +1,10 @@
 """Cascaded SE(3) control by differential flatness and the Hopf fibration.
 
-The cascade follows [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Position and
-velocity feedback, with the plan's acceleration and jerk as feedforward, gives the desired thrust
-and, at zero heading, attitude and body rate [Watterson2020]. The attitude error corrects the body
-rate. The error of the body rate gives a torque. Feedforward commands lead by the rotors' lag.
+The cascade follows [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Feedback of position
+and velocity, with the plan's acceleration and jerk as feedforward, gives the desired thrust. At
+zero heading, thrust and jerk determine the desired attitude and body rate [Watterson2020]. The
+attitude error corrects the body rate. The error of the body rate gives a torque. Feedforward
+commands are taken from ahead in time, to compensate the rotors' lag.
 
 World frame, z up; body rates and torques in the body frame; quaternions w x y z.
 """
@@ -24,28 +25,28 @@ from planner_jax.sims.robots.quadrotor.reference import Reference
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """All gains of the cascade; static under jit.
+    """All gains of the controller's cascade; static under jit.
 
     With a rotor lag of 20 ms the loops are not well separated: a velocity gain that damps the
     position loop alone excites the attitude. With these gains every mode of the cascade has a
     damping ratio of at least 0.5.
     """
 
-    position: float = 30.0  # [1/s^2]
-    velocity: float = 6.0  # [1/s]
-    attitude: float = 14.0  # [1/s]
-    heading: float = 4.0  # [1/s], of the attitude error about body z
-    rate: float = 32.0  # [1/s]
-    share: float = 0.3  # largest feedback acceleration, as a share of the plan's thrust
-    correction: float = 10.0  # [rad/s], largest body rate that corrects an attitude error
-    # Greatest increase of a rotor's thrust in favour of a torque, over its greatest thrust: 1 N for
-    # the papers' quadrotors.
+    position: float = 30.0  # [1/s^2], acceleration per position error
+    velocity: float = 6.0  # [1/s], acceleration per velocity error
+    attitude: float = 14.0  # [1/s], body rate per attitude error
+    heading: float = 4.0  # [1/s], body rate per attitude error about body z
+    rate: float = 32.0  # [1/s], angular acceleration per body rate error
+    share: float = 0.3  # greatest feedback acceleration, as a fraction of the plan's thrust
+    correction: float = 10.0  # [rad/s], greatest body rate that corrects an attitude error
+    # Greatest increase of a rotor's thrust in favour of a torque, divided by the rotor's greatest
+    # thrust. The value is 1 N for the quadrotors of the papers.
     spare: float = 1.0 / 11.8
 
 
 @struct.dataclass
 class RobotState:
-    """The quadrotor at one instant."""
+    """The state of the quadrotor at one instant, true or estimated."""
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
@@ -54,10 +55,10 @@ class RobotState:
 
 
 def rotation_error(R: Array, R_wanted: Array) -> Array:
-    """Return the rotation vector (3,) [rad], body frame, from one attitude to another, up to pi.
+    """Return the rotation vector (3,) [rad], body frame, from attitude `R` to `R_wanted`.
 
-    The vector sin(angle) axis is exact; the angle follows from its length and the cosine by atan2,
-    without an arc cosine.
+    The vector (sine of the angle) times (axis) follows from the matrices. The angle is the atan2 of
+    the vector's length and the cosine, which is more accurate than an arc cosine.
     """
     E = jnp.matmul(R.T, R_wanted, precision=lax.Precision.HIGHEST)
     sine_axis = 0.5 * jnp.stack([E[2, 1] - E[1, 2], E[0, 2] - E[2, 0], E[1, 0] - E[0, 1]])
@@ -80,11 +81,11 @@ def control(
     """
     gravity = jnp.asarray(world.gravity, state.pos.dtype)
     R = rotation(state.quat_wxyz)
-    half = 0.5 * world.timestep  # MuJoCo's velocities are older than its positions by this time
+    half = 0.5 * world.timestep  # [s], by which MuJoCo's velocities are older than its positions
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
     pull = net_thrust(reference.acc, gravity)
     back = gains.position * ahead + gains.velocity * faster
-    # Without a bound, a large error would tilt a weak thrust in any direction.
+    # The feedback is bounded, since a large error would tilt a weak thrust in any direction.
     most = gains.share * jnp.sqrt(jnp.sum(pull**2))
     back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
     acc = reference.acc + back
@@ -95,7 +96,7 @@ def control(
     stiffness = jnp.array([gains.attitude, gains.attitude, gains.heading], acc.dtype)
     highest = lax.Precision.HIGHEST
     turn = jnp.matmul(R.T, jnp.matmul(R_wanted, rate_wanted, precision=highest), precision=highest)
-    # Without a bound, a large error would command a rate that saturated rotors cannot stop in time.
+    # The correction is bounded, since saturated rotors could not stop a fast rotation in time.
     back = jnp.clip(stiffness * rotation_error(R, R_wanted), -gains.correction, gains.correction)
     rate = turn - half * reference.angular_acc + back
     inertia = jnp.asarray(model.inertia, acc.dtype)

@@ -1,6 +1,6 @@
 # Pyright cannot see the names of MuJoCo's compiled module.
 # pyright: reportAttributeAccessIssue=false
-"""Reader of a quadrotor's body and rotors from MuJoCo's model format, MJCF, compiled by MuJoCo."""
+"""Reader of a quadrotor's mass, inertia and rotors from MJCF, MuJoCo's model format."""
 
 from pathlib import Path
 from typing import Any
@@ -11,18 +11,19 @@ import numpy as np
 from planner_jax.robot.quadrotor_file import RobotError, Value
 
 _Mj = Any  # a structure of MuJoCo, whose package has no types
-_SKEW = 0.02  # greatest product of inertia over the greatest moment of inertia
+_SKEW = 0.02  # greatest allowed (product of inertia) / (greatest moment of inertia)
 
 
 def describe_mjcf(path: Path) -> dict[str, Value]:
-    """Return the quadrotor of an MJCF file, in the fields of a YAML file, in SI units.
+    """Read the quadrotor of an MJCF file; return it in the fields of a YAML file, in SI units.
 
     Mass and inertia are the sums of all bodies below the only free joint, about their centre of
     mass. A rotor is an actuator on a site whose `gear` has a force along z and a torque about z.
-    Its thrust limits are `ctrlrange` times gain and `gear`; its lag is its filter's time constant.
+    The thrust limits are `ctrlrange` times gain and `gear`; the lag is the time constant of the
+    actuator's filter.
 
     Raises:
-        RobotError: the model does not have this form; one line.
+        RobotError: the model does not have this form.
     """
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
@@ -83,7 +84,8 @@ def _rotor(
 ) -> dict[str, Value]:
     """Return position (2,) [m], thrust limits (2,) [N], torque ratio [m] and lag [s] of a rotor.
 
-    `k` is its actuator; `centre` (3,) [m] and `turn` (3, 3) are the pose of the body in the world.
+    `k` is the rotor's actuator; `centre` (3,) [m] and `turn` (3, 3) are the body's pose in the
+    world.
     """
     name = model.actuator(k).name or k
     site = int(model.actuator_trnid[k, 0])
@@ -104,7 +106,7 @@ def _rotor(
 
 
 def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
-    """Return the field `rotors`: counter-clockwise, the first with a positive drag torque."""
+    """Return the field `rotors`: counter-clockwise, first a rotor with a positive drag torque."""
     rotors = sorted(rotors, key=lambda rotor: np.arctan2(*rotor["place"][::-1]) % 6.28)
     if rotors[0]["ratio"] < 0.0:
         rotors = [*rotors[1:], rotors[0]]

@@ -1,4 +1,4 @@
-"""References of a quadrotor: a plan's trajectory and attitude, followed by a braking piece to rest.
+"""References of a quadrotor: a plan's trajectory and attitude, then a piece that brakes to hover.
 
 World frame, z up; body rates in the body frame.
 """
@@ -12,29 +12,30 @@ from planner_jax.robot.quadrotor import flat_attitude, net_thrust
 from planner_jax.sims.model import World
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
-_BRAKING = 0.8  # [s], from the end of a plan to rest
-_LOWEST_REST = 0.5  # [m], least height of the position at rest
+_BRAKING = 0.8  # [s], duration of the braking piece after the end of a plan
+_LOWEST_REST = 0.5  # [m], least height of the position at standstill
 
 
 @struct.dataclass
 class Reference:
-    """The reference at one instant."""
+    """The planned motion of the quadrotor at one instant, and leads that compensate rotor lag."""
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
     acc: Array  # (3,) [m/s^2]
     jerk: Array  # (3,) [m/s^3]
-    # () [m/s^2], addition to the commanded thrust that compensates the rotors' lag
+    # () [m/s^2], addition to the commanded thrust that compensates the rotors' lag.
     thrust_lead: Array
     angular_acc: Array  # (3,) [rad/s^2], body frame
-    torque_lead: Array  # (3,) [rad/s^2], the same for the angular acceleration
+    # (3,) [rad/s^2], addition to the angular acceleration that compensates the rotors' lag.
+    torque_lead: Array
 
 
 def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Return the trajectory with one more piece that brakes to rest after its end.
+    """Return the trajectory with one more piece, which brakes to standstill after its end.
 
-    The piece is the polynomial of degree 7 from the last state to rest. Its end point is where a
-    constant deceleration would stop, but no lower than half a metre.
+    The piece is the polynomial of degree 7 from the last state to standstill. Its end point is
+    where a constant deceleration would stop, but at a height of at least half a metre.
     """
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
@@ -73,9 +74,9 @@ def reference_at(
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
     step = 2.0 * world.timestep
-    # A command changes the thrust in the next step, whose force acts around the start of that step,
-    # because MuJoCo's Euler integrator is a leapfrog. Meanwhile the thrust changes as well, on
-    # average by half. Hence half a step of lead.
+    # A command changes the thrust in the next step. The force of this step acts around the start of
+    # the step, because MuJoCo's Euler integrator is a leapfrog. During the step the thrust changes
+    # too, on average by half of its change. Commands are therefore taken from half a step ahead.
     ahead = time + 0.5 * world.timestep
 
     def flat(at: Array) -> tuple[Array, Array]:
@@ -84,7 +85,7 @@ def reference_at(
         return size, flat_attitude(acc_then, order(3, at), gravity)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
-    # The inverse of a first-order lag: the value plus `lag` times its rate of change.
+    # The inverse of a first-order lag is the value plus `lag` times its rate of change.
     growth = (more - less) / (2.0 * step)
     angular_acc = (after - before) / (2.0 * step)
     angular_jerk = (after - 2.0 * rate + before) / step**2

@@ -1,7 +1,7 @@
 """The simulated quadrotor, a `sims.robot.Robot` with a tool on the body z axis.
 
-`qpos` starts with the position and the quaternion (w x y z), `qvel` with the velocity (world) and
-the body rate (body frame). Rotors are MuJoCo actuators with a first-order lag.
+`qpos` starts with the position and the quaternion (w x y z), `qvel` with the velocity (world frame)
+and the body rate (body frame). The rotors are MuJoCo actuators with a first-order lag.
 """
 
 import dataclasses
@@ -20,12 +20,12 @@ from planner_jax.sims.robots.quadrotor.reference import Reference, reference_at,
 from planner_jax.sims.scenery import VISUAL, xml_numbers
 from planner_jax.trajectory.polynomial import evaluate, total_duration
 
-_SEGMENTS = 12  # number of capsules of the hoop
+_SEGMENTS = 12  # number of capsules of which the drawn hoop consists
 
 
 @dataclasses.dataclass(frozen=True)
 class Quadrotor:
-    """A quadrotor with a tool; static under jit."""
+    """The simulated quadrotor with a racket or a net; static under jit."""
 
     model: QuadrotorModel
     gains: Gains = Gains()
@@ -37,11 +37,11 @@ class Quadrotor:
 
     @property
     def tool(self) -> Tool:
-        """The tool that hits or catches balls."""
+        """The racket or net that hits or catches balls."""
         return self.model.tool
 
     def mjcf(self) -> tuple[str, str]:
-        """Return the body with rotors and tool, and the motors."""
+        """Return MJCF of the body with rotors and tool, and of the motors."""
         model, rotors = self.model, self.model.rotors
         discs = "".join(
             f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
@@ -64,7 +64,7 @@ class Quadrotor:
         return body, motors
 
     def _tool_xml(self) -> str:
-        """Return the hoop as a ring of capsules over a plate, or the racket as a plate."""
+        """Return MJCF of the hoop as a ring of capsules over a plate, or of the racket's plate."""
         tool = self.tool
         low = tool.height - BALL_RADIUS * (1.0 if tool.kind == RACKET else 3.0)
         plate = (
@@ -82,7 +82,7 @@ class Quadrotor:
         return plate + ring
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return `qpos`, `qvel` and `act` of a hover at a position (3,) [m], with steady rotors."""
+        """Return `qpos`, `qvel` and `act` of a hover at (3,) [m], with rotors at steady thrust."""
         upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
         lift = self.model.mass * gravity * self.model.rotors.shares
         return (
@@ -92,16 +92,16 @@ class Quadrotor:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command as thrusts, and no other forces."""
+        """Return the command as rotor thrusts (4,) [N], and zero extra forces."""
         return command, jnp.zeros(self.num_vel, command.dtype)
 
     def state(self, physics: Physics) -> RobotState:
-        """Return the quadrotor's part of the simulated state."""
+        """Return the true state of the quadrotor from the simulated physics."""
         qpos, qvel = physics.qpos, physics.qvel
         return RobotState(pos=qpos[:3], vel=qvel[:3], quat_wxyz=qpos[3:7], rate=qvel[3:6])
 
     def sense(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
-        """Return the quadrotor's estimated state.
+        """Return the quadrotor's state with errors of some standard deviations.
 
         Args:
             state: the true state.
@@ -126,18 +126,19 @@ class Quadrotor:
         return state.pos, state.vel, jnp.sum(R * state.rate, axis=1), R[:, 2]
 
     def head_state(self, plan: Any, time: Array) -> Array:
-        """Return position to jerk (4, 3) at a time () [s] since the start of a plan.
+        """Return planned position, velocity, acceleration and jerk (4, 3) at a time () [s].
 
-        The state stays at rest after the end of the braking piece.
+        Times count from the start of the plan. After the end of the braking piece the state stays
+        at standstill.
         """
         path = with_rest(plan.trajectory)
         time = jnp.minimum(time, total_duration(path))
         return jnp.stack([evaluate(path, time, k) for k in range(4)])
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """Return the references at times (K,) [s] since the start of a plan, at most at its end.
+        """Return the references at times (K,) [s] since the start of a plan; leaves (K, ...).
 
-        Leaves are (K, ...).
+        Later times than the end of the braking piece are replaced by a time just before it.
         """
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
@@ -145,11 +146,11 @@ class Quadrotor:
         return jax.vmap(lambda time: reference_at(path, time, lag, world))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
-        """Return rotor thrusts (4,) [N]."""
+        """Return the rotor thrusts (4,) [N] that track a reference."""
         return control(state, reference, self.model, self.gains, world)
 
     def shapes(self) -> list[Shape]:
-        """Return arms, stick, rotors and tool, which are one rigid part."""
+        """Return the only part for drawing: arms, stick, rotors and tool."""
         rotors = self.model.rotors
         arms, top = rotors.positions, np.array([0.0, 0.0, self.tool.height])
         discs = [(arm, rotors.radius) for arm in arms] + [(top, self.tool.radius)]
@@ -158,11 +159,11 @@ class Quadrotor:
         return [Shape(lines, discs, tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and quaternion, w x y z, of the one shape."""
+        """Return position [m] and quaternion, w x y z, of the only shape at a pose (7,)."""
         return [(pose[:3], pose[3:7])]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the centre of the propeller plane (..., 3) [m]."""
+        """Return the centre of the propeller plane, (..., 3) [m], at joint positions (..., 7)."""
         return poses[..., :3]
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:
