@@ -45,7 +45,7 @@ class EkfState:
 
 
 def _congruence(A: Array, P: Array) -> Array:
-    """Return A P A', made exactly symmetric; accelerators may not reduce the precision."""
+    """Return A P A' in full precision (no TF32 on a GPU), made exactly symmetric."""
     full = jnp.einsum("ij,jk,lk->il", A, P, A, precision=lax.Precision.HIGHEST)
     return 0.5 * (full + full.T)
 
@@ -69,7 +69,7 @@ def solve_definite(A: Array, B: Array) -> Array:
 def ekf_init(
     pos: Float[Array, "3"], vel: Float[Array, "3"], *, pos_std: Array, vel_std: Array
 ) -> EkfState:
-    """Return the belief before the first observation.
+    """Make the Gaussian belief about a ball's state before the first observation.
 
     Args:
         pos: (3,) [m].

@@ -141,7 +141,8 @@ def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
 
     For |x| < 1/2 a series of thirteen terms replaces the formula of phi_2, which suffers from
-    cancellation. The branch that is not selected gets an input with a finite gradient.
+    cancellation. The branch that is not selected gets a harmless input, so that the gradient is
+    not NaN.
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)

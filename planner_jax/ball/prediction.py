@@ -35,7 +35,7 @@ class PathTable:
     resolution: Array  # () [s], > 0
 
     def at(self, time: Array) -> BallState:
-        """Return the state of the target at one time () [s]; see `target_at`."""
+        """Interpolate position and velocity of the target at one time () [s]; see `target_at`."""
         return target_at(self, time)
 
 
@@ -72,7 +72,7 @@ def predict_path(
 def _node_function(num_nodes: int) -> Callable:
     """Build the function that integrates positions and velocities (N, 3) at the nodes of a table.
 
-    A batch of balls runs in a GPU kernel where one fits (`ball.prediction_kernel`). Derivatives are
+    On a GPU a batch of balls can run in one kernel (`ball.prediction_kernel`). Derivatives are
     computed in forward mode, also inside reverse mode: there are few inputs, and no intermediate
     states need to be stored.
     """
@@ -106,7 +106,7 @@ def _node_function(num_nodes: int) -> Callable:
         moving = tuple(k for k, t in enumerate(tangents) if not isinstance(t, SymbolicZero))
         further = tuple(k for k in moving if k > 0)
         found = [jnp.zeros_like(leaf) for leaf in nodes]
-        if 0 in moving:  # a displacement of the first point displaces the whole path
+        if 0 in moving:  # a displacement of the initial position displaces the whole path
             found[0] = found[0] + tangents[0]
         if further:
             for k, by in enumerate(slopes(further)(*primals)):

@@ -81,13 +81,13 @@ def _call(
     """Build the kernel for `lanes` tables of `num_nodes` nodes, with `threads` threads a block."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
-    shapes = 2 * (shapes or [(num_nodes, 3)])  # of positions, of velocities
+    shapes = 2 * (shapes or [(num_nodes, 3)])  # results for positions, then for velocities
 
     def body(pos, vel, resolution, drag, gravity, *out):
         numbers = resolution[...], drag[...], gravity[...]
         zero = jnp.zeros_like(numbers[0])
 
-        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple instead of an array
+        def full(values: Iterable[ArrayLike]) -> Any:  # a tuple of components, not an array
             return tuple(zero + value for value in values)
 
         def advance(ball: BallState, moved: list[BallState], sign: float = 1.0) -> tuple:

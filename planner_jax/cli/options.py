@@ -17,7 +17,7 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.settings import SweepSettings
 
 Options = dict[str, Any]  # values of the options that the user passed, by argument names
-FAILED, BAD_ARGUMENT = 1, 2  # exit codes
+FAILED, BAD_ARGUMENT = 1, 2  # exit codes of the process
 
 
 class BadOption(PlannerJaxError):
@@ -118,7 +118,7 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _form_of(field: dataclasses.Field) -> Options:
-    """Return the arguments of `add_argument` for a field with required or several values."""
+    """Return a field's arguments of `add_argument`: metavar, number of words, required."""
     names = field.metadata["metavar"].split()
     how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
     if len(names) == 1:

@@ -33,7 +33,7 @@ _ALL = ("quadrotor", "car", "arm")
 
 @dataclasses.dataclass(frozen=True)
 class Format:
-    """A file format for plans."""
+    """A file format in which plans can be exported, and the functions that write it."""
 
     summary: str  # short description for the command's help
     robots: tuple[str, ...]  # names of the supported robots of `export.setpoints.ROBOTS`

@@ -33,7 +33,7 @@ _VERTICAL = 1e-6
 
 
 def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the yaw of attitudes and its rate; yaw is the body's x axis as seen from above.
+    """Return yaw and yaw rate of attitudes: the direction of the body's x axis, seen from above.
 
     Args:
         quat_wxyz: (K, 4), FLU body to ENU world.

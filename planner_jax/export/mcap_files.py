@@ -45,7 +45,7 @@ def _full_name(kind: str) -> str:
 
 
 def _definition(kind: str) -> str:
-    """Return the definition of a type, followed by the definitions of all types in its fields."""
+    """Return a ROS message type's definition, followed by those of the types in its fields."""
     types = [kind]
     for each in types:  # the loop appends to the list that it iterates over
         inner = (line.split()[0].removesuffix("[]") for line in _TYPES[each].splitlines())

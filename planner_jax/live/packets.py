@@ -97,7 +97,7 @@ class Answer:
     setpoints: np.ndarray  # (K, 20), the columns of `FIELDS`
 
     def column(self, name: str) -> np.ndarray:
-        """Return a field of all setpoints, (K, N), such as "pos" or "quat_wxyz"."""
+        """Return one field of all K setpoints, (K, N); `name` is a key of `FIELDS`, as "pos"."""
         names = list(FIELDS)
         before = sum(FIELDS[each] for each in names[: names.index(name)])
         return self.setpoints[:, before : before + FIELDS[name]]

@@ -128,7 +128,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         state = np.asarray(self.stroke.case.head_state)
         self._setpoints(self._recover(state, 0.0), 0.0)
         ball = None
-        for k in range(3):  # towards the robot
+        for k in range(3):  # three observations of a ball that flies towards the robot
             pos = tuple(state[0] + (4.0 - 0.1 * k, 0.0, 0.1 * k))
             ball, _ = self._sight.see(0, pos, 0.01 * k, 0.01 * k)
         assert ball is not None
@@ -181,7 +181,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self.report.stages["ball"].add(taken)
         self._complete()
 
-    # Packets with a state of the robot.
+    # Methods that use packets with a state of the robot.
 
     def _use_robot(self, packet: Packet, due: float, _: float) -> Fault:
         self._collect(due)
@@ -204,7 +204,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.counts["hard_rests"] += not is_within
         return _Flight(course, start)
 
-    # Packets with an observation of the ball.
+    # Methods that use packets with an observation of the ball.
 
     def _use_ball(self, packet: Packet, due: float, received: float) -> Fault:
         before = self._sight.number
@@ -297,7 +297,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         old, new = (state_of(each.course, due - each.start) for each in (flight, found))
         return all(math.dist(old[k], new[k]) <= _JOIN[k] for k in range(2))
 
-    # Packets of answers.
+    # Methods that make the packets of answers.
 
     def _pack(self, packet: Packet, fault: Fault, due: float) -> bytes:
         flight = self._flight

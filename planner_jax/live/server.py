@@ -13,8 +13,9 @@ from planner_jax.live.packets import LONGEST, SILENT, Fault, read_request
 from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
-_LISTENED = 0.25  # [s] without a packet, after which the server checks whether to stop
-# Socket option SO_TIMESTAMPNS of Linux, and its format: arrival of a packet in [s] and [ns].
+_LISTENED = 0.25  # [s], longest wait for a packet before the server checks whether to stop
+# Number of Linux's socket option SO_TIMESTAMPNS, and the format of its value: the arrival time of a
+# packet as whole seconds and nanoseconds.
 _STAMPS, _STAMP = 35, struct.Struct("@ll")
 
 
@@ -43,7 +44,7 @@ class Server:
         self.port: int = self._socket.getsockname()[1]
 
     def warm_up(self) -> None:
-        """Compile all of the planner's programs, and discard packets that arrive meanwhile."""
+        """Compile the planner's JAX programs, and discard packets that arrive meanwhile."""
         self.planner.warm_up()
         self._socket.setblocking(False)
         with contextlib.suppress(BlockingIOError):
@@ -52,7 +53,7 @@ class Server:
         self._socket.settimeout(_LISTENED)
 
     def run(self, is_running: Callable[[], bool]) -> None:
-        """Answer packets while `is_running()`, checked after every packet and every timeout."""
+        """Answer packets while `is_running()` is true; test it after every packet and timeout."""
         while is_running():
             with contextlib.suppress(TimeoutError):
                 self._answer(*self._receive())

@@ -22,7 +22,7 @@ class Obstacles:
     """
 
     centre: Array  # (N, 2) [m], at time 0
-    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise; the last may be repeated
+    corners: Array  # (N, V, 2) [m] from the centre, counter-clockwise, padded with the last corner
     velocity: Array  # (N, 2) [m/s]
     present: Array  # (N,) bool, whether the entry is an obstacle or only padding
 

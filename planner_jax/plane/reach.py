@@ -61,7 +61,7 @@ class Grid:
 
 @struct.dataclass
 class Vehicle:
-    """A vehicle on the grid: a reference point, and two discs that cover its body."""
+    """Sizes and limits of a vehicle; two discs cover its body, and a reference point is tracked."""
 
     radius: Array  # () [m], radius of the discs
     ahead: Array  # (2,) [m], distances of the discs' middles ahead of the reference point
@@ -136,9 +136,9 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) along x by `move` (...) cells, less than 32; x is in bits.
+    """Move cells (words, ..., cells) along x by `move` (...) cells, less than 32.
 
-    Cells that leave the grid are dropped.
+    The cells along x are the bits of the words. Cells that leave the grid are dropped.
     """
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
@@ -274,7 +274,7 @@ def reach_set(
         each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
         return allowed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
 
-    free = _map_needed(find_free, blocked, halves_needed)  # at every half layer
+    free = _map_needed(find_free, blocked, halves_needed)  # for every half step between layers
 
     def move_y(bits: Array, n: Array, half: int) -> Array:
         moved = _move_y(bits[:, 1:], moves[n, 1:, :, half, 1])

@@ -21,7 +21,7 @@ class PointState:
 
 
 class PlanePath(Protocol):
-    """The path of a target, as planners use it."""
+    """Interface of a target's path in the plane, as the planners of interceptions use it."""
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -37,7 +37,7 @@ class TurningPath:
 
     pos: Array  # (2,) [m], at time 0
     vel: Array  # (2,) [m/s], at time 0
-    turn_rate: Array  # () [rad/s], to the left
+    turn_rate: Array  # () [rad/s], positive to the left
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s]."""
@@ -67,10 +67,10 @@ class PolynomialPath:
 
 @struct.dataclass
 class LaterPath:
-    """A path whose times count from a later moment."""
+    """A path with a later time origin: its time 0 is the time `begin` of another path."""
 
     path: PlanePath
-    begin: Array  # () [s], that moment in the times of `path`
+    begin: Array  # () [s], time of `path` at which this path has time 0
 
     def at(self, time: Array) -> PointState:
         """Return position [m] and velocity [m/s] at one time () [s] after `begin`."""
@@ -78,13 +78,16 @@ class LaterPath:
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
-    """Return the displacements ahead and to the left (...) [s] of a target of unit speed."""
+    """Return the displacement of a target with unit speed and a constant turn rate.
+
+    The displacements along the initial velocity and to its left are (...) [s], as the speed is 1.
+    """
     angle = turn_rate * time
     return time * _sinc(angle), time * _cosc(angle)
 
 
 def _sinc(angle: Array) -> Array:
-    """Return sin(x) / x."""
+    """Return sin(x) / x for an angle x [rad], also near zero."""
     small = jnp.abs(angle) < 1e-2
     safe = jnp.where(small, 1.0, angle)
     return jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)

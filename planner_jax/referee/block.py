@@ -87,19 +87,19 @@ class BlockVerdict(Verdict):
     SENTENCES = _SENTENCES
     UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
 
-    failed_part: np.ndarray  # (B,) str, the joint, link or shield that fails, or ""
-    contact_time: np.ndarray  # (B,) [s]
-    execution_time: np.ndarray  # (B,) [s], of the motion
+    failed_part: np.ndarray  # (B,) str, the joint, link or shield that exceeds a limit, or ""
+    contact_time: np.ndarray  # (B,) [s], time of the contact that the plan reports
+    execution_time: np.ndarray  # (B,) [s], duration of the arm's motion
     velocity_share: np.ndarray  # (B,) greatest |rate| of a joint / its limit
     acceleration_share: np.ndarray  # (B,) greatest |acceleration| of a joint / its limit
-    floor_clearance: np.ndarray  # (B,) [m], least
-    pole_clearance: np.ndarray  # (B,) [m], least
-    rig_clearance: np.ndarray  # (B,) [m], least
-    base_clearance: np.ndarray  # (B,) [m], least
-    self_clearance: np.ndarray  # (B,) [m], least
+    floor_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the floor
+    pole_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the pole
+    rig_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the rig's beams
+    base_clearance: np.ndarray  # (B,) [m], least distance of links 2 to 6 and shield from the base
+    self_clearance: np.ndarray  # (B,) [m], least distance between two parts of the arm
     miss: np.ndarray  # (B,) [m], ball to the shield's middle at the contact, in the face's plane
-    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face
-    tilt: np.ndarray  # (B,) [rad], shield's normal to minus the ball's velocity
+    height: np.ndarray  # (B,) [m], of the ball above the plane of the shield's face at the contact
+    tilt: np.ndarray  # (B,) [rad], angle between shield's normal and minus the ball's velocity
 
     def success_message(self, k: int | tuple) -> str:
         """Describe for plan `k`, a success, where and when the ball meets the shield."""
@@ -180,7 +180,7 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
-    """Return the fields of `BlockVerdict` for one chunk of plans."""
+    """Judge one chunk of a batch of plans, and return the fields of `BlockVerdict` by name."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # Time [s] from the end of the arm's motion to the contact with the ball.
@@ -250,7 +250,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
         values = derivative(motion.coeffs, times, order)
         found.append((values, times))
         if order >= degree:
-            continue  # constant, without roots
+            continue  # a constant derivative has no roots
         # Between two extrema the derivative is monotonic, and has at most one root.
         low, high, is_below = times[:-1], times[1:], values[:-1] < 0.0
         for _ in range(_HALVINGS):
@@ -421,7 +421,8 @@ def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.nd
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown
     upper = case[f"scene.{name}.upper"].T - pos + grown
-    # Times between the bottom and the top, before and after the highest point.
+    # Times at which the ball is between the heights of the box's bottom and top: first while it
+    # rises to its highest point, then while it falls.
     highest = vel[2] / gravity
     over, under = (
         np.sqrt(vel[2] ** 2 - 2.0 * gravity * side[2]) / gravity for side in (upper, lower)

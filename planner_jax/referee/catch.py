@@ -73,10 +73,10 @@ class CatchVerdict(FlightVerdict):
 
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
     net_offset: np.ndarray  # (B, N) [m], component along z_d: height above the hoop's plane
-    angle: np.ndarray  # (B, N) [rad], z_d to minus the velocity; NaN for a target at standstill
+    angle: np.ndarray  # (B, N) [rad], z_d to minus the target's velocity; NaN if it stands still
     catch_times: np.ndarray  # (B, N) [s], end of the pieces up to each catch
     caught: np.ndarray  # (B, N) bool, the tests of order, catch time, net and angle pass
-    num_caught: np.ndarray  # (B,) int
+    num_caught: np.ndarray  # (B,) int, number of caught targets
 
     def success_message(self, k: int | tuple) -> str:
         """Describe for plan `k`, a success, how many targets it catches, and the greatest miss."""
@@ -277,7 +277,7 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 def _judge(
     case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
 ) -> dict:
-    """Return the fields of `CatchVerdict` for one chunk of plans."""
+    """Judge one chunk of a batch of plans, and return the fields of `CatchVerdict` by name."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)

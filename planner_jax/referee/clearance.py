@@ -52,7 +52,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return np.concatenate(parts)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return for each plan the index of its least `bound` (P,); plan numbers `of` (P,) rise."""
+        """Return the index of each plan's least `bound` (P,); `of` (P,) has rising plan indices."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])

@@ -70,10 +70,12 @@ class HitVerdict(FlightVerdict):
     }
 
     hitting_velocity: np.ndarray  # (B, 3) [m/s], of the quadrotor at the impact
-    apex: np.ndarray  # (B,) [m], of the ball after the impact
-    landing_point: np.ndarray  # (B, 3) [m], NaN where the ball does not come down to the target
-    landing_error: np.ndarray  # (B,) [m], horizontal; infinite where it does not come down
-    contact_error: np.ndarray  # (B,) [m], racket centre to ball at the impact
+    apex: np.ndarray  # (B,) [m], greatest height of the ball after the impact
+    # (B, 3) [m], where the ball falls to the target's height; NaN if it never does.
+    landing_point: np.ndarray
+    # (B,) [m], horizontal distance of the landing point from the target; infinite without one.
+    landing_error: np.ndarray
+    contact_error: np.ndarray  # (B,) [m], distance of racket centre and ball at the impact
 
     def success_message(self, k: int | tuple) -> str:
         """Describe for plan `k`, a success, how far from the target the ball lands."""
@@ -138,7 +140,7 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    """Return the fields of `HitVerdict` for one chunk of plans."""
+    """Judge one chunk of a batch of plans, and return the fields of `HitVerdict` by name."""
     pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]

@@ -72,8 +72,8 @@ class InterceptVerdict(Verdict):
     max_curvature: np.ndarray  # (B,) [1/m], magnitude
     max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of atan(wheelbase * curvature)
     max_lateral_acceleration: np.ndarray  # (B,) [m/s^2], magnitude, of the rear axle
-    wall_clearance: np.ndarray  # (B,) [m], least
-    mover_clearance: np.ndarray  # (B,) [m], least
+    wall_clearance: np.ndarray  # (B,) [m], least distance of the body from a wall
+    mover_clearance: np.ndarray  # (B,) [m], least distance from a moving obstacle
     nearest_wall: np.ndarray  # (B,) int, index of the nearest wall, or -1
     nearest_mover: np.ndarray  # (B,) int, index of the nearest mover, or -1
     miss: np.ndarray  # (B,) [m], from the body's middle to the target when the plan ends
@@ -193,7 +193,8 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
     if fields.keys() >= {"path", "begin"}:
         return target_positions_of(fields["path"], leaf("begin") + times)
     if "turn_rate" in fields:
-        # The chord of an arc is arc length x sinc(angle / 2), rotated by angle / 2.
+        # The chord of a circular arc has the length (arc length) sinc(angle / 2). Its direction is
+        # the initial direction, rotated by angle / 2.
         half = 0.5 * leaf("turn_rate") * times
         (x, y), chord = leaf("vel", 2).T, times * np.sinc(half / np.pi)
         cos, sin = np.cos(half), np.sin(half)
@@ -209,7 +210,7 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
 
 
 def _judge(case: dict, relative: float, contact: float) -> dict:
-    """Return the fields of `InterceptVerdict` for one chunk of plans."""
+    """Judge one chunk of a batch of plans, and return the fields of `InterceptVerdict` by name."""
     end = case["plan.time"]
     finite = finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
@@ -255,7 +256,7 @@ def final_poses(plans, body) -> np.ndarray:
     }
     case = {name: np.asarray(leaf, np.float64) for name, leaf in case.items()}
     end = np.asarray(plans.time, np.float64)
-    # A plan whose time is out of range ends at its start.
+    # For a plan whose time is not in (0, `LONGEST_PLAN`], the start pose is returned.
     end = np.where((end > 0.0) & (end <= LONGEST_PLAN), end, 0.0)
     span = end / (case["plan.speed"].shape[1] - 1)
     with np.errstate(all="ignore"):

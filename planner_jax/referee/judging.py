@@ -59,7 +59,7 @@ class Verdict:
         return f"{name}: {text}"
 
     def success_message(self, k: int | tuple) -> str:
-        """Describe plan `k`, a success, for `sentence`; subclasses add measurements."""
+        """Return the text that `sentence` reports for a successful plan `k`."""
         return "every limit holds"
 
 

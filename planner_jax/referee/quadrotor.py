@@ -169,14 +169,15 @@ def _norm_squared(vector: np.ndarray) -> np.ndarray:
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """Return |a + g e_3|^2 for accelerations a (3, ...)."""
+    """Return the squared thrust per unit mass, |a + g e_3|^2, for accelerations a (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
 def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray:
-    """Return |omega|^2 of the Hopf fibration at zero heading, from c = tau x jerk.
+    """Return the squared body rate |omega|^2 of the Hopf fibration at zero heading.
 
-    The thrust direction z has z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2. The yaw rate is
+    With the thrust per unit mass tau and c = tau x jerk, the thrust direction z has
+    z' = (c / |tau|^2) x z, so |z'| = |c| / |tau|^2. The rate about z is
     (z_y z_x' - z_x z_y') / (1 + z_z) = -c_z / (|tau| (|tau| + tau_z)). The result is infinite
     without thrust and upside down, where the attitude is undefined.
     """
@@ -258,7 +259,7 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """Sample all six quantities; return `_tops` of each, (6, B), and `_fastest_turn`, (B,)."""
+    """Sample the six `_MEASURES`; return `_tops` of each, (6, B), and `_fastest_turn`, (B,)."""
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))

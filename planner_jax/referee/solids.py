@@ -23,12 +23,12 @@ def length(vector: np.ndarray | list) -> np.ndarray:
 
 
 def rotate(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Multiply vectors (3, ...) by matrices (3, 3, ...)."""
+    """Return the products (3, ...) of rotation matrices (3, 3, ...) and vectors (3, ...)."""
     return np.stack([dot(rotation[k], vector) for k in range(3)])
 
 
 def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Multiply vectors (3, ...) by the transposes of matrices (3, 3, ...)."""
+    """Return the products of transposed rotation matrices (3, 3, ...) and vectors (3, ...)."""
     return np.stack([dot(rotation[:, k], vector) for k in range(3)])
 
 
@@ -128,7 +128,7 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
 
     The arguments are those of `between_boxes`.
     """
-    edges = rotation * half  # (3, 3, P), half of each
+    edges = rotation * half  # (3, 3, P), the half edges as vectors
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
         for k, first, second in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0))
