@@ -1,28 +1,30 @@
-"""Measure interceptions of targets that are only predicted, with one plan and with re-planning.
+"""Measure how often a car meets a target whose path it must predict from noisy observations.
 
     python -m benchmarks.intercept_predicted [--suite hard] [--num 40] [--seed 0] [--out DIR]
 
 A target is observed 15 times, once a second up to the start, with noise of 0.1 m on each coordinate
-[Qu2022, Section V-A], and `select` predicts its path. The planner knows walls and movers, but only
-the prediction of the target. There are three rows for straight and for turning targets:
+[Qu2022, Section V-A]. The function `select` predicts its path. The planner knows walls and moving
+obstacles exactly. There are three rows for straight and for turning targets:
 
-* `one shot`: one plan, driven to its end.
-* `re-planned`: observations continue once a second while the car drives. After each one the target
-is
-  predicted from all observations so far, and the remainder is re-planned. The new plan replaces the
-  old one if it keeps every limit.
-* `known`: the target's path is known.
+* `one shot`: the target is predicted once, and one plan is driven to its end.
+* `re-planned`: observations continue once a second while the car drives. After each observation the
+  target is predicted again, and the remaining motion is planned again. The new plan replaces the
+  old plan if it keeps every limit.
+* `known`: the target's true path is known, and one plan is driven to its end.
 
-The car follows its plans exactly. If no plan keeps every limit, the body's middle may be 0.2 m from
-the prediction at the meeting. If that fails too, and the car has no plan yet, it may meet a point
-about 0.5 m beside the prediction. If that fails as well, the plan with the smallest excess is
-driven, and planning from scratch is tried at every observation.
+The car follows its plans exactly. If no plan keeps every limit, the tolerance of the meeting is
+increased to 0.2 m. If planning fails again, and the car does not follow a solved plan yet, plans to
+eight points 0.5 m around the predicted target are tried. If all these plans fail, the car drives
+the plan with the smallest excess over a limit, and plans from scratch at every later observation.
 
-The whole driven trajectory, at steps of 20 ms, is judged by the referee as one plan against the
-true target: every limit of the car, the map, polygons, and a meeting within 0.3 m at the case's
-time. Misses are over all drives, even those with collisions. A case is solvable if some row solves
-it. Printed beside the rows are the share of first predictions within 0.3 m at the case's time, and
-the same share at the Cramer-Rao bound, which no unbiased predictor exceeds by much.
+The referee judges the whole driven trajectory, at steps of 20 ms, as one plan against the true
+target. It checks the limits of the car, the map, collisions with polygons, and a distance of at
+most 0.3 m from the target at the case's time. The table lists this distance, called miss, over all
+drives, including drives with a collision. A case is solvable if at least one of the rows solves it.
+
+Finally the program prints which share of the first predictions is within 0.3 m of the true target
+at the case's time. It also prints this share for a predictor at the Cramer-Rao bound, which is
+about the best that an unbiased predictor can reach.
 """
 
 import dataclasses
@@ -46,14 +48,14 @@ from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 from planner_jax.task.intercept.spec import SUITES
 
-NOISE = 0.1  # [m], standard deviation of each observed coordinate
-COUNT = 15  # observations up to the start
-INTERVAL = 1.0  # [s], between two observations, and between two plans
-RATE = 50.0  # [Hz], of the driven trajectory that the referee judges
-RADII = (0.05, 0.3, 0.5)  # [m]
-SUCCESS = 0.3  # [m], from the true target
-CLOSE = 0.2  # [m], tolerance around the prediction if no plan keeps all limits
-# [m], points around the prediction that are tried last.
+NOISE = 0.1  # [m] Standard deviation of each observed coordinate.
+COUNT = 15  # Number of observations up to the start.
+INTERVAL = 1.0  # [s] Time between two observations, and between two plans.
+RATE = 50.0  # [Hz] Sampling rate of the driven trajectory that the referee judges.
+RADII = (0.05, 0.3, 0.5)  # [m] The table lists the shares of misses below these distances.
+SUCCESS = 0.3  # [m] Greatest distance from the true target of a successful meeting.
+CLOSE = 0.2  # [m] Tolerance of the meeting for cases in which the usual plan exceeds a limit.
+# [m] Offsets from the predicted target of the points that are tried if all other plans fail.
 PLACES = 0.5 * np.stack([f(np.arange(8) * np.pi / 4.0) for f in (np.cos, np.sin)], axis=1)
 PLANNER = SpacetimeIntercept()
 MODES = ("straight", "turning")
@@ -67,14 +69,18 @@ HEADER = (
 @jax.jit
 @jax.vmap
 def predict(times: jax.Array, seen: jax.Array, weights: jax.Array) -> TurningPath:
-    """Predict paths, leaves (B, ...), from observations (B, L, 2) [m] at times (B, L) [s]."""
+    """Predict the paths of B targets from observations (B, L, 2) [m] at times (B, L) [s]."""
     return select(times, seen, NOISE, weights).path
 
 
 @jax.jit
 @jax.vmap
 def compute_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
-    """Return shares (B,) within the success radius at the bound, for observations at (B, L) [s]."""
+    """Return the probabilities (B,) that the best unbiased prediction is within `SUCCESS`.
+
+    The prediction is for the times `end` (B,) [s], from observations at `times` (B, L) [s]. Its
+    covariance is the Cramer-Rao bound.
+    """
     straight, turning = (
         share_within(cramer_rao(path, times, NOISE, end, turning=turning), SUCCESS)
         for turning in (False, True)
@@ -90,7 +96,10 @@ class Observations:
     places: np.ndarray  # (B, L, 2) [m]
 
     def paths(self, now: float) -> TurningPath:
-        """Return paths, leaves (B, ...), predicted at time `now` [s], which is their time 0."""
+        """Predict the paths of all B targets from the observations up to the time `now` [s].
+
+        Time 0 of the predicted paths is `now`.
+        """
         batch = len(self.places)
         times = np.tile((self.times - now).astype(np.float32), (batch, 1))
         seen = np.tile((self.times <= now).astype(np.float32), (batch, 1))
@@ -98,12 +107,12 @@ class Observations:
 
 
 def take_lanes(tree: Any, lanes: Any) -> Any:
-    """Return the batch elements `lanes` of a pytree, on the host."""
+    """Return the elements with indices `lanes` of a batched pytree, in NumPy arrays."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[lanes], tree)
 
 
 def replace_lanes(tree: Any, lanes: np.ndarray, some: Any) -> Any:
-    """Return a pytree with other values in the batch elements `lanes`, on the host."""
+    """Return a batched pytree in which `some` replaces the elements with indices `lanes`."""
 
     def leaf(old: Any, new: Any) -> np.ndarray:
         changed = np.array(old)
@@ -114,11 +123,13 @@ def replace_lanes(tree: Any, lanes: np.ndarray, some: Any) -> Any:
 
 
 def plan_cases(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
-    """Plan from scratch; where that fails, with more tolerance, and then beside the target.
+    """Plan B cases from scratch, and relax the meeting of cases that are not solved.
+
+    Such cases are planned with a larger tolerance, and then to points beside the target.
 
     Args:
-        cases: leaves (B, ...).
-        around: (B,) bool, whether a point beside the target is allowed.
+        cases: a batch, leaves (B, ...).
+        around: (B,) bool, whether the case may be planned to a point beside the target.
     """
     plans = pj.plan(PLANNER, cases)
     lanes = np.flatnonzero(~is_solved(plans.status))
@@ -135,12 +146,12 @@ def plan_cases(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
 
 
 def loosen(cases: InterceptCase, distance: float) -> InterceptCase:
-    """Return the cases with a tolerance of `distance` [m]."""
+    """Return cases in which the meeting may be up to `distance` [m] from the target."""
     return dataclasses.replace(cases, tolerance=np.full_like(cases.tolerance, distance))
 
 
 def plan_beside(cases: InterceptCase) -> InterceptPlan:
-    """Plan to points around the target; return the first solved plan of each case."""
+    """Plan each case to several points around its target; return the case's first solved plan."""
     num, path = len(PLACES), cast("Any", cases.target)
     many = take_lanes(cases, np.repeat(np.arange(len(cases.time)), num))
     moved = np.asarray(path.pos)[:, None] + PLACES
@@ -154,16 +165,16 @@ def plan_beside(cases: InterceptCase) -> InterceptPlan:
 class Drives:
     """Drives of B cars: speed and curvature every 20 ms, from the start to the case's time."""
 
-    plans: InterceptPlan  # currently driven
+    plans: InterceptPlan  # plans that the cars follow at present
     cases: InterceptCase  # problems that these plans solve
-    began: np.ndarray  # (B,) [s], when these plans began
+    began: np.ndarray  # (B,) [s], times at which the cars began to follow these plans
     had_plan: np.ndarray  # (B,) bool, whether the first plan keeps every limit
     speed: np.ndarray  # (B, S) [m/s]
     curvature: np.ndarray  # (B, S) [1/m]
 
     @classmethod
     def start(cls, cases: InterceptCase) -> "Drives":
-        """Create drives that follow their first plans."""
+        """Plan all cases from scratch, and create drives that follow these first plans."""
         plans = plan_cases(cases, np.ones(cases.batch_shape, bool))
         setpoints = plans.sample(RATE)
         return cls(
@@ -176,7 +187,10 @@ class Drives:
         )
 
     def renew(self, now: float, target: TurningPath) -> None:
-        """Plan again at a time [s], for targets predicted from then on."""
+        """Plan all drives again at the time `now` [s], for newly predicted targets.
+
+        Time 0 of the predicted paths is `now`.
+        """
         again = PLANNER.replanner()
         task = again.begin(self.cases, self.plans, now - self.began, target=target)
         plans = pj.plan(again, task)
@@ -195,7 +209,7 @@ class Drives:
         self.curvature[lanes, first:] = setpoints.curvature
 
     def judge(self, truth: InterceptCase) -> InterceptVerdict:
-        """Return the referee's verdict on the whole drives, against the true targets."""
+        """Judge the whole drives against the true targets; return the referee's verdict."""
         loose = dataclasses.replace(truth, tolerance=np.full_like(truth.tolerance, SUCCESS))
         whole = dataclasses.replace(
             self.plans,
@@ -208,12 +222,12 @@ class Drives:
 
 
 def drive(cases: InterceptCase, observed: Observations | None, until: float) -> Drives:
-    """Drive B cases, and re-plan at every observation before a time [s].
+    """Simulate the drives of B cases, which are planned again at every observation.
 
     Args:
-        cases: the true cases.
-        observed: observations of the targets; None if the targets are known.
-        until: [s]; 0 drives the first plans.
+        cases: the cases with the true targets.
+        observed: observations of the targets; None if the planner knows the true targets.
+        until: [s], time after which drives are not planned again; 0 for no re-planning.
     """
     if observed is None:
         return Drives.start(cases)
@@ -229,9 +243,17 @@ def report(
     truth: InterceptCase,
     turning: np.ndarray,
 ) -> None:
-    """Print a line for each row and kind of target, (B,) bool, and which drives failed."""
+    """Judge all drives; print a line for each row and kind of target, and list failed drives.
+
+    Args:
+        bench: prints the lines.
+        rows: name -> drives of this row, and their duration on this machine [s].
+        truth: the cases with the true targets.
+        turning: (B,) bool, whether the target turns.
+    """
     verdicts = {name: drives.judge(truth) for name, (drives, _) in rows.items()}
-    # Cases that no row solves, not even with a known target, are left out of the last share.
+    # The share "success of the solvable" leaves out cases that no row solves, not even the row with
+    # known targets.
     solvable = np.any([verdict.success for verdict in verdicts.values()], axis=0)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         if not solvable[is_of_mode].any():
@@ -279,7 +301,10 @@ def report(
 def report_bound(
     bench: Bench, observed: Observations, truth: InterceptCase, turning: np.ndarray
 ) -> None:
-    """Print the predictor's share within the success radius at the case's time, and the bound's."""
+    """Print the share of first predictions within `SUCCESS` of the target at the case's time.
+
+    The share of the best unbiased predictor, by the Cramer-Rao bound, is printed too.
+    """
     times = np.asarray(truth.time)
     there = positions(truth.target, times)
     off = np.linalg.norm(positions(observed.paths(0.0), times) - there, axis=1)
@@ -297,7 +322,7 @@ def report_bound(
 
 
 def main() -> None:
-    """Print the table, and the results of the predictor alone."""
+    """Simulate all three rows, print the table, and print how accurate the predictions are."""
     parser = argument_parser("intercept_predicted", __doc__, num=40, seed=0)
     parser.add_argument("--suite", choices=SUITES, default="hard", help="default: hard")
     options = parser.parse_args()

@@ -1,20 +1,25 @@
-"""Measure errors of predicted targets, beside Table I of [Qu2022], its polynomials and a bound.
+"""Measure errors of predicted target positions, and compare methods with Table I of [Qu2022].
 
     python -m benchmarks.intercept_prediction [--num 20000] [--seed 0] [--out DIR]
 
 Targets are observed 15 times, once a second up to time 0, with noise of 0.1 m on each coordinate
-(Section V-A), and predicted 0, 5, 10 and 15 s ahead. Straight and turning targets move at 0.2 to
-0.5 m/s, which keeps them on the paper's map; turning ones turn at 0.03 to 0.1 rad/s. The paper's
-own curve accelerates by 0.4 m/s every second, which neither of our two models describes. Errors are
-means. Relative errors are divided by the mean distance from the map's corner. The paper states
-neither the origin of its distances nor its polynomial degree, but its errors grow like those with
-degree 2.
+[Qu2022, Section V-A]. Their positions are predicted 0, 5, 10 and 15 s ahead. The methods are
+polynomials of degree 1 to 3 as in the paper, least-squares turns, and the function `select`, which
+decides whether a target is straight or turning. The table also has the Cramer-Rao bound, a lower
+bound on the errors of unbiased predictions.
 
-The summary's success is the share of `select` predictions within 0.3 m at 10 s, for straight and
-turning targets. The time is of one prediction on one core, compiled before, from arrays on the host
-to arrays on the host. The prior of `select` was tuned with other seeds. The mean error of 1,000
-turning targets at 10 s has a standard error of 0.01 m, which exceeds the differences between some
-methods.
+Straight and turning targets move at 0.2 to 0.5 m/s, which keeps them on the paper's map. Turning
+targets turn at 0.03 to 0.1 rad/s. A third kind follows the paper's example curve, which accelerates
+by 0.4 m/s every second; neither a straight path nor a turn describes it. Errors are means. For the
+relative error, the mean error is divided by the mean distance of the targets from the map's corner.
+The paper states neither the origin of its distances nor the degree of its polynomials. Its errors
+grow with time as errors of degree 2 do.
+
+The summary's success is the share of predictions by `select` within 0.3 m at 10 s, for straight and
+turning targets. The time is for one prediction on one core without compilation, from arrays on the
+host to arrays on the host. The prior of `select` was tuned with other seeds. The mean error of
+1,000 turning targets at 10 s has a standard error of 0.01 m. Some methods differ by less, so use
+many more targets to compare them.
 """
 
 import os
@@ -32,11 +37,11 @@ from planner_jax.sims.prediction.polynomial_fit import fit_polynomial
 from planner_jax.sims.prediction.select_path import chance_within, mean_position, select
 from planner_jax.sims.prediction.turn_fit import fit_turn
 
-TIMES = np.arange(-14.0, 1.0, dtype=np.float32)  # [s], of the observations
-AHEAD = np.array([0.0, 5.0, 10.0, 15.0], np.float32)  # [s]
-MEETING = 2  # index in AHEAD of the time at which shares are counted
-NOISE, MAP = 0.1, 8.0  # [m]
-RADII = (0.3, 0.5)  # [m]
+TIMES = np.arange(-14.0, 1.0, dtype=np.float32)  # [s] Times of the observations.
+AHEAD = np.array([0.0, 5.0, 10.0, 15.0], np.float32)  # [s] Times of the predicted positions.
+MEETING = 2  # Index into AHEAD of the time for which shares of small errors are counted.
+NOISE, MAP = 0.1, 8.0  # [m] Standard deviation of a coordinate, and side of the square map.
+RADII = (0.3, 0.5)  # [m] Shares of errors below these distances are counted.
 MODES = {
     "straight": "straight targets",
     "turning": "targets with a constant turn rate",
@@ -54,7 +59,7 @@ METHODS = (
 
 
 def draw(mode: str, num: int, seed: int) -> tuple[Any, np.ndarray]:
-    """Draw paths of targets, leaves (num, ...), and noisy observations (num, 15, 2) [m]."""
+    """Draw `num` targets of one kind; return their paths and observations (num, 15, 2) [m]."""
     rng = np.random.default_rng([seed, list(MODES).index(mode)])
     speed, heading = rng.uniform(0.2, 0.5, num), rng.uniform(-np.pi, np.pi, num)
     rate = rng.uniform(0.03, 0.1, num) * rng.choice([-1.0, 1.0], num) * (mode == "turning")
@@ -84,8 +89,9 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 
     Returns:
         off: (methods, 4) [m], distances of the predictions from the true positions.
-        nearer: () probability that `select` assigned to a smaller distance at the meeting.
-        residual: () [m], of `select`.
+        nearer: () probability, computed by `select`, that the error 10 s ahead is smaller than the
+            actual error.
+        residual: () [m], deviation of the observations from the path that `select` chose.
         is_turning: () bool, whether `select` chose a turn.
     """
     chosen, tested = select(TIMES, seen, NOISE), select(TIMES, seen, NOISE, threshold=6.6)
@@ -101,9 +107,10 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 @jax.jit
 @jax.vmap
 def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
-    """Return mean distances (4,) [m] at the Cramer-Rao bound.
+    """Return mean errors (4,) [m] of the best unbiased prediction, at the times `AHEAD`.
 
-    Also returns the shares within the radii (2,) at the meeting.
+    The covariance of this prediction is the Cramer-Rao bound. Also returns the probabilities (2,)
+    that its error 10 s ahead is below each of `RADII`.
     """
 
     def least(time: Any) -> jax.Array:
@@ -118,7 +125,7 @@ def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
 
 
 def report(bench: Bench, mode: str, num: int, seed: int) -> None:
-    """Predict the targets of one mode, and print their table."""
+    """Predict `num` targets of one kind with all methods, and print the table of errors."""
     paths, seen = draw(mode, num, seed)
     truth = np.asarray(places(paths, AHEAD))
     off, nearer, residual, turning = map(np.asarray, predict(truth, seen))
@@ -172,7 +179,7 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
 
 
 def latency(bench: Bench, num: int, seed: int) -> None:
-    """Measure predictions one at a time, each of another target, with their probabilities."""
+    """Report the time of one prediction with its probability of success, over many targets."""
 
     @jax.jit
     def one(seen: jax.Array) -> tuple[TurningPath, jax.Array]:
@@ -197,7 +204,7 @@ def latency(bench: Bench, num: int, seed: int) -> None:
 
 
 def main() -> None:
-    """Print a table for each kind of target, and the time of one prediction."""
+    """Print a table of errors for each kind of target, and the time of one prediction."""
     parser = argument_parser("intercept_prediction", __doc__, num=20000, seed=0)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads

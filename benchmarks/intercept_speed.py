@@ -1,15 +1,23 @@
-"""Compare speed planners along a given path, including the planners of [Qu2022, Table II].
+"""Compare planners of the speed along a given path, as in [Qu2022, Table II].
 
     python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
 
-The problems are drawn with a seed. All planners share the dynamic programming, cost, limits and
-end. They differ in how polygons become bounds. A plan is good if its status is CONVERGED and it
-meets no polygon at any millisecond. Acceleration and jerk are means over good plans, clearance is
-the minimum. The second table compares pairs on the problems where both are good. Times are of one
-problem at a time, compiled before, from its arrays to the plan's arrays; the planners take turns.
---batch adds the rate at which the device solves a batch. With the extra `peers`, Clarabel and OSQP
-solve the quadratic programs of the trapezoids too. The cost gap of the summary is relative to
-Clarabel's cost.
+In the graph of station (distance along the path) over time, moving obstacles are polygons. A
+planner first finds a line between the polygons by dynamic programming. Then it minimises the
+acceleration by a quadratic program, whose bounds keep the curve on the same side of each polygon.
+All planners use the same dynamic programming, cost, limits and end. They differ in the bounds:
+trapezoids, rectangles, or the bounds of the planner `em`.
+
+Problems are drawn with a seed. A plan is good if its status is CONVERGED and its curve is outside
+of every polygon, checked every millisecond. The first table has means of acceleration and jerk over
+good plans, and the least distance from a polygon. The second table compares pairs of planners on
+the problems where both plans are good. Times are for one problem at a time without compilation,
+from the problem's arrays to the plan's arrays. The planners take turns, so that other load affects
+all of them.
+
+With --batch the program also prints how many problems per second the device solves in a batch. With
+the extra `peers`, the solvers Clarabel and OSQP solve the quadratic programs of `trapezoid` and
+`em` too. The cost gap of the summary is relative to Clarabel's cost.
 """
 
 import dataclasses
@@ -38,10 +46,11 @@ from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
 
-PIECES = (10, 20)
+PIECES = (10, 20)  # Numbers of pieces of the planned curve.
 CONSTANT = "constant speed"
 OURS = "this library"
-# Each planner with its reference, compared on the problems where both are good.
+# Pairs of a planner and a reference planner, which are compared on problems where both plans are
+# good.
 PAIRS = (
     ("trapezoid", "em"),
     ("trapezoid-edges", "em"),
@@ -63,7 +72,10 @@ class Judged:
 
 
 def planners() -> dict[str, SpeedPlanner]:
-    """Return every planner with every number of pieces; samples stay 0.1 s apart for 10 s."""
+    """Return every speed planner with every number of pieces, by name.
+
+    Planners whose bounds apply to samples always have 100 samples, 0.1 s apart for 10 s.
+    """
     return {
         f"{name}, {pieces}": dataclasses.replace(
             planner, pieces=pieces, samples=planner.samples and 100 // pieces
@@ -74,13 +86,20 @@ def planners() -> dict[str, SpeedPlanner]:
 
 
 def constant_speed(problem: StationTimeProblem, degree: int = 5) -> BezierCurve:
-    """Return the curve of constant speed, which ignores polygons and the initial speed."""
+    """Return a curve of constant speed to the end, without regard to polygons and initial speed."""
     points = jnp.linspace(0.0, 1.0, degree + 1)[None] * problem.end_station
     return BezierCurve(points=points, horizon=problem.horizon)
 
 
 def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
-    """Evaluate curves (B, K, n + 1) at every millisecond, in double precision."""
+    """Compute accelerations, errors and clearances of B planned curves, in double precision.
+
+    Args:
+        problems: a batch of B problems.
+        points: (B, K, n + 1), control points of K pieces of degree n. The curves are evaluated
+            every millisecond.
+        solved: (B,) bool, whether the planner reports the problem as solved.
+    """
     pieces, degree = points.shape[1], points.shape[2] - 1
     horizon = float(problems.horizon[0])
     times = np.linspace(0.0, horizon, round(1000 * horizon) + 1)
@@ -117,11 +136,15 @@ def judge(problems: Any, points: np.ndarray, solved: np.ndarray) -> Judged:
 
 
 def run_in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, dict]:
-    """Run every function on the batch elements, one at a time and in random turns.
+    """Call every function on every problem, one at a time, in a random order of the functions.
+
+    Args:
+        runs: functions by name.
+        lanes: arguments of the functions, one tuple for each of N problems.
 
     Returns:
-        results: by name, NumPy, stacked over the batch elements.
-        seconds: by name, (N,), the fastest of three calls, because other programs may be running.
+        results: by name, with NumPy leaves that are stacked over the problems.
+        seconds: by name, (N,) [s], the fastest of three calls, because other programs may run too.
     """
     seconds = {name: np.full(len(lanes), np.inf) for name in runs}
     results: dict[str, list] = {name: [] for name in runs}
@@ -143,13 +166,13 @@ def run_in_turns(runs: dict[str, Callable], lanes: list[tuple]) -> tuple[dict, d
 
 
 def split_batches(*batches: Any) -> list[tuple]:
-    """Split batches into their elements, on the device."""
+    """Split batches of equal size into tuples of their elements, with arrays on the device."""
     num = len(jax.tree.leaves(batches)[0])
     return [jax.tree.map(lambda leaf, k=k: jnp.asarray(leaf[k]), batches) for k in range(num)]
 
 
 def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
-    """Print one row a planner; return the results."""
+    """Plan all problems with every planner, print one row a planner, and return the results."""
     named = planners()
     single = {
         name: jax.jit(lambda problem, planner=planner: plan_speed(problem, planner))
@@ -192,7 +215,7 @@ def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
 def _compare_pairs(
     bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]
 ) -> list[str]:
-    """Return the table of pairs, on problems where both planners are good."""
+    """Return the table that compares pairs of planners, on problems where both plans are good."""
     lines = [
         "| planner and reference | both good | good, difference | rms acc. | peak acc. "
         "| time, median |",
@@ -220,7 +243,10 @@ def _compare_pairs(
 
 
 def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
-    """Print results of the programs beside the peers' solvers; return cost gaps to Clarabel."""
+    """Solve the planners' quadratic programs with this library, Clarabel and OSQP; print a table.
+
+    Returns the relative excess of this library's costs over Clarabel's costs.
+    """
     bench.say(
         "",
         "| program of | solver | solved | cost above Clarabel's, median / 95 % / largest "
@@ -253,7 +279,10 @@ def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
 
 
 def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
-    """Solve a planner's programs with all solvers; return solved, costs and seconds by solver."""
+    """Solve a planner's quadratic programs for all problems with every installed solver.
+
+    Returns by solver which programs are solved (B,), the costs (B,) and the durations (B,) [s].
+    """
     programs = jax.jit(jax.vmap(lambda problem: program_of(problem, planner)))(problems)
     template = speed_template(planner)
     solve = jax.jit(lambda *program: solve_qp(template, *program))
@@ -266,7 +295,8 @@ def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
     for peer, make in PEERS.items():
         if is_installed(peer):
             run = make(speed_matrices(planner))
-            # All programs before any again: a solver may start at its previous solution.
+            # A solver may start at its previous solution. Therefore no program is solved twice in
+            # succession: all programs are solved once before any program is repeated.
             tries = [[run(*program) for program in on_host] for _ in range(3)]
             rows[peer] = (
                 np.array([each.solved for each in tries[0]]),
@@ -277,12 +307,12 @@ def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
 
 
 def program_of(problem: Any, planner: SpeedPlanner) -> tuple:
-    """Return the right-hand sides and bounds of a planner's program for one problem."""
+    """Return right-hand sides and bounds of a planner's quadratic program for one problem."""
     return speed_bounds(problem, reference_line(problem, planner.grid), planner)
 
 
 def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
-    """Print plans and programs per second, for one batch on the device."""
+    """Print how many plans, and how many quadratic programs alone, a device solves per second."""
     places = np.arange(batch) % len(problems.horizon)
     many = jax.device_put(jax.tree.map(lambda leaf: leaf[places], problems))
     bench.say("", "| batch | planner, pieces | plans/s | programs alone, 1/s |")
@@ -309,7 +339,7 @@ def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
 
 
 def main() -> None:
-    """Print the tables."""
+    """Draw the problems, and print the tables of planners, solvers and batches."""
     parser = argument_parser("intercept_speed", __doc__, num=500, seed=0)
     parser.add_argument(
         "--batch", type=at_least(0), default=0, help="problems in a batch; default: 0, no batch"

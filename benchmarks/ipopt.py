@@ -1,24 +1,26 @@
-"""Compare planners with IPOPT on the same problems: plans per second on one core, at equal cost.
+"""Compare the speed of the planners with IPOPT on the same problems, at equal cost of the plans.
 
     python -m benchmarks.ipopt [--num 200] [--tune 20] [--seed 0] [--repeat 3] [--batch N]
         [--tasks hit,catch] [--out DIR]
 
-The planner is `exact` with each effort, on hits of the suite `court` and catches of one ball
-(`throws`). It plans one case at a time on one core, and batches on JAX's first device. IPOPT runs
-through CasADi (the extra `oracle`) on one core. Its problem has the same decision variables,
-initial guess, objective and samples, implemented independently from the definitions (`ipopt_peer`),
-with exact derivatives and MUMPS. There are two forms: limits as constraints, satisfied as the
-planners' statuses require, or the planner's own penalties in the objective. IPOPT's settings are
-tuned on other cases. For each form the fastest setting without a loss of quality is used, and
-printed.
+The planner is `exact` with each of its efforts, on hits of the suite `court` and on catches of one
+ball. It plans one case at a time on one core, and batches on JAX's first device. IPOPT runs through
+CasADi (the extra `oracle`) on one core, with exact derivatives and the linear solver MUMPS. Its
+problem has the same decision variables, initial guess, objective and samples, but is implemented
+independently in `ipopt_peer`. It has two forms. In the form "limits", limits are constraints. In
+the form "penalties", limits are penalties in the objective, as in the planner. IPOPT's settings are
+tuned on other cases: for each form, the fastest setting without a loss of quality is used.
 
-The cost of a plan consists of snap and time alone, in float64 for all. Its gap is relative to the
-least cost of any accepted plan of the case in this run. Times on one core are CPU times, on which
-other load of the machine has little effect, without compiling and building; for each case the
-fastest of --repeat tries counts. IPOPT reaches a planner's plan at its first iterate that satisfies
-the limits and costs no more, within 0.01 %. The compared cost is the planner's objective if IPOPT
-minimises it. The time until then is the share of iterates, times the duration of a search to a
-tolerance of 1e-6, or the whole duration if no iterate qualifies. IPOPT need not detect this itself.
+The cost of a plan is the weighted sum of its squared snap and its time, in float64. Its gap is
+relative to the least cost of any accepted plan of the case in this run. Times on one core are CPU
+times without compilation, because other load of the machine has little effect on CPU times. For
+each case the fastest of --repeat tries counts.
+
+To compare at equal cost, the program finds the first iterate of IPOPT that keeps the limits and
+costs at most 0.01 % more than the planner's plan. In the form "penalties" the cost is the planner's
+objective. IPOPT's time is the duration of a search to a tolerance of 1e-6, times the share of its
+iterates up to that iterate, or the whole duration if there is no such iterate. This favours IPOPT,
+which would not know when to stop.
 """
 
 import dataclasses
@@ -46,33 +48,34 @@ from planner_jax.trajectory.polynomial import snap_energy
 
 # Task -> suite, and the module that defines its problem.
 TASKS = {"hit": ("court", "hits"), "catch": ("throws", "catches")}
-BATCH, GPU_BATCH = 1024, 65536
-# Greatest speed-up of the batched interior-point solver jaxipm over IPOPT: [Viljoen2026],
-# quadrotors on one L40S.
+BATCH, GPU_BATCH = 1024, 65536  # Batch sizes on a CPU and on other devices.
+# Greatest published speed-up of the batched interior-point solver jaxipm over IPOPT, measured with
+# quadrotors on one GPU of type L40S [Viljoen2026].
 JAXIPM = 32.85
-TIGHTEST = 1e-6  # tolerance of the searches whose iterates are evaluated
-NO_MORE = 1e-4  # relative excess of a cost over another that counts as equal
+TIGHTEST = 1e-6  # Tolerance of the searches by IPOPT whose iterates are compared with plans.
+NO_MORE = 1e-4  # A relative excess of one cost over another up to this value counts as equal.
 
 
 @dataclasses.dataclass
 class Found:
-    """Results of one solver on all cases."""
+    """Costs, success and times of one solver on B cases."""
 
     name: str
-    cost: np.ndarray  # (B,), of snap and time
-    objective: np.ndarray | None  # (B,), the planner's, with penalties; None if not minimised
-    accepted: np.ndarray  # (B,) bool, by the referee
-    seconds: np.ndarray  # (B,), CPU time, one after another on one core
-    in_batch: float | None = None  # plans per second
+    cost: np.ndarray  # (B,), cost of snap and time, without penalties
+    # (B,), the planner's objective with penalties; None if the solver does not minimise it
+    objective: np.ndarray | None
+    accepted: np.ndarray  # (B,) bool, whether the referee accepts the plan
+    seconds: np.ndarray  # (B,) [s], CPU times of single cases on one core
+    in_batch: float | None = None  # plans per second in a batch; None if not measured
 
 
 class Setup:
-    """Cases of a task with the parameters of IPOPT's problems, in float64.
+    """Drawn cases of a task, and the parameters of the same problems for IPOPT, in float64.
 
     Args:
-        name: of the task.
+        name: name of the task.
         num: number of cases.
-        seed: with which the cases are drawn.
+        seed: seed with which the cases are drawn.
     """
 
     def __init__(self, name: str, num: int, seed: int):
@@ -103,21 +106,21 @@ class Setup:
             self._objective = jax.jit(jax.vmap(self.planner.objective))
 
     def plans(self, points: np.ndarray) -> Any:
-        """Return the plans of points (B, n), float64 NumPy leaves."""
+        """Convert decision variables (B, n) to plans, with NumPy leaves in float64."""
         with jax.enable_x64(True):
             return jax.tree.map(np.asarray, self._decode(jnp.asarray(points), self.contexts))
 
     def objective(self, points: np.ndarray) -> np.ndarray:
-        """Return the planner's objective, including penalties, at points (B, n); (B,)."""
+        """Return the planner's objective with penalties (B,) at decision variables (B, n)."""
         with jax.enable_x64(True):
             return np.asarray(self._objective(jnp.asarray(points), self.contexts).cost)
 
     def judge(self, plans: Any) -> np.ndarray:
-        """Return which plans the referee accepts, (B,) bool."""
+        """Return for each plan whether the referee accepts it, (B,) bool."""
         return np.asarray(self.card.judge(self.cases, plans).success)
 
     def cost(self, plans: Any) -> np.ndarray:
-        """Return the cost of snap and time of plans, (B,)."""
+        """Return the costs (B,) of the plans' snap and time, in float64 and without penalties."""
         with jax.enable_x64(True):
             path = jax.tree.map(lambda x: jnp.asarray(np.asarray(x), float), plans.trajectory)
             cost = self.planner.energy_weight * np.asarray(jax.vmap(snap_energy)(path))
@@ -129,14 +132,18 @@ class Setup:
 def run_planner(
     setup: Setup, effort: str, repeat: int, batch: int, seed: int
 ) -> tuple[Found, float]:
-    """Run the planner with an effort; return results and the duration of the first call."""
+    """Plan with one effort, one case at a time on a CPU core and in a batch on JAX's first device.
+
+    Returns the results, and the duration [s] of the first call, which compiles.
+    """
     planner = setup.card.planner("exact", effort=effort, **setup.card.bench)
     num, host = len(setup.batches["learned"].starts), jax.devices("cpu")[:1]
     lanes = [pj.take(setup.cases, k) for k in range(num)]
     began = time.perf_counter()
     pj.plan(planner, lanes[0], devices=host)
     first = time.perf_counter() - began
-    plans = [pj.plan(planner, case, devices=host) for case in lanes]  # compiles all rounds
+    # This loop compiles all searches that the cases need.
+    plans = [pj.plan(planner, case, devices=host) for case in lanes]
     seconds = np.full(num, np.inf)
     for _ in range(repeat):
         for k, case in enumerate(lanes):
@@ -167,17 +174,17 @@ def run_planner(
 def seconds_to(
     setup: Setup, peer: Any, paths: list[np.ndarray], whole: np.ndarray, run: Found
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the time that IPOPT takes to a feasible plan at no more than the planner's cost.
+    """Return the times in which IPOPT reaches a feasible plan that costs no more than the planner's.
 
     Args:
         setup: the cases.
-        peer: solver of the iterates.
-        paths: the iterates (S, n) of each case.
-        whole: (B,) [s], duration of each search.
+        peer: IPOPT, which computed the iterates.
+        paths: the iterates (S, n) of IPOPT for each case.
+        whole: (B,) [s], duration of each search by IPOPT.
         run: results of the planner.
 
     Returns:
-        The times (B,) [s], and which plans are reached, (B,) bool.
+        The times (B,) [s], and whether IPOPT reaches such a plan, (B,) bool.
     """
     worst, params = peer.programs[False].worst, setup.batches["learned"].params
     by_objective = peer.form == "penalties"
@@ -197,7 +204,7 @@ def seconds_to(
 
 
 def measure(bench: Bench, name: str, options: Any) -> None:
-    """Print all rows of one task."""
+    """Tune IPOPT, run planner and IPOPT on one task, and print all tables of this task."""
     peer_module: Any = importlib.import_module("planner_jax.benchmarks.ipopt_peer.peer")
     setup = Setup(name, options.num, options.seed)
     tuning = Setup(name, options.tune, options.seed + 1)
@@ -269,7 +276,10 @@ def measure(bench: Bench, name: str, options: Any) -> None:
 
 
 def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
-    """Print a row a solver; return the gaps of the planner's efforts."""
+    """Print a row for each solver: success, costs above the least cost of any solver, and speed.
+
+    Returns the relative excess costs of the planner, an array for each effort.
+    """
     bench.say(
         "",
         "| solver | refereed | cost above the least (median, p90, p99) | planner's objective above "
@@ -304,7 +314,7 @@ def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarr
 
 
 def _format_quantiles(gap: np.ndarray | None) -> str:
-    """Format three quantiles in per cent."""
+    """Format the median, 90 % and 99 % quantile of relative costs in per cent."""
     if gap is None or not gap.size:
         return "-"
     return ", ".join(f"{100.0 * (each or 0.0):.2f} %" for each in gap_figures(gap).values())
@@ -313,7 +323,10 @@ def _format_quantiles(gap: np.ndarray | None) -> str:
 def _report_equal_costs(
     bench: Bench, setup: Setup, efforts: dict, peers: dict, kept: dict, repeat: int
 ) -> None:
-    """Print plans/s up to the planner's cost, for each effort, form and initial guess."""
+    """Print how fast IPOPT reaches the cost of the planner, relative to the planner's own speed.
+
+    There is a row for each effort of the planner, form of IPOPT's problem, and initial guess.
+    """
     bench.say(
         "",
         f"At the same cost; the planner's own initial guess is the learned one. jaxipm has up to "
@@ -354,7 +367,7 @@ def _report_equal_costs(
 
 
 def main() -> None:
-    """Print the rows."""
+    """Parse the arguments, and compare planner and IPOPT on each requested task."""
     parser = argument_parser("ipopt", __doc__, num=200, tune=20, seed=0, repeat=3)
     parser.add_argument(
         "--tasks", default=",".join(TASKS), help="comma-separated; default: %(default)s"

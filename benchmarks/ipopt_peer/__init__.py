@@ -1,1 +1,4 @@
-"""The problems of the `exact` planners in CasADi's symbols, for IPOPT."""
+"""The problems of the planners `ExactHit` and `ExactCatch`, written with CasADi for IPOPT.
+
+`benchmarks.ipopt` uses them to compare the planners with IPOPT.
+"""

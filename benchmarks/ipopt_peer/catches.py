@@ -1,4 +1,7 @@
-"""The problem of `ExactCatch` with one ball in CasADi's symbols, after [Yu2023catch]."""
+"""The problem of `ExactCatch` with one ball, written with CasADi for IPOPT [Yu2023catch].
+
+`benchmarks.ipopt` loads this module by its name.
+"""
 
 import math
 from typing import Any
@@ -6,9 +9,9 @@ from typing import Any
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 
-RIM = 0.9  # share of the net's radius that a planned catch may use
+RIM = 0.9  # A planned catch is within this share of the net's radius from its centre.
 
-# Parameters of a catch, and their numbers of values; SI units.
+# Names of a catch's parameters, in SI units -> count of numbers.
 SIZES = {
     "gravity": 1,
     "speed": 1,
@@ -29,7 +32,10 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Return the parameters of one context with one ball (NumPy leaves), by name."""
+    """Collect the parameters `SIZES` of one case by name, from the planner's prepared data.
+
+    `context` is the result of the planner's `prepare` for a case with one ball, with NumPy leaves.
+    """
     case, path = context.case, context.targets
     found = {"ball_pos": path.ball.pos, "ball_vel": path.ball.vel}
     found |= {"ball_drag": path.drag, "ball_gravity": path.gravity, "horizon": context.horizon}
@@ -39,7 +45,7 @@ def read_params(context: Any) -> dict[str, Any]:
 
 
 def make_problem(planner: Any) -> Problem:
-    """Return the problem of an `ExactCatch` for one ball."""
+    """Define the optimisation problem of an `ExactCatch` for one ball, with its settings."""
     return Problem(
         planner=planner,
         sizes=SIZES,
@@ -65,10 +71,11 @@ def ball_at(time: Any, params: dict) -> tuple[Any, Any]:
 
 
 def ends(natural: Any, params: dict, time_weight: float) -> tuple[Any, Any, list, Any]:
-    """Return the end of a catch.
+    """Compute the end of a trajectory at which the ball is caught, from the end's variables.
 
-    The variables are log T, position in the net, velocity, acceleration and jerk. Returns tail
-    state, duration, excesses and cost, as `Problem.ends`.
+    The variables `natural` are log T, the ball's position in the net (2), and velocity,
+    acceleration and jerk of the quadrotor (3 each). Returns the state at the end, the duration, the
+    relative excesses over the limits of the catch, and the cost, as specified by `Problem.ends`.
     """
     time, place = ca.exp(natural[0]), natural[1:3]
     pos, vel = ball_at(time, params)
@@ -92,7 +99,11 @@ def ends(natural: Any, params: dict, time_weight: float) -> tuple[Any, Any, list
 
 
 def limits(height: Any, vel: Any, acc: Any, jerk: Any, params: dict) -> list:
-    """Return squares of speed, body rate and thrust over their limits, less one; and height."""
+    """Return the excesses over the limits at one sample of the trajectory.
+
+    For speed, body rate and thrust the excess is the squared ratio to the limit, minus one, with
+    the opposite sign for the least thrust. The excess of the height is in metres.
+    """
     squared = ca.sumsqr(acc + ca.vertcat(0.0, 0.0, params["gravity"]))
     return [
         ca.sumsqr(vel) / params["speed"] ** 2 - 1.0,

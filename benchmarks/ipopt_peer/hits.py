@@ -1,4 +1,7 @@
-"""The problem of `ExactHit` in CasADi's symbols, from [Yu2023bat] and the planner's docstrings."""
+"""The problem of `ExactHit`, written with CasADi for IPOPT [Yu2023bat].
+
+`benchmarks.ipopt` loads this module by its name.
+"""
 
 from typing import Any
 
@@ -6,7 +9,7 @@ import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
-# Parameters of a hit, and their numbers of values; SI units.
+# Names of a hit's parameters, in SI units -> count of numbers.
 SIZES = {
     "gravity": 1,
     "speed": 1,
@@ -25,7 +28,11 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Return the parameters of one context (NumPy leaves), by name."""
+    """Collect the parameters `SIZES` of one case by name, from the planner's prepared data.
+
+    `context` is the result of the planner's `prepare` for the case, with NumPy leaves. It has a
+    table of the ball's path.
+    """
     case, path = context.case, context.path
     found = {"path_pos": path.pos, "path_vel": path.vel, "resolution": path.resolution}
     for source in (case, case.limits, case.hit_limits):
@@ -34,7 +41,7 @@ def read_params(context: Any) -> dict[str, Any]:
 
 
 def make_problem(planner: Any) -> Problem:
-    """Return the problem of an `ExactHit`."""
+    """Define the optimisation problem of an `ExactHit`, with its settings."""
     nodes = planner.num_table_nodes
     return Problem(
         planner=planner,
@@ -48,7 +55,10 @@ def make_problem(planner: Any) -> Problem:
 
 
 def keys_kernel(distance: Any) -> Any:
-    """Return Keys' kernel with a = -1/2 at a distance in nodes [Yu2023bat, eq. 10b]."""
+    """Return the weight of a table node in cubic convolution (Keys, a = -1/2) [Yu2023bat, eq. 10b].
+
+    `distance` is from the node to the interpolated point, in units of the node spacing.
+    """
     u = ca.fabs(distance)
     near = (1.5 * u - 2.5) * u * u + 1.0
     far = ((-0.5 * u + 2.5) * u - 4.0) * u + 2.0
@@ -56,7 +66,7 @@ def keys_kernel(distance: Any) -> Any:
 
 
 def ball_at(time: Any, params: dict, nodes: int) -> tuple[Any, Any]:
-    """Interpolate position and velocity of the incoming ball [Yu2023bat, eqs 8 to 10]."""
+    """Interpolate position and velocity of the incoming ball at a time [Yu2023bat, eqs 8 to 10]."""
     inside = ca.fmin(ca.fmax(time, 0.0), params["resolution"] * (nodes - 3))
     place = inside / params["resolution"] + 1.0
     weights = keys_kernel(place - ca.DM(np.arange(nodes)))
@@ -65,10 +75,12 @@ def ball_at(time: Any, params: dict, nodes: int) -> tuple[Any, Any]:
 
 
 def ends(natural: Any, params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
-    """Return the end of a hit.
+    """Compute the end of a trajectory at which the ball is hit, from the end's variables.
 
-    The variables are log T, log t_post, log thrust, two tangential speeds and jerk. Returns tail
-    state, duration, excesses and cost, as `Problem.ends`.
+    The variables `natural` are log T, the logarithms of the ball's flight time after the impact and
+    of the thrust, two speeds of the racket in its plane, and the jerk (3). Returns the state at
+    the end, the duration, the relative excesses over the limits of the hit, and the cost (zero), as
+    specified by `Problem.ends`.
     """
     time, flight, thrust = (ca.exp(natural[k]) for k in range(3))
     gravity, up = params["gravity"], ca.DM([0.0, 0.0, 1.0])
@@ -92,7 +104,11 @@ def ends(natural: Any, params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
 
 
 def limits(height: Any, vel: Any, acc: Any, jerk: Any, params: dict) -> list:
-    """Return squares of speed, acceleration, body rate over their limits, less one; and height."""
+    """Return the excesses over the limits at one sample of the trajectory.
+
+    For speed, acceleration and body rate the excess is the squared ratio to the limit, minus one.
+    The excess of the height is in metres.
+    """
     return [
         ca.sumsqr(vel) / params["speed"] ** 2 - 1.0,
         ca.sumsqr(acc) / params["acceleration"] ** 2 - 1.0,

@@ -1,4 +1,7 @@
-"""Run IPOPT on a batch, one case after another on one core, and record its iterates."""
+"""Run IPOPT on a batch of cases, one after another on one core, time it, and record its iterates.
+
+`benchmarks.ipopt` uses this module.
+"""
 
 import dataclasses
 import shutil
@@ -13,13 +16,16 @@ from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
 from planner_jax.core.protocol import take
 from planner_jax.cost.along import BETWEEN_NODES
 
-# MUMPS's ordering and scaling: its defaults, and the least effort, because the matrices are small.
+# Options of the linear solver MUMPS: its defaults, or neither scaling nor an expensive reordering,
+# because the matrices are small.
 _USUAL: dict[str, Any] = {}
 _PLAIN = {"mumps_scaling": 0, "mumps_permuting_scaling": 0, "mumps_pivot_order": 0}
 _ADAPTIVE = {"mu_strategy": "adaptive"}
-_NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}  # the starts are good
+# Options of IPOPT for initial guesses that are close to the optimum.
+_NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}
 _QUASI_NEWTON = {"hessian_approximation": "limited-memory", "max_iter": 100}
-# Form -> settings to try: tolerance, options, and whether the functions are compiled.
+# Form of the problem -> settings to try: (tolerance, options of IPOPT, whether the functions are
+# compiled C code).
 TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     "limits": (
         (1e-6, _PLAIN, True),
@@ -44,32 +50,36 @@ TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
         (1e-4, _PLAIN | _QUASI_NEWTON, True),
     ),
 }
-MOST_STEPS = 300
-# Relative excess over the least objective, in nine of ten cases, that counts as equal
+MOST_STEPS = 300  # Maximum number of IPOPT's iterations.
+# A setting is good enough if its objective exceeds the least objective of all settings by at most
+# this relative amount, in nine of ten cases.
 AS_GOOD = 1e-3
 
 
 @dataclasses.dataclass
 class Batch:
-    """Parameters of cases, and starting points."""
+    """B cases for IPOPT: their parameters and initial guesses."""
 
     params: np.ndarray  # (B, P), parameters of the cases
-    starts: np.ndarray  # (B, n)
+    starts: np.ndarray  # (B, n), initial guesses of the decision variables
 
 
 @dataclasses.dataclass
 class Solutions:
-    """IPOPT's results."""
+    """Results of IPOPT on B cases."""
 
-    points: np.ndarray  # (B, n)
-    objectives: np.ndarray  # (B,), IPOPT's own
-    seconds: np.ndarray  # (B,), CPU time
-    steps: np.ndarray  # (B,)
-    converged: np.ndarray  # (B,) bool
+    points: np.ndarray  # (B, n), decision variables at which IPOPT stopped
+    objectives: np.ndarray  # (B,), the objective that IPOPT minimised
+    seconds: np.ndarray  # (B,) [s], CPU time
+    steps: np.ndarray  # (B,), number of iterations
+    converged: np.ndarray  # (B,) bool, as reported by IPOPT
 
 
 def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
-    """Return the parameters of a task's programs for a batch of contexts, (B, P)."""
+    """Return the parameters (B, P) of IPOPT's problems for a batch of cases.
+
+    `contexts` are the planner's prepared data of the cases. `module` is `hits` or `catches`.
+    """
     contexts = jax.tree.map(np.asarray, contexts)
     sizes = module.make_problem(planner).sizes
     num = jax.tree.leaves(contexts)[0].shape[0]
@@ -78,7 +88,7 @@ def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
 
 
 class Peer:
-    """IPOPT on a planner's problem in one form.
+    """IPOPT on the problem of a planner, with limits as constraints or as penalties.
 
     Args:
         module: defines the task's problem, `hits` or `catches`.
@@ -102,7 +112,10 @@ class Peer:
     def solve(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch, repeat: int = 1
     ) -> Solutions:
-        """Solve all cases; the time of each case is the fastest of `repeat` tries."""
+        """Solve all cases with one setting; the fastest of `repeat` tries of a case is its time.
+
+        A setting is (tolerance, options of IPOPT, whether to use compiled C code).
+        """
         solver, options = self._solver(setting)
         solver(batch.starts[0], batch.params[0])  # IPOPT's first call initialises it
         found, seconds = [], np.full(len(batch.starts), np.inf)
@@ -125,7 +138,7 @@ class Peer:
     def iterates(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch
     ) -> list[np.ndarray]:
-        """Return the iterates (steps + 1, n) of each search; not timed."""
+        """Solve all cases without timing; return IPOPT's iterates (steps + 1, n) for each case."""
         size = batch.starts.shape[1]
         program = self.programs[False]
         callback = _Recorder(size, program.num_constraints, batch.params.shape[1])
@@ -145,7 +158,7 @@ class Peer:
 
 
 class _Recorder(ca.Callback):
-    """Callback that stores the iterates of IPOPT."""
+    """Callback that CasADi calls in each iteration of IPOPT, to store the iterate."""
 
     def __init__(self, size: int, constraints: int, params: int):
         ca.Callback.__init__(self)
@@ -175,15 +188,19 @@ class _Recorder(ca.Callback):
 
 
 def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
-    """Return the fastest setting with the highest success rate and a near-minimal objective.
+    """Select the fastest setting of IPOPT among those with the highest success rate.
+
+    The setting's objective must also be within `AS_GOOD` of the least objective of all settings, in
+    nine of ten cases. If no setting qualifies, the one with the least such excess is selected.
 
     Args:
-        peer: whose settings are tried.
+        peer: IPOPT on one form of the problem; the settings for this form are tried.
         batch: cases that are used for tuning only.
-        accepted: function of points (B, n); returns which of them the referee accepts, (B,) bool.
+        accepted: function that maps decision variables (B, n) to whether the referee accepts the
+            plan, (B,) bool.
 
     Returns:
-        The setting, and a row of figures for each tried setting.
+        The selected setting, and a row of figures for each tried setting.
     """
     tried = [each for each in TRIED[peer.form] if each[2] in peer.programs]
     found = [peer.solve(each, batch) for each in tried]

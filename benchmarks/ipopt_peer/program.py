@@ -1,14 +1,20 @@
-"""The nonlinear program of one minimum-snap segment with exact derivatives, for IPOPT.
+"""The nonlinear program of one minimum-snap trajectory with exact derivatives, for IPOPT.
 
-As in `ExactHit` and `ExactCatch`, the decision variables x are whitened waypoint offsets and a few
-variables of the ends. The ends determine boundary rows R and the mean duration h of a piece. Rows
-and offsets are the columns C of the trajectory, and its samples in time over h are constant
-matrices times C. Hence the ends are one small function, and the limits of a sample another one.
-CasADi differentiates both symbolically, and the chain rule through the matrices is written out
-here. If CasADi differentiated the whole program, the graph would be a hundred times larger, and
-IPOPT slower.
+`benchmarks.ipopt` compares the planners with IPOPT on this program. It has the decision variables x
+of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in scaled
+("whitened") coordinates, and a few variables that describe the state at the end of the trajectory.
+The program shares only the trajectory's constant matrices and the settings with the planners.
 
-Shares only the constant matrices of the trajectory and the settings with the planners.
+The program is computed in three steps:
+1. The variables of the end determine the boundary conditions: position to jerk at both ends, in
+   units of the mean duration h of a piece. They also determine h.
+2. Boundary conditions and offsets form the coefficients C of the trajectory. The samples of the
+   trajectory, in units of h, are constant matrices times C.
+3. The limits are evaluated at each sample.
+
+CasADi differentiates only the small functions of steps 1 and 3 symbolically. The chain rule through
+the matrices of step 2 is implemented here. If CasADi differentiated the whole program, its
+expression graph would be about a hundred times larger, and IPOPT slower.
 """
 
 import dataclasses
@@ -23,41 +29,50 @@ import numpy as np
 
 from planner_jax.cost.penalty import join_trapezoid_weights
 
-ca: Any = importlib.import_module("casadi")  # of the extra `oracle`
+ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extra `oracle`.
 
-ORDERS = 4  # from the extra `oracle`
-# Components of a sample: height, velocity, acceleration, jerk, each as (order, axis).
+ORDERS = 4  # Number of boundary conditions at each end: position, velocity, acceleration and jerk.
+# Components of a sample as (order of the derivative, axis): height, velocity, acceleration, jerk.
 PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
 COMPILER = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-shared")
 
 
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """Definition of a task's segment; all functions take and return CasADi symbols.
+    """Definition of the trajectory problem of a task, a hit or a catch.
 
-    `params` is a dict of the parameters of a case by name, as in `sizes`.
+    All functions take and return CasADi symbols. Their argument `params` is a dict of the
+    parameters of a case by name, with the lengths in `sizes`. An excess is positive if a limit is
+    exceeded.
     """
 
-    planner: Any  # an `ExactHit` or `ExactCatch`, for its settings
-    sizes: dict[str, int]  # parameters of a case, and their numbers of values
-    num_natural: int  # number of variables of the ends
-    # Function of these variables and `params`: tail state (4, 3), duration [s], list of excesses,
-    # cost.
+    planner: Any  # the `ExactHit` or `ExactCatch` whose settings are used
+    sizes: dict[str, int]  # names of the parameters of a case, with their numbers of values
+    num_natural: int  # number of variables that describe the end of the trajectory
+    # Function of these variables and `params`. Returns the state at the end (4, 3), the duration
+    # [s], a list of excesses over limits at the end, and a cost.
     ends: Callable[[Any, dict], tuple[Any, Any, list, Any]]
-    # Function of height, velocity, acceleration, jerk at a sample and `params`: list of excesses.
+    # Function of height, velocity, acceleration and jerk at a sample, and `params`. Returns a list
+    # of excesses over limits.
     limits: Callable[[Any, Any, Any, Any, dict], list]
-    factors: tuple[float, ...]  # factors of the planner's margin, for each of these excesses
-    impact_weight: float  # [s], weight of the hinges of the ends
+    factors: tuple[float, ...]  # factors of the planner's margin, one for each excess at a sample
+    impact_weight: float  # [s], weight of the penalties at the end
 
 
 def hinge(x: Any, width: float) -> Any:
-    """Return the smoothed hinge of [Yu2023catch, eq. 27b]."""
+    """Return a smooth approximation of max(x, 0), the penalty of an excess [Yu2023catch, eq. 27b].
+
+    It is 0 for x <= 0, and x - `width` / 2 for x >= `width`.
+    """
     blend = (width - 0.5 * x) * (x / width) ** 3
     return ca.if_else(x <= 0.0, 0.0, ca.if_else(x < width, blend, x - 0.5 * width))
 
 
 def rate_squared(acc: Any, jerk: Any, gravity: Any) -> Any:
-    """Return |omega|^2 of the Hopf fibration at zero heading, by differential flatness."""
+    """Return the squared body rate [rad^2/s^2] from acceleration and jerk, by flatness.
+
+    The attitude is given by the Hopf fibration at zero heading.
+    """
     thrust = acc + ca.vertcat(0.0, 0.0, gravity)
     squared = ca.fmax(ca.sumsqr(thrust), 1e-4)
     size = ca.sqrt(squared)
@@ -67,19 +82,19 @@ def rate_squared(acc: Any, jerk: Any, gravity: Any) -> Any:
 
 
 def body_axes(axis: Any) -> tuple[Any, Any]:
-    """Return the body x and y axes at zero heading for a body z axis."""
+    """Return the body's x and y axes from its z axis, by the Hopf fibration at zero heading."""
     x, y, z = axis[0], axis[1], axis[2]
     k = 1.0 / ca.fmax(1.0 + z, 1e-6)
     return ca.vertcat(1.0 - k * x * x, -k * x * y, -x), ca.vertcat(-k * x * y, 1.0 - k * y * y, -y)
 
 
 class Program:
-    """Program of a problem, built once for all of its cases.
+    """The nonlinear program of a problem with its derivatives, built once for all cases.
 
     Args:
-        problem: of a task.
-        penalised: whether limits are the planner's own penalties in the objective, not constraints.
-        backoff: excesses must be below -backoff if they are constraints.
+        problem: definition of the task's problem.
+        penalised: whether limits are penalties in the objective, as in the planner, or constraints.
+        backoff: margin of the constraints: every excess must be at most -backoff.
         compiled: whether functions are compiled C code, or run by CasADi's virtual machine.
     """
 
@@ -104,7 +119,10 @@ class Program:
             self.functions = self._compile()
 
     def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
-        """Return IPOPT on this program: a function of a start and parameters."""
+        """Return a function that runs IPOPT from an initial guess (n,) with parameters (P,).
+
+        The function returns CasADi's result and statistics. `callback` is called in each iteration.
+        """
         nlp, gradient, jacobian, hessian = self.functions
         settings: dict[str, Any] = {"print_level": 0, "sb": "yes", "linear_solver": "mumps"}
         given: dict[str, Any] = {"ipopt": settings | options, "print_time": False}
@@ -125,15 +143,17 @@ class Program:
         return solve_case
 
     def _split(self, vector: Any) -> dict:
-        """Split the parameters by name."""
+        """Split a vector of parameters into a dict of parameters by name."""
         ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
 
     def _lay_out(self) -> None:
-        """Define the order of the columns of the trajectory.
+        """Define the order of the trajectory's coefficients.
 
-        Columns are ordered by axis, for each axis rows and then offsets. x has the offsets ordered
-        by waypoint. The outer columns are the offsets, the inner ones are rows and then h.
+        Coefficients are ordered by axis; for each axis the boundary conditions come before the
+        offsets. In x the offsets are ordered by waypoint. Coefficients that are variables of x, the
+        offsets, are called outer. Boundary conditions, which depend on x through the function of
+        the end, are called inner, and h follows them.
         """
         planner, rows = self.problem.planner, 2 * ORDERS
         inside = planner.num_pieces - 1
@@ -145,9 +165,10 @@ class Program:
         self._scale = ca.DM(planner.scale).T
 
     def _build_ends(self) -> None:
-        """Build the function of the ends, its slopes, and the Hessian of weighted outputs.
+        """Build the function of the end's variables, its Jacobian, and its weighted Hessian.
 
-        The outputs are rows by axis and the duration, cost, and excesses.
+        Its outputs are the boundary conditions by axis, the mean duration of a piece, the cost, and
+        the excesses at the end.
         """
         problem, planner = self.problem, self.problem.planner
         natural = ca.SX.sym("natural", problem.num_natural)
@@ -177,10 +198,10 @@ class Program:
         self._ends_bend = ca.Function("ends_bend", [*given, weights], [bend])
 
     def _build_limits(self) -> None:
-        """Build the functions of a sample's limits, mapped over all samples.
+        """Build the functions of the limits at a sample with derivatives, mapped over all samples.
 
-        Their inputs are the sample in time over h, h, and the parameters. If limits are penalties,
-        they are one value: the sum of their hinges times h.
+        Their inputs are the sample in units of h, h itself, and the parameters. If limits are
+        penalties, the functions return one value: the sum of the sample's penalties times h.
         """
         planner, factors = self.problem.planner, self.problem.factors
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
@@ -214,29 +235,35 @@ class Program:
         self._bends = map_samples("bends", [multipliers], [ca.densify(gradient), filled(bend)])
 
     def _point(self) -> tuple[Any, Any, Any, Any]:
-        """Return symbols of x and parameters; variables of the ends, and offsets (M - 1, 3)."""
+        """Return symbols of x and of the parameters, and split x.
+
+        The parts are the unscaled variables of the end, and the waypoint offsets (M - 1, 3).
+        """
         num = self.problem.planner.num_offsets
         x, params = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("params", self.num_params)
         natural = x * self._scale.T
         return x, params, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
 
     def _columns(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
-        """Return columns (C, 3) and h, from the outputs of the ends and the offsets."""
+        """Return the trajectory's coefficients (C, 3), and the mean duration h of a piece [s]."""
         rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
         return columns, outward[3 * rows]
 
     def _offset_energy(self, offsets: Any, h: Any) -> Any:
-        """Return the energy cost of the offsets."""
+        """Return the weighted snap energy of the offsets, which adds to the smoothest energy."""
         return self._own * ca.sumsqr(offsets) / h**self._power
 
     def _to_x(self, by_outer: Any, by_natural: Any) -> Any:
-        """Convert slopes by offsets, ordered by axis, and by ends to slopes (R, n) by x."""
+        """Convert derivatives by offsets, ordered by axis, and by the end's variables.
+
+        Returns derivatives by x, (R, n).
+        """
         wide = ca.horzcat(by_outer[:, self._place], by_natural)
         return wide * ca.repmat(self._scale, wide.shape[0], 1)
 
     def _worst(self) -> Any:
-        """Build the function of the largest excess at a point, over samples and ends."""
+        """Build a function of x that returns the largest excess over a limit on the trajectory."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends = self._ends(natural, params)
         columns, h = self._columns(outward, offsets)
@@ -244,7 +271,7 @@ class Program:
         return ca.Function("worst", [x, params], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
 
     def _nlp(self) -> Any:
-        """Build objective and constraints: limit by limit at all samples, then at the ends."""
+        """Build the objective and the constraints: each limit at all samples, then at the end."""
         x, params, natural, offsets = self._point()
         outward, core, at_ends = self._ends(natural, params)
         columns, h = self._columns(outward, offsets)
@@ -257,7 +284,7 @@ class Program:
         return ca.Function("nlp", [x, params], [f, g], ["x", "p"], ["f", "g"])
 
     def _gradient(self) -> Any:
-        """Build the objective and its slopes by x."""
+        """Build the objective and its gradient with respect to x."""
         x, params, natural, offsets = self._point()
         outward, core, _, by_natural = self._ends_slopes(natural, params)
         columns, h = self._columns(outward, offsets)
@@ -277,7 +304,7 @@ class Program:
         return ca.Function("gradient", [x, params], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
 
     def _jacobian(self) -> Any:
-        """Build the constraints and their slopes by x."""
+        """Build the constraints and their Jacobian with respect to x."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends, by_natural = self._ends_slopes(natural, params)
         columns, h = self._columns(outward, offsets)
@@ -295,7 +322,7 @@ class Program:
         return ca.Function("jacobian", [x, params], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
 
     def _hessian(self) -> Any:
-        """Build the upper triangle of the Hessian of the Lagrangian by x."""
+        """Build the upper triangle of the Hessian of the Lagrangian with respect to x."""
         x, params, natural, offsets = self._point()
         of_f, of_g = ca.MX.sym("of_f"), ca.MX.sym("of_g", self.num_constraints)
         outward, _, _, by_natural = self._ends_slopes(natural, params)
@@ -308,7 +335,7 @@ class Program:
             at_ends = of_g[count:]
         of_samples, bends = self._bends(self._unit(columns), h, params, multipliers)
         by_columns, full = self._columns_of(of_samples), self._hessian_of_columns(bends)
-        # The energy of the offsets is added to the contribution of the samples.
+        # The blocks below are sums of derivatives of the limits and of the offsets' snap energy.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
         num_out, num_in = len(self._outer), len(self._inner) + 1
@@ -333,7 +360,7 @@ class Program:
         return ca.Function("hessian", [x, params, of_f, of_g], [hessian], names, ["hess"])
 
     def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
-        """Return slopes of one value at all samples, by columns (K, 3 C), and by h (K, 1)."""
+        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and by h (K, 1)."""
         parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
         by_h = ca.MX.zeros(self.num_samples, 1)
         for k, (i, j) in enumerate(self._slope_places):
@@ -346,24 +373,24 @@ class Program:
         return ca.horzcat(*parts), by_h
 
     def _unit(self, columns: Any) -> Any:
-        """Return the samples (10, K) in time over h of columns (C, 3)."""
+        """Return the components (10, K) of K samples in units of h, from coefficients (C, 3)."""
         sampled = [matrix @ columns for matrix in self._matrices]
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
 
     def _columns_of(self, of_samples: Any) -> Any:
-        """Convert slopes (11, K) by the samples to slopes (1, 3 C) by columns, ordered by axis."""
+        """Convert derivatives by samples (11, K) to derivatives by coefficients (1, 3 C)."""
         parts = [ca.MX.zeros(1, self._num_columns)] * 3
         for i, (order, axis) in enumerate(PLACES):
             parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
         return ca.horzcat(*parts)
 
     def _hessian_of_columns(self, bends: Any) -> Any:
-        """Convert Hessians of samples to a Hessian (3 C + 1, 3 C + 1) by columns and h."""
+        """Convert the samples' Hessians to one by coefficients and h, (3 C + 1, 3 C + 1)."""
         last, num = len(PLACES), self._num_columns
         factors = {place: bends[k, :].T for k, place in enumerate(self._bend_places)}
         sizes = (num, num, num, 1)
         blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # Ordered such that each product with a matrix is computed only once.
+        # The loops are ordered such that each product with a sample matrix is computed only once.
         for i, (order, axis) in enumerate(PLACES):
             inside: dict[int, Any] = {}
             for j, (other, of) in enumerate(PLACES):
@@ -381,7 +408,10 @@ class Program:
         return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
 
     def _compile(self) -> list:
-        """Return the functions compiled and loaded; their temporary file may be deleted."""
+        """Generate C code of all functions, compile it, and load the compiled functions.
+
+        The temporary files are deleted, because the loaded library does not need them.
+        """
         code = ca.CodeGenerator("program.c")
         for function in self.functions:
             code.add(function)
