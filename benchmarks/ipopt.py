@@ -174,7 +174,7 @@ def run_planner(
 def seconds_to(
     setup: Setup, peer: Any, paths: list[np.ndarray], whole: np.ndarray, run: Found
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times in which IPOPT reaches a feasible plan that costs no more than the planner's.
+    """Return the times that IPOPT takes to feasible plans at no more than the planner's cost.
 
     Args:
         setup: the cases.

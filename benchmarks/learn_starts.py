@@ -1,17 +1,21 @@
-"""Train the networks for the initial guesses of hits and catches, and measure their effect.
+"""Train the networks that propose initial guesses of hits and catches, and measure their effect.
 
     python -m benchmarks.learn_starts [--tasks hit hard-hit catch] [--train MINUTES] [--num 1000]
         [--out DIR]
 
-Training uses the planner's own objective: it minimises the mean logarithm of the cost at the guess,
-over batches from a large pool of cases. Half of the cases are from the usual suites. The others
-have random starts (also moving), limits, balls, rackets or nets, and targets over a reasonable
-range. Cases of `hard-hit`, with velocities at the waypoints, are serves planned 0.5 to 0.88 s late,
-or with 0.29 to 0.5 of the limits; many of them are infeasible.
+A network maps the numbers of a case to a correction of the planner's initial guess. Training
+minimises the mean logarithm of the planner's objective at the guess, over batches from a large pool
+of cases. Half of the cases are from the usual suites. The other half has random initial states
+(some of them moving), limits, balls, rackets or nets, and targets.
 
---train trains, and replaces the shipped files. Printed are the cost above the minimum that very
-long searches find, and the share of plans that keep every limit, after several numbers of
-iterations, with and without the network, on cases that no network was trained on.
+The task `hard-hit` has a network of its own, for a trajectory with velocities at the waypoints as
+additional variables. Its cases are serves planned 0.5 to 0.88 s late, or with limits multiplied by
+0.29 to 0.5. Many of them are infeasible.
+
+With --train the networks are trained and the shipped files are replaced. The printed table compares
+plans with and without the network after several numbers of iterations, on cases that no network
+was trained on. It has the cost above the minimum that very long searches find, and the share of
+plans that keep every limit.
 """
 
 import argparse
@@ -37,22 +41,22 @@ from planner_jax.optimise.shipped import StartNetwork
 from planner_jax.planning.decided import first_choice
 from planner_jax.task.hit.default_planner import WITH_VELOCITIES
 
-_POOL = 262_144  # cases drawn at the start, and sampled again and again
-_BATCH = 8192
-_RATE = 2e-3  # initial rate of Adam, with cosine decay to zero
-_SEED_APART = 90_001  # seed of cases that no network was trained on
-_STEPS = 50  # optimiser steps in one call
-_ITERATIONS = (0, 3, 5, 7, 12, 20)
-_CHUNKS = 64  # batches of hard hits, each with its own delay or limits
+_POOL = 262_144  # Number of cases that are drawn once, from which all training batches are sampled.
+_BATCH = 8192  # Number of cases in a training batch.
+_RATE = 2e-3  # Initial learning rate of Adam, which decays to zero along a cosine.
+_SEED_APART = 90_001  # Seed of the cases in the printed table. No network is trained on them.
+_STEPS = 50  # Number of Adam steps in one compiled call.
+_ITERATIONS = (0, 3, 5, 7, 12, 20)  # Numbers of planner iterations in the printed table.
+_CHUNKS = 64  # Hard hits are drawn in this number of parts, each with one delay or limit scale.
 
 
 def _draw_factors(random: np.random.Generator, num: int, low: float, high: float) -> np.ndarray:
-    """Draw factors (num,) log-uniformly between two numbers."""
+    """Draw factors (num,) whose logarithms are uniform between log(low) and log(high)."""
     return np.exp(random.uniform(np.log(low), np.log(high), num))
 
 
 def _add_motion(random: np.random.Generator, head: Any) -> Any:
-    """Return head states (B, 4, 3), half of them with random motion added."""
+    """Add random velocity, acceleration and jerk to half of the initial states (B, 4, 3)."""
     num = len(head)
     sizes = np.array([1.5, 3.0, 15.0])[:, None] * random.uniform(size=(num, 1, 1))
     moving = random.uniform(size=(num, 1, 1)) < 0.5
@@ -62,7 +66,7 @@ def _add_motion(random: np.random.Generator, head: Any) -> Any:
 
 
 def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw hits, half as `pj.hit.draw` does, half varied."""
+    """Draw `num` training cases of hits: half usual ones, half with varied states and limits."""
     random, half = np.random.default_rng(seed), num // 2
     plain = pj.hit.draw(num - half, seed=seed)
     varied = pj.hit.draw(half, seed=seed + 1)
@@ -101,7 +105,7 @@ def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw hits, half of them planned late, half with weak limits."""
+    """Draw `num` training cases of hard hits: half are planned late, half have weak limits."""
     random, serves = np.random.default_rng(seed), pj.hit.generate_serves(num, seed)
     parts = []
     for k, rows in enumerate(np.array_split(np.arange(num), _CHUNKS)):
@@ -114,7 +118,11 @@ def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_catches(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw catches in greedy order, half from the suites `throws` and `hard`, half varied."""
+    """Draw `num` training cases of catches: half usual ones, half with varied states and limits.
+
+    The usual cases are from the suites `throws` and `hard`, with catching times that the greedy
+    decision chose.
+    """
     random, half = np.random.default_rng(seed), num // 2
 
     def draw_usual(num: int, seed: int) -> Any:
@@ -157,15 +165,17 @@ def _concatenate(*batches: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _NetworkSpec:
-    """Specification of a network to train."""
+    """What a network is trained on and compared on, and where it is stored."""
 
-    file: str  # path below planner_jax.task
-    draw: Callable[[int, int], Any]
-    planner: Any  # without the network
-    usual: Callable[[int, int], Any]  # cases of the usual suite
-    hidden: tuple[int, ...] = (128, 128)
-    floor: float = 0.0  # added to the cost, so that much smaller costs gain little
-    iterations: tuple[int, ...] = _ITERATIONS
+    file: str  # path of the shipped file, below the folder of planner_jax.task
+    draw: Callable[[int, int], Any]  # draws training cases: (number, seed) -> cases
+    planner: Any  # planner without the network
+    usual: Callable[[int, int], Any]  # draws cases for the printed table: (number, seed) -> cases
+    hidden: tuple[int, ...] = (128, 128)  # widths of the hidden layers
+    # Added to the cost before the logarithm, so that training ignores differences between costs far
+    # below this value.
+    floor: float = 0.0
+    iterations: tuple[int, ...] = _ITERATIONS  # numbers of planner iterations in the printed table
 
 
 def _draw_throws(num: int, seed: int) -> Any:
@@ -200,7 +210,14 @@ TASKS = {
 def make_untrained(
     features: np.ndarray, outputs: int, hidden: tuple[int, ...], seed: int = 0
 ) -> StartNetwork:
-    """Return an untrained network with zero output, for features (B, F) of a batch of cases."""
+    """Return an untrained network, whose output is zero.
+
+    Args:
+        features: (B, F), inputs for a batch of cases. Their mean and deviation scale the inputs.
+        outputs: number of outputs.
+        hidden: widths of the hidden layers.
+        seed: seed of the random weights.
+    """
     random = np.random.default_rng(seed)
     sizes = (features.shape[-1], *hidden, outputs)
     weights = [
@@ -216,7 +233,7 @@ def make_untrained(
 
 
 def to_bytes(network: StartNetwork) -> bytes:
-    """Return a network as an archive of half-precision arrays, which is precise enough."""
+    """Return a network as a compressed archive, with weight matrices in half precision."""
     arrays = {"mean": network.mean, "deviation": network.deviation}
     for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
         arrays |= {f"weight{k}": weight, f"bias{k}": bias}
@@ -232,7 +249,7 @@ def to_bytes(network: StartNetwork) -> bytes:
 def train(
     spec: _NetworkSpec, minutes: float, seed: int, say: Callable[[str], None]
 ) -> StartNetwork:
-    """Train a network for some minutes."""
+    """Train a network for `minutes` on a pool of drawn cases; `say` prints the progress."""
     planner = spec.planner
     pool = jax.device_put(jax.tree.map(jnp.asarray, spec.draw(_POOL, seed)))
     prepare = jax.jit(jax.vmap(planner.prepare))
@@ -275,7 +292,7 @@ def train(
         rate = _RATE * 0.5 * (1.0 + np.cos(np.pi * share))
         params, state, value = steps(params, state, own, rate)
         value.block_until_ready()
-        began = began or time.perf_counter()  # after the first call, which compiles
+        began = began or time.perf_counter()  # Time starts after the first call, which compiles.
         calls += 1
         share = min((time.perf_counter() - began) / (60.0 * minutes), 1.0)
         if calls % 20 == 1:
@@ -287,7 +304,7 @@ def train(
 
 
 def compare(bench: Bench, task: str, num: int) -> None:
-    """Print the effect of the shipped network, a row for each number of iterations."""
+    """Compare plans with and without the shipped network on `num` cases; print the table."""
     spec = TASKS[task]
     cases = jax.tree.map(np.asarray, spec.usual(num, _SEED_APART))
     planners = {
@@ -321,12 +338,12 @@ def compare(bench: Bench, task: str, num: int) -> None:
 
 
 def locate_file(task: str) -> Path:
-    """Return the path of the shipped network of a task."""
+    """Return the path of the file with the shipped network of a task."""
     return Path(planner_jax.task.__path__[0]) / TASKS[task].file
 
 
 def main() -> None:
-    """Train networks if requested, and compare."""
+    """Train the networks if requested, and compare plans with and without them."""
     parser = argument_parser("learn_starts", __doc__, num=1000, seed=11)
     parser.add_argument(
         "--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="default: all"

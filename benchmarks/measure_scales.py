@@ -1,13 +1,16 @@
-"""Measure the scales of the exact planners' decision variables, beside the shipped scales.
+"""Measure the scales of the decision variables of `ExactHit` and `ExactCatch`.
 
     python -m benchmarks.measure_scales [--write] [--out DIR]
 
-Hits: serves of the generator (seed 7), 100 of each hard kind, so that limits are active. Catches:
-throws of the suite `hard`, with limits x 1 and x 0.8; all segments share one scale. Scale i is 1 /
-sqrt(floor + median H_ii). H = J^T J is the Gauss-Newton curvature of the planner's residuals in SI
-units. The median is over cases, each with the sum of H at its initial guess and at a solution.
-Prints the largest ratio to the shipped scale, and the share of plans with the measured scale that
-the referee accepts. --write replaces the shipped files.
+Decision variables are divided by scales, so that the objective has a similar curvature along all
+variables. The scale of variable i is 1 / sqrt(floor + median H_ii). H = J^T J is the Gauss-Newton
+approximation of the Hessian, from the Jacobian J of the planner's residuals in SI units. The median
+is over cases. For each case, H is the sum at the initial guess and at a solution.
+
+The cases of hits are drawn serves, 100 of each of five hard kinds, so that limits are active. The
+cases of catches are throws of the suite `hard`, with limits multiplied by 1 and 0.8. The program
+prints the largest ratio of a measured to a shipped scale, and the share of plans with the measured
+scales that the referee accepts. --write replaces the shipped files.
 """
 
 import dataclasses
@@ -39,21 +42,24 @@ from planner_jax.trajectory.proportional_minco import (
 
 HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 
-# Reasonable initial scales: metres, log seconds, log m/s^2, m/s, m/s^3.
+# Scales of the variables at the end of a hit with which the measurement starts: logarithms of the
+# duration, of the ball's flight time and of the thrust, two speeds [m/s], and jerk [m/s^3].
 _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
-# Log seconds, position in the net, m/s, m/s^2, m/s^3.
+# The same for the end of a catch: logarithm of the duration, position in the net (2), velocity
+# [m/s], acceleration [m/s^2], jerk [m/s^3].
 _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
-# Easy throws hardly depend on the position in the net and the final jerk, so the floor is larger.
+# Floor of the curvature for catches. It is larger than for hits, because the objective of easy
+# throws hardly depends on the position in the net and the final jerk.
 _CATCH_FLOOR = 0.1
 
 
 # Function of a planner, a point (n,) and its context; returns residuals (R,).
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
-_ROUNDS = 3  # of measuring with the scale of the round before
+_ROUNDS = 3  # Number of measurements, each with the scale of the measurement before.
 
 
 def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.Array) -> jax.Array:
-    """Return the diagonal of J^T J of a residual function at a point (n,), shape (n,)."""
+    """Return the diagonal (n,) of J^T J, with the Jacobian J of residuals at a point (n,)."""
     jacobian = jax.jacfwd(residuals)(point)
     return jnp.sum(jacobian**2, axis=0)
 
@@ -99,10 +105,11 @@ def measure_scale(
 
 
 def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> jax.Array:
-    """Return the residuals of a planner of segments: squared hinges, energy and time.
+    """Return residuals whose squares sum to about twice a planner's objective near its minimum.
 
-    The curvature of the smoothed hinge is at most 3 / (2 hinge_width); the residuals have this
-    curvature.
+    The residuals belong to the penalties of limits, the snap energy and the durations. A penalty is
+    a smoothed max(excess, 0), whose curvature is at most 3 / (2 hinge_width). The residuals of
+    penalties have this curvature for every positive excess.
     """
     case, along = context.case, planner.along(planner.nodes, context.case)
     offsets, natural = planner.split(point)
@@ -133,7 +140,11 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
 
 
 def draw_hard_serves(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw `num` serves of each of five kinds: late, very late, weak, very weak, any start."""
+    """Draw `num` hits of each of five hard kinds.
+
+    The kinds are: planned 0.5 s late, planned 0.6 s late, limits x 0.5, limits x 0.35, and random
+    initial positions.
+    """
     kinds = (
         functools.partial(pj.hit.to_cases, delay=0.5),
         functools.partial(pj.hit.to_cases, delay=0.6),
@@ -147,7 +158,7 @@ def draw_hard_serves(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw `num` hard throws for each of two limits on speed and body rate."""
+    """Draw `num` throws of the suite `hard`, with limits of speed and body rate x 1 and x 0.8."""
     cases = first_choice(pj.catch.Greedy(), pj.catch.draw(num, "hard", seed))
 
     def weaker(factor: float) -> pj.catch.CatchCase:
@@ -162,7 +173,7 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return `ExactHit` with an initial guess of its scale, by the scale's name."""
+    """Return planners of hits for each number of pieces, with guessed scales, by file key."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -172,7 +183,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return `ExactCatch` with an initial guess of a segment's scale, by the scale's name."""
+    """Return planners of catches for each number of pieces, with guessed scales, by file key."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH
@@ -181,7 +192,7 @@ def catch_planners() -> dict[str, Any]:
     return found
 
 
-# Task -> cases, planners, options of `measure_scale`.
+# Task -> function that draws cases, function that returns planners, options of `measure_scale`.
 TASKS = {
     "hit": (draw_hard_serves, hit_planners, {}),
     "catch": (draw_weak_throws, catch_planners, {"floor": _CATCH_FLOOR}),
@@ -189,7 +200,10 @@ TASKS = {
 
 
 def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarray]:
-    """Measure the scales of a task by name, and compare them with the shipped scales."""
+    """Measure the scales of all planners of a task, and compare them with the shipped scales.
+
+    Returns the measured scales by the keys of the shipped file.
+    """
     draw, planners, options = TASKS[task]
     cases, found = draw(num, seed), {}
     shipped = json.loads(locate_file(task).read_text("utf-8"))
@@ -209,12 +223,12 @@ def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarra
 
 
 def locate_file(task: str) -> Path:
-    """Return the path of the shipped scales of a task."""
+    """Return the path of the file with the shipped scales of a task."""
     return Path(planner_jax.task.__path__[0]) / task / "measured_scales.json"
 
 
 def main() -> None:
-    """Measure scales, then write or compare them."""
+    """Measure the scales of the requested tasks, and replace the shipped files if requested."""
     parser = argument_parser("measure_scales", __doc__, num=100, seed=7)
     parser.add_argument("--write", action="store_true", help="replace the shipped files")
     parser.add_argument(

@@ -1,11 +1,12 @@
-"""Compare the batched L-BFGS with optax.lbfgs and SciPy's L-BFGS-B on the same hit objective.
+"""Compare this library's L-BFGS with optax.lbfgs and SciPy's L-BFGS-B on the objective of hits.
 
     python -m benchmarks.optimiser [--num 200] [--row late-0.5] [--out DIR]
 
-All three get the same float32 objective in the same scaled variables and the same start. Times are
-per plan, compiled before: the batched solvers in one call for all serves, SciPy serve by serve with
-a compiled value and gradient. Success is judged by the referee. The summary of the run folder is
-about this library's solver, over all iteration budgets.
+All three solvers minimise the same float32 objective in the same scaled variables, from the same
+initial guess. This library's solver and optax solve all serves in one batched call. SciPy solves
+one serve after another, with a compiled function of value and gradient. Times are per plan, without
+compilation. Success is judged by the referee. The summary of the run folder is about this library's
+solver, over all maximum numbers of iterations.
 """
 
 import time
@@ -28,7 +29,10 @@ PLANNER = ExactHit()
 
 
 def make_own_solver(iterations: int) -> Callable:
-    """Return this library's solver for one problem."""
+    """Return a function that minimises the objective of one case with this library's L-BFGS.
+
+    The function returns the decision variables and the number of iterations.
+    """
 
     def solve(case):
         context = PLANNER.prepare(case)
@@ -42,7 +46,11 @@ def make_own_solver(iterations: int) -> Callable:
 
 
 def make_optax_solver(iterations: int) -> Callable:
-    """Return optax.lbfgs with its zoom line search for one problem."""
+    """Return a function that minimises the objective of one case with optax.lbfgs.
+
+    It uses optax's zoom line search, and returns the decision variables and the number of
+    iterations.
+    """
 
     def solve(case):
         context = PLANNER.prepare(case)
@@ -67,7 +75,10 @@ def make_optax_solver(iterations: int) -> Callable:
 
 
 def run_batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
-    """Run a batched solver; return points, mean iterations and duration [s], compiled before."""
+    """Solve a batch of cases in one call, after a first call that compiles.
+
+    Returns decision variables (B, n), the mean number of iterations, and the duration [s].
+    """
     compiled = jax.jit(jax.vmap(solve))
     jax.block_until_ready(compiled(cases))
     began = time.perf_counter()
@@ -76,7 +87,10 @@ def run_batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
 
 
 def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
-    """Run SciPy's L-BFGS-B serve by serve; return points, mean iterations and duration [s]."""
+    """Solve cases one after another with SciPy's L-BFGS-B, and a compiled value and gradient.
+
+    Returns decision variables (B, n), the mean number of iterations, and the duration [s].
+    """
     contexts = jax.jit(jax.vmap(PLANNER.prepare))(cases)
     starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
     value_and_grad = jax.jit(jax.value_and_grad(lambda x, c: PLANNER.objective(x, c).cost))
@@ -103,7 +117,7 @@ def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
 
 
 def main() -> None:
-    """Print one line for each solver and iteration budget."""
+    """Run each solver with several maximum numbers of iterations, and print a line for each."""
     parser = argument_parser("optimiser", __doc__, num=200)
     parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1], help="default: late-0.5")
     options = parser.parse_args()

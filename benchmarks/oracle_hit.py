@@ -1,19 +1,21 @@
-"""Search for feasible hits by direct transcription, in cases that planners do not solve.
+"""Search with a slow, independent solver for feasible hits, in cases that planners do not solve.
 
     python -m benchmarks.oracle_hit [--serves DIR] [--delay S] [--limit-scale F]
         [--failures RUN/plans | --indices FILE.npy] [--num N] [--starts K] [--out DIR]
 
-The search takes a sample of serves, for example those where a planner failed, and shares no code
-with the planners. The quadrotor's snap is constant on pieces of free duration, so position to jerk
-are continuous. The impact, its time and the ball's flight after it are equality constraints. Limits
-are inequalities at samples of every piece. IPOPT minimises the largest relative excess over a
-limit. It starts with coarse pieces, from many starting points. If the excess is small, the pieces
-are halved, and limits that still peak between samples are tightened on their piece. A hit counts
-only if the library's referee accepts it.
+The search takes a sample of serves, for example serves for which a planner failed. It shares no
+code with the planners, and solves a nonlinear program by direct transcription. The quadrotor's snap
+is constant on pieces of free duration, so position to jerk are continuous. The impact and the
+ball's flight to the target are equality constraints. Limits are inequalities at samples of every
+piece. IPOPT minimises the excess: the largest relative amount by which a limit is exceeded.
 
-A found hit proves its case feasible. If none is found, nothing is proven; but if all starts end
-with the same excess, all limits together would probably have to be relaxed by this share. Needs the
-extra `oracle` (CasADi).
+Each search starts with few pieces, from one of several starting points. If the excess is small, the
+pieces are halved, and limits that are exceeded between samples are tightened on their piece. A hit
+counts only if the library's referee accepts it.
+
+A hit that is found proves that its case is feasible. If no hit is found, nothing is proven. But if
+all starting points lead to the same excess, the case probably becomes feasible only if all limits
+are relaxed by this excess. The program needs the extra `oracle` (CasADi).
 """
 
 import argparse
@@ -31,18 +33,18 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.summary import wilson_interval
 from planner_jax.task.hit.suites import generate_serves, read_serves, to_cases
 
-NUM_GENERATED = 9000  # serves that are drawn if no folder is passed
+NUM_GENERATED = 9000  # Number of serves that are drawn if no folder of serves is passed.
 VERDICTS = ("feasible", "infeasible", "undecided")
 
 
 def read_failures(plans: Path) -> np.ndarray:
-    """Read the indices of serves whose plan failed, from a sweep's `plans`."""
+    """Read from the folder `plans` of a sweep the indices of serves whose plans failed."""
     table = Dataset(plans).read(["index", "success"])
     return table["index"].to_numpy()[~table["success"].to_numpy()]
 
 
 def summarise(findings: list[Finding]) -> dict:
-    """Return counts with Wilson intervals, and times."""
+    """Count the verdicts of all cases, with shares, Wilson intervals, excesses and CPU times."""
     num, verdicts = len(findings), {}
     for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)
@@ -62,7 +64,7 @@ def summarise(findings: list[Finding]) -> dict:
 
 
 def format_table(summary: dict) -> str:
-    """Format the summary as a Markdown table and two sentences."""
+    """Format the result of `summarise` as a Markdown table and one or two sentences."""
     lines = ["| verdict | cases | share | 95 % interval |", "|---|---|---|---|"]
     for name in VERDICTS:
         row = summary[name]
@@ -83,7 +85,7 @@ def format_table(summary: dict) -> str:
 def write_findings(
     bench: Bench, summary: dict, indices: np.ndarray, findings: list[Finding]
 ) -> None:
-    """Store rows of all cases, and hits.npz with the trajectories of the hits."""
+    """Store a row for each case, and the trajectories of all feasible hits in hits.npz."""
     for index, finding in zip(indices, findings, strict=True):
         numbers = {k: v for k, v in vars(finding).items() if k not in ("coeffs", "durations")}
         bench.row(index=index, verdict=finding.verdict, **numbers)
@@ -99,7 +101,7 @@ def write_findings(
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the argument parser."""
+    """Return the parser of this program's command line."""
     parser = argument_parser("oracle_hit", __doc__, num=200, starts=len(STARTS), seed=0, workers=1)
     add = parser.add_argument
     add("--serves", type=Path, help="folder of published trial files (default: draw serves)")
@@ -121,7 +123,7 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Judge a sample of cases."""
+    """Read or draw serves, search for hits in a sample of them, and print the verdicts."""
     parser = make_parser()
     options = parser.parse_args()
     try:

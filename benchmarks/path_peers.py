@@ -1,8 +1,9 @@
-"""Run a published Hybrid A* (fastsim-navigation, extra `peers`) on searches of `intercept_paths`.
+"""Run the published Hybrid A* of fastsim-navigation, for comparison in `intercept_paths`.
 
-The C++ code sometimes aborts its process, so it runs in a process of its own: `python -m
-benchmarks.path_peers SEARCHES.json RESULTS.jsonl FIRST` writes a line for every search, starting
-with number FIRST.
+The package fastsim-navigation is installed with the extra `peers`. Its C++ code sometimes aborts
+the process, so it runs in a separate process. The command `python -m benchmarks.path_peers
+SEARCHES.json RESULTS.jsonl FIRST` runs the searches of a file from number FIRST on, and appends a
+line of results for each.
 """
 
 import importlib
@@ -22,30 +23,31 @@ INSTALL = (
     "fastsim-navigation not installed: pip install 'planner-jax[peers]' adds it to compare with "
     "(Python 3.11, Linux, x86-64)"
 )
-CELL, PAD = 0.1, 0.4  # [m], cell size of the cost map, and margin beyond the case's map
-REPEATS = 3
-_START_UP, _EACH = 30.0, 20.0  # [s], time limits of a process start and of a search
+CELL, PAD = 0.1, 0.4  # [m] Cell size of the cost map, and its margin around the case's map.
+REPEATS = 3  # The fastest of this number of searches counts.
+_START_UP, _EACH = 30.0, 20.0  # [s] Time limits for the start of a process and for a search.
 
 
 def is_installed() -> bool:
-    """Return whether the peer can be imported."""
+    """Return whether the Python package of fastsim-navigation is installed."""
     return importlib.util.find_spec(PEER) is not None
 
 
 def run_searches(searches: Sequence[dict], folder: Path) -> list[dict]:
-    """Run the peer on searches; restart it after an abort.
+    """Run fastsim-navigation on path problems, in a process that is restarted after an abort.
 
     Args:
-        searches: each with "start" and "goal" (3,), poses of the rear axle; "distance" (Y, X) [m]
-            of the cost map's cells from the nearest wall; "corner" (2,) [m] of the map; "curvature"
-            [1/m]; and "body", corners (4, 2) [m] ahead and to the left of the rear axle.
-        folder: for temporary files.
+        searches: path problems. Each has "start" and "goal" (3,), poses of the rear axle;
+            "distance" (Y, X) [m] of the cost map's cells from the nearest wall; "corner" (2,) [m],
+            the lower corner of the map; "curvature" [1/m], its limit; and "body", the corners
+            (4, 2) [m] of the body, ahead and to the left of the rear axle.
+        folder: folder for temporary files.
 
     Returns:
-        For each search "found" and "aborted", and "ms" and "poses" unless it aborted.
+        For each problem "found" and "aborted", and unless the search aborted, "ms" and "poses".
 
     Raises:
-        RuntimeError: the peer does not run at all.
+        RuntimeError: fastsim-navigation cannot be run.
     """
     given, results = folder / "searches.json", folder / "results.jsonl"
     given.write_text(json.dumps(searches))
@@ -72,7 +74,7 @@ def run_searches(searches: Sequence[dict], folder: Path) -> list[dict]:
 
 
 def search_one(given: dict) -> dict:
-    """Run one search several times, each with a new planner; return the fastest."""
+    """Solve one path problem `REPEATS` times; return the path and the fastest time [ms]."""
     peer: Any = importlib.import_module(PEER)
     # A cell counts as wall if a wall is within half a cell of its centre.
     cells = np.where(np.array(given["distance"]) <= 0.5 * CELL, 254, 0).astype(np.uint8)
@@ -96,7 +98,7 @@ def search_one(given: dict) -> dict:
 
 
 def main() -> None:
-    """Run the searches from number FIRST on, and append a line of results for each."""
+    """Read path problems from a file, solve those from number FIRST on, and append the results."""
     given, results, first = sys.argv[1:]
     searches = json.loads(Path(given).read_text())
     with Path(results).open("a") as file:

@@ -1,11 +1,12 @@
-"""Check that invalid cases in a batch are all marked, and that they change no other plan.
+"""Check that invalid cases in a batch are marked, and that they change no plan of another case.
 
     python -m benchmarks.poisoned_batches [--num 20000] [--task hit] [--every 100] [--seed 0]
         [--out DIR]
 
-Every hundredth case violates a rule of its class. Rules and bad values take turns: NaN, infinity,
-numbers below or above the allowed range. Both batches, the valid and the poisoned one, are JAX
-arrays. A poisoned case is marked if the status of its plan is BAD_INPUT.
+A batch is planned twice: as drawn, and with invalid ("poisoned") numbers in every hundredth case. A
+poisoned case has one array with a bad value: NaN, infinity, or a number outside the allowed range.
+The poisoned cases take turns through all arrays and bad values. A poisoned case is marked if the
+status of its plan is BAD_INPUT. All other plans must be equal, bit for bit, in both batches.
 """
 
 import argparse
@@ -22,12 +23,14 @@ from planner_jax.core.registry import all_tasks
 from planner_jax.core.rules import all_ruled
 from planner_jax.planning.decided import DecidedPlanner
 
-REPLACED = ("order", "times")  # replaced by a decision that does not read the values
+# Planners that decide the order and times of catches replace these arrays without reading them, so
+# bad values in them have no effect.
+REPLACED = ("order", "times")
 BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
 
 
 def poisons(case: Any) -> list[tuple[str, float]]:
-    """Return names of a case's arrays with values that violate their rules."""
+    """Return the names of a case's arrays, each with a value that the array's rule forbids."""
     found = []
     for ruled in all_ruled(jax.tree.map(np.asarray, case)):
         for value in BAD:
@@ -39,12 +42,12 @@ def poisons(case: Any) -> list[tuple[str, float]]:
 
 
 def poison(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
-    """Return the batch in NumPy arrays, with a rule violated in some batch elements.
+    """Return a copy of a batch with an invalid number in some cases, in NumPy arrays.
 
     Args:
         cases: a batch.
-        lanes: indices of the batch elements to poison; each violates the next rule.
-        spared: names of arrays that stay unchanged.
+        lanes: indices of the cases to change. They take turns through all invalid numbers.
+        spared: names of arrays that are not changed.
     """
     paths, tree = jax.tree_util.tree_flatten_with_path(cases)
     leaves = {
@@ -59,7 +62,14 @@ def poison(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
 
 
 def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
-    """Count poisoned and marked cases, and the other cases with the bits of the valid batch."""
+    """Plan a valid and a poisoned batch, and count marked cases and changed plans.
+
+    Args:
+        task: specification of the task.
+        num: number of cases.
+        every: one in this number of cases is poisoned.
+        seed: seed of the cases.
+    """
     cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)
     lanes = np.arange(every // 2, num, every)
     others = np.setdiff1d(np.arange(num), lanes)
@@ -81,7 +91,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Print the row."""
+    """Compare both batches of a task, and print how many cases are marked and unchanged."""
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)
     bench.row(task=options.task, num=options.num, **found)
@@ -96,7 +106,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Print both counts."""
+    """Parse the arguments, and print the counts of marked and of unchanged plans."""
     parser = argument_parser("poisoned_batches", __doc__, num=20_000, every=100, seed=0)
     parser.add_argument("--task", default="hit", choices=all_tasks(), help="default: hit")
     options = parser.parse_args()

@@ -360,7 +360,7 @@ class Program:
         return ca.Function("hessian", [x, params, of_f, of_g], [hessian], names, ["hess"])
 
     def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
-        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and by h (K, 1)."""
+        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and h (K, 1)."""
         parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
         by_h = ca.MX.zeros(self.num_samples, 1)
         for k, (i, j) in enumerate(self._slope_places):
