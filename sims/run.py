@@ -1,4 +1,4 @@
-"""Runs of flights in a run folder: manifest, rows, table, picture, report page and film."""
+"""Runs of simulated flights: fly all cases, and write rows, pictures and report to a folder."""
 
 import dataclasses
 import datetime
@@ -40,8 +40,8 @@ from planner_jax.sims.task import FlightTask
 from planner_jax.sweep.quadrotor_settings import robot_remark
 from planner_jax.sweep.report import require_counted
 
-_FILMED = 3  # flights in a film, at most
-_RECORDED = 256  # largest batch of flights that is recorded completely
+_FILMED = 3  # greatest number of flights in a film
+_RECORDED = 256  # largest batch of flights of which every sample is recorded
 _FRAME = "world, z up; times from the start of the first plan"
 
 
@@ -64,16 +64,16 @@ def start_flights(
     *,
     record: int = 16,
 ) -> dict[str, Any]:
-    """Fly into a new folder, and return the manifest of the run.
+    """Fly all cases of a run into a new folder, and return the run's manifest.
 
     Args:
         settings: settings of the run, of the task's own class.
-        out: folder, new or empty.
+        out: path of the folder, new or empty.
         video: name of a film in the folder, .gif or .mp4; None for no film.
-        record: number of flights that are recorded, the first ones.
+        record: number of flights that are recorded, from the first flight on.
 
     Raises:
-        ArgumentError: an argument breaks a rule; no files are left behind.
+        ArgumentError: an argument breaks a rule; no files remain.
     """
     folder = RunFolder(out)
     require(1 <= record <= _RECORDED, "record", f">= 1 and <= {_RECORDED}", record)
@@ -108,7 +108,7 @@ def start_flights(
 
 
 def _discard_unfinished(folder: RunFolder) -> str:
-    """Remove the files of flights that are not finished, and return a message about it."""
+    """Remove the files of an unfinished run, and return a message about the removal."""
     try:
         if folder.read_manifest()["state"] == "complete":
             return f"the flights are finished: {folder.path}"
@@ -135,10 +135,10 @@ def _fly_into(
 
 
 def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recording]:
-    """Return manifest, task and recording of a finished run of flights.
+    """Read the manifest, the task and the recording of a finished run of flights.
 
     Raises:
-        ArgumentError: the folder does not hold such a run.
+        ArgumentError: the folder does not hold a finished run of flights.
     """
     manifest = folder.read_manifest()
     flights = Dataset(folder.path / FLIGHTS)
@@ -160,7 +160,7 @@ def read_flights(folder: RunFolder) -> tuple[dict[str, Any], FlightTask, Recordi
 
 
 def require_sound(folder: RunFolder) -> None:
-    """Raise `ArgumentError` unless the files of flights are complete and match their summary."""
+    """Raise `ArgumentError` unless the files of a run are complete and match its summary."""
     manifest, flight, _ = read_flights(folder)
     try:
         counted = _summary(flight, folder.plans.read())
@@ -173,9 +173,10 @@ def require_sound(folder: RunFolder) -> None:
 
 
 def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
-    """Return the rows of all flights, the times [s], and the first flights with their record.
+    """Fly all cases; return their rows, the times [s], and the first flights with their record.
 
-    A run of few flights records them all, which saves compiling a second program.
+    A run whose flights fit into one batch of up to 256 records all of them. It then needs no second
+    program, with a record, for the first flights.
     """
     num = flight.settings.num
     size = min(flight.settings.batch or 4096, num)
@@ -183,7 +184,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
     parts, compiling, warm, warm_flights, recorded = [], 0.0, 0.0, 0, None
     watch = Stopwatch()
     for first in range(0, num, size):
-        lanes = np.arange(first, first + size) % num  # the last batch is padded
+        lanes = np.arange(first, first + size) % num  # the last batch is padded with first cases
         with CompileClock() as clock:
             lap = Stopwatch()
             flights = flight.fly(cases[lanes], record)
@@ -207,7 +208,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
 
 
 def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
-    """Return the counts and rates of a run."""
+    """Return the counts, rates and tracking errors of a run from its rows."""
     success = np.asarray(rows["success"])
     low, high = wilson_interval(int(success.sum()), success.size)
     return {
@@ -222,7 +223,7 @@ def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
 
 
 def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
-    """Return success and times of a run, one sentence per line."""
+    """Return sentences on success, conditions and times of a run, one per line."""
     summary, times, device = manifest["summary"], manifest["times"], manifest["device"]
     settings = flight.settings
     rate = percent(summary["successes"], summary["num"])
@@ -246,10 +247,10 @@ def headline(manifest: dict[str, Any], flight: FlightTask) -> list[str]:
 
 
 def write_flight_report(folder: RunFolder) -> None:
-    """Write `table.md`, `figures/` and `index.html` of a run; existing ones are replaced.
+    """Write `table.md`, `figures/` and `index.html` of a run, and replace existing files.
 
     Args:
-        folder: run folder with `manifest.json`, `plans/` and `flights/`; a film may be there.
+        folder: run folder with `manifest.json`, `plans/` and `flights/`, and perhaps a film.
 
     Raises:
         ArgumentError: the folder does not hold a finished run of flights.
@@ -298,5 +299,5 @@ def write_flight_report(folder: RunFolder) -> None:
 
 
 def _image(name: str) -> str:
-    """Return a figure of the run folder as HTML."""
+    """Return the HTML of a picture in the run folder."""
     return f'<p><img src="figures/{name}" alt="{name.partition(".")[0]}"></p>\n'

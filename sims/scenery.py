@@ -1,4 +1,4 @@
-"""Visual surroundings of a flight: solid parts, a pitching machine, and their MJCF."""
+"""Visual surroundings of a flight: solid parts, a pitching machine, and their MJCF text."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -9,48 +9,48 @@ from scipy.spatial import ConvexHull
 from planner_jax.sims.robot import Solid
 
 GROUND_COLOUR = "#A9C4A9"
-FLAT = 0.01  # [m]; parts that are no higher lie flat on the ground
-VISUAL = 'mass="0" contype="0" conaffinity="0"'  # MJCF attributes of visual geoms
+FLAT = 0.01  # [m], height up to which a part counts as lying flat on the ground
+VISUAL = 'mass="0" contype="0" conaffinity="0"'  # MJCF attributes of geoms that are visual only
 _STEEL, _RUBBER = "#5B6B73", "#2E8B57"
-_SIDES, _RINGS = 14, 3  # facets of a drawn capsule, around its axis and at each end
+_SIDES, _RINGS = 14, 3  # numbers of facets of a drawn capsule, around its axis and at each end
 
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """An upright solid."""
+    """An upright box or cylinder of the surroundings, for drawing."""
 
     kind: str  # "box" or "cylinder"
-    # [m]: length, width, height; the length and width of a cylinder are its diameter
+    # [m]: length, width, height; the length and width of a cylinder are its diameter.
     size: tuple[float, float, float]
     centre: tuple[float, float, float]  # [m], world frame
     colour: str  # as #RRGGBB
-    turn: float = 0.0  # [rad] about z
+    turn: float = 0.0  # [rad], rotation about z
     opacity: float = 1.0  # less than 1 for transparent parts
 
     @property
     def quat_wxyz(self) -> tuple[float, float, float, float]:
-        """The attitude as a quaternion."""
+        """The part's attitude as a unit quaternion, w x y z."""
         return (float(np.cos(0.5 * self.turn)), 0.0, 0.0, float(np.sin(0.5 * self.turn)))
 
 
 @dataclasses.dataclass(frozen=True)
 class Prism:
-    """An upright prism on the ground, at rest or at constant velocity without rotation."""
+    """An upright prism on the ground that stands still or moves at constant velocity."""
 
-    corners: np.ndarray  # (V, 2) [m], of its base at time 0, convex, in either orientation
+    corners: np.ndarray  # (V, 2) [m], of its convex base at time 0, in either orientation
     height: float  # [m]
     colour: str  # as #RRGGBB
     velocity: tuple[float, float] = (0.0, 0.0)  # [m/s]
 
     def outlines(self, time: float) -> list[np.ndarray]:
-        """Return its edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
+        """Return the edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
         base = self.corners + time * np.asarray(self.velocity)
         ring = np.concatenate([base, base[:1]])
         low, high = (np.pad(ring, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height))
         return [low, high, *(np.stack([low[k], high[k]]) for k in range(len(base)))]
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return corners (2 V, 3) [m] at time 0, and triangles (T, 3) of sides and top."""
+        """Return corners (2 V, 3) [m] at time 0, and triangles (T, 3) of the sides and the top."""
         num = len(self.corners)
         low, high = (
             np.pad(self.corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height)
@@ -63,11 +63,11 @@ class Prism:
 
 
 def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[Part]:
-    """Return a pitching machine: two wheels beside the mouth, a case behind it, mast and foot.
+    """Return the parts of a pitching machine: two wheels beside the mouth, a case, mast and foot.
 
     Args:
-        mouth: (3,) [m], where balls leave it, above the ground.
-        heading: [rad] of the throws, from the x axis.
+        mouth: (3,) [m], point where balls leave the machine, above the ground.
+        heading: [rad], direction of the throws, from the x axis.
     """
     ahead = np.array([np.cos(heading), np.sin(heading), 0.0])
     aside = np.array([-np.sin(heading), np.cos(heading), 0.0])
@@ -89,7 +89,7 @@ def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[P
 
 
 def outlines(part: Part) -> list[np.ndarray]:
-    """Return a part's edges as lines, each (M, 3) [m], world frame."""
+    """Return the edges of a part as lines, each (M, 3) [m], in the world frame."""
     if part.kind == "box":
         angle = np.linspace(0.25, 2.25, 5) * np.pi
         ring = np.sign(np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -108,7 +108,7 @@ def outlines(part: Part) -> list[np.ndarray]:
 
 
 def hull(points: np.ndarray) -> Solid:
-    """Return the convex hull of points (P, 3) [m]; all points must be vertices of it."""
+    """Return the convex hull of points (P, 3) [m], all of which must be vertices of the hull."""
     found = ConvexHull(points)
     a, b, c = (points[found.simplices[:, k]] for k in range(3))
     inward = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
@@ -123,7 +123,7 @@ def box_solid(lower: np.ndarray, upper: np.ndarray) -> Solid:
 
 
 def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid:
-    """Return a capsule around the segment between two ends (3,) [m], as rings of points."""
+    """Return a capsule around the segment between two ends (3,) [m], as a mesh."""
     along = np.asarray(second, float) - first
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
@@ -141,22 +141,22 @@ def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid
 
 
 def part_solid(part: Part) -> Solid:
-    """Return the surface of a part in the world frame."""
+    """Return the surface of a part, with a cylinder as a prism, in the world frame."""
     return hull(np.concatenate([line[:-1] for line in outlines(part)[:2]]))
 
 
 def xml_numbers(*values: float) -> str:
-    """Return numbers as MJCF text."""
+    """Format numbers as MJCF text, separated by blanks."""
     return " ".join(f"{value:.9g}" for value in values)
 
 
 def xml_colour(colour: str, opacity: float = 1.0) -> str:
-    """Return the MJCF colour of #RRGGBB."""
+    """Convert a colour #RRGGBB and an opacity to MJCF text."""
     return xml_numbers(*(int(colour[k : k + 2], 16) / 255.0 for k in (1, 3, 5)), opacity)
 
 
 def part_xml(part: Part) -> str:
-    """Return a part as a geom of MJCF."""
+    """Return a part of the surroundings as an MJCF geom."""
     length, width, height = (0.5 * size for size in part.size)
     half = (length, width, height) if part.kind == "box" else (length, height)
     return (

@@ -1,6 +1,6 @@
-"""Detection of contacts between tool and balls.
+"""Detection of contacts between a robot's tool and the balls, in every physics step.
 
-A tool is a disc on the z axis of the body that carries it. A contact is the passage of the ball's
+The tool is a disc on the z axis of the body that carries it. A contact is the passage of the ball's
 centre through the disc's plane from above; its time is interpolated between two steps. A ball that
 passes within the disc's radius is caught by a net, or hit by a racket.
 """
@@ -16,22 +16,22 @@ from planner_jax.sims.robot import Physics
 
 @struct.dataclass
 class Contact:
-    """The nearest passage of one ball so far, or the passage at which it was met; world frame."""
+    """One ball's contact with the tool, or its nearest passage of the disc's plane so far."""
 
-    met: Array  # () bool, within the radius
+    met: Array  # () bool, whether the passage is within the disc's radius
     time: Array  # () [s], time of the passage
     offset: Array  # () [m], distance of the ball from the disc's centre; inf before any passage
-    ball_pos: Array  # (3,) [m]
-    ball_vel: Array  # (3,) [m/s]
+    ball_pos: Array  # (3,) [m], position of the ball at the passage
+    ball_vel: Array  # (3,) [m/s], velocity of the ball at the passage
     robot_pos: Array  # (3,) [m], position of the body with the tool
     tool_vel: Array  # (3,) [m/s], velocity of the tool at the ball, rotation included
-    normal: Array  # (3,) z axis of the body with the tool
-    planned_time: Array  # () [s], contact time of the plan that was active then
-    tracking: Array  # () [m], distance of the robot from its plan then
+    normal: Array  # (3,), unit z axis of the body with the tool
+    planned_time: Array  # () [s], contact time of the plan that was active at the passage
+    tracking: Array  # () [m], distance of the robot from its plan at the passage
 
 
 def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
-    """Return contacts before any passage, leaves (N, ...)."""
+    """Return the contacts of balls that have not passed the tool's plane, leaves (N, ...)."""
     number, vector = jnp.zeros(num_balls, dtype), jnp.zeros((num_balls, 3), dtype)
     return Contact(
         met=jnp.zeros(num_balls, bool),
@@ -49,9 +49,9 @@ def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
 
 @struct.dataclass
 class Moment:
-    """Tool and balls at one instant.
+    """Positions and velocities of the tool's body and the balls at one instant.
 
-    Velocities are MuJoCo's: they belong to half a step before.
+    Velocities are MuJoCo's stored velocities, which belong to half a step earlier.
     """
 
     robot_pos: Array  # (3,) [m]
@@ -63,7 +63,7 @@ class Moment:
 
 
 def moment(world: World, physics: Physics) -> Moment:
-    """Return tool and balls of a simulated state."""
+    """Return positions and velocities of tool and balls in a simulated state."""
     motion = world.carrier.tool_motion(world.robot.state(physics))
     return Moment(*motion, *ball_states(world, physics))
 
@@ -71,18 +71,18 @@ def moment(world: World, physics: Physics) -> Moment:
 def passage(
     world: World, before: Moment, after: Moment, time: Array, planned: Array, reference: Array
 ) -> tuple[Array, Contact]:
-    """Return whether each ball passes the disc's plane from above within a step, and the passage.
+    """Return which balls pass the disc's plane from above within a step, and their passages.
 
     Args:
-        world: the world with the tool and the time step.
+        world: the world, with the tool and the time step.
         before: tool and balls at `time`.
         after: tool and balls one step later.
-        time: () [s].
+        time: () [s], start of the step.
         planned: (N,) [s], planned contact times.
         reference: (3,) [m], planned position of the robot at `time`.
 
     Returns:
-        (N,) bool, and contacts with leaves (N, ...).
+        (N,) bool, whether each ball passes, and the passages with leaves (N, ...).
     """
 
     def gap(at: Moment) -> Array:
@@ -116,9 +116,9 @@ def passage(
 
 
 def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
-    """Return the nearer of two passages: the contact so far, or a later passage.
+    """Return a ball's contact so far, or a later passage if that one is nearer to the centre.
 
-    The contact so far is returned if the ball is already met.
+    A ball that is already met keeps its contact.
     """
     take = passes & ~contact.met & (later.offset < contact.offset)
 

@@ -1,8 +1,9 @@
 """Detection of a ball in an image by its colour, and its position from the depth of its pixels.
 
 The method follows [Natarajan2024, Section IV-F]. Thresholds of hue, saturation and value give a
-mask. Pixels of low confidence and depths of other objects are dropped. The ball's position is the
-centroid of the remaining pixels, if there are enough of them.
+The method follows [Natarajan2024, Section IV-F]. Thresholds of hue, saturation and value give a
+mask of pixels. Pixels of low confidence and pixels at the depth of other objects are dropped. The
+ball's position is the centroid of the remaining pixels, if there are enough of them.
 """
 
 import jax
@@ -14,23 +15,23 @@ from jax import Array, lax
 from planner_jax.studies.block.camera import Camera, back_project, from_numbers
 from planner_jax.studies.block.noise import StereoNoise
 
-WINDOW = 64  # [px], edge of the square around the mask's median that is evaluated
-# Mean height of a sphere's visible half, seen from afar, above the plane through its centre, in
-# radii.
+WINDOW = 64  # [px], edge of the evaluated square around the median of the mask's pixels
+# Mean height of a sphere's visible half above the plane through its centre, in radii, seen from a
+# large distance.
 _MEAN_HEIGHT = 2.0 / 3.0
-_WHOLE = 0.7  # least visible share of a ball's pixels at its depth
+_WHOLE = 0.7  # least fraction of a ball's pixels, expected at its depth, that must be visible
 
 
 @struct.dataclass
 class BallThresholds:
-    """Thresholds that separate a ball's pixels from others."""
+    """Thresholds that separate the pixels of a ball from other pixels."""
 
-    lower: Array  # (3,) hue, saturation and value, each 0 to 1
-    upper: Array  # (3,) the same; an upper hue below the lower one means a range across hue 1
+    lower: Array  # (3,), lower limits of hue, saturation and value, each 0 to 1
+    upper: Array  # (3,), upper limits; an upper hue below the lower hue means a range across 1
     radius: Array  # () [m], radius of the ball
-    confidence: Array  # () least confidence of a pixel
-    pixels: Array  # () least number of pixels of a ball
-    reach: Array  # () [m], greatest depth
+    confidence: Array  # (), least confidence of a pixel
+    pixels: Array  # (), least number of pixels of a ball
+    reach: Array  # () [m], greatest depth of a pixel
 
 
 def ball_thresholds(
@@ -42,10 +43,10 @@ def ball_thresholds(
     pixels: float = 4,
     reach: float = 14.0,
 ) -> BallThresholds:
-    """Return thresholds of a ball as NumPy float32 leaves; the default ball is orange.
+    """Return thresholds for a ball as NumPy float32 leaves; the default ball is orange.
 
     Raises:
-        ValueError: a colour is not between 0 and 1, or the radius is not positive; one line.
+        ValueError: a colour is not between 0 and 1, or the radius is not positive.
     """
     for name, value in (("lower", lower), ("upper", upper)):
         colour = np.asarray(value)
@@ -66,10 +67,10 @@ def ball_thresholds(
 
 @struct.dataclass
 class Sighting:
-    """A ball detected in one frame; NaN where it is not seen."""
+    """A ball detected in one frame; positions are NaN if the ball is not seen."""
 
     place: Array  # (3,) [m], position of the ball's centre, world frame
-    pixel: Array  # (2,) [px], column and row
+    pixel: Array  # (2,) [px], column and row of the ball's centre
     depth: Array  # () [m], depth of the ball's centre, along the camera's axis
     pixels: Array  # () int32, number of pixels from which the depth was computed
 
@@ -91,14 +92,14 @@ def hue_saturation_value(rgb: Array) -> Array:
 
 
 def colour_mask(image: Array, thresholds: BallThresholds) -> Array:
-    """Return which pixels have the ball's colour, (rows, columns), of bytes (rows, columns, 3).
+    """Return which pixels of an image (rows, columns, 3) have the ball's colour, (rows, columns).
 
     The result equals a comparison with `hue_saturation_value`, but needs no division per pixel.
     """
     red, green, blue = (image[..., k].astype(jnp.float32) for k in range(3))
     value = jnp.maximum(jnp.maximum(red, green), blue)
     span = value - jnp.minimum(jnp.minimum(red, green), blue)
-    # The quantity 6 hue span, from 0 to 6 span.
+    # `turn` is 6 * hue * span, which lies between 0 and 6 * span.
     turn = jnp.where(
         value == red,
         green - blue + jnp.where(green < blue, 6.0, 0.0) * span,
@@ -115,24 +116,25 @@ def colour_mask(image: Array, thresholds: BallThresholds) -> Array:
 def sighting(
     image: Array, depth: Array, confidence: Array, camera: Camera, thresholds: BallThresholds
 ) -> Sighting:
-    """Return where the ball is in one frame.
+    """Detect the ball in one frame and return its position.
 
-    1. The medians of the mask's columns and rows, which stray pixels hardly affect, give the centre
-    of a window of 64 pixels.
+    1. A window of 64 pixels is centred at the medians of the mask's columns and rows, which stray
+    pixels hardly affect.
 
-    2. In the window the depth uses the confident pixels near the median depth: within three robust
-    standard deviations (1.48 times the median deviation) and a radius of it.
+    2. The depth is the mean over confident pixels of the window near the median depth. Near means
+    within the ball's radius plus three robust standard deviations (1.48 times the median
+    deviation).
 
-    3. The centroid uses all pixels of the mask near the centroid of those pixels.
+    3. The centroid of these pixels is refined: it uses all pixels of the mask near this centroid.
 
     4. Depths are of the ball's surface. Their mean over the visible half is two thirds of a radius
     in front of the ball's centre, which is corrected.
 
-    A ball counts as not seen if less than 0.7 of it is visible, such as behind a pole: its centroid
-    would be biased.
+    A ball counts as not seen if less than 0.7 of it is visible, such as behind a pole, because its
+    centroid would be biased.
 
     Args:
-        image: (rows, columns, 3) bytes, red, green and blue; at least 64 each way.
+        image: (rows, columns, 3) bytes, red, green and blue; at least 64 rows and columns.
         depth: (rows, columns) [m]; NaN where there is none.
         confidence: (rows, columns), 0 to 1.
         camera: the camera that took the frame.
@@ -160,8 +162,8 @@ def sighting(
     across = (first + jnp.stack(corner[::-1]) - camera.centre) / camera.focal
     along = jnp.sqrt(1.0 + jnp.sum(across**2))
     deep = mean(depth, usable) + _MEAN_HEIGHT * thresholds.radius / along
-    # Holes in the depth would bias the centroid. So it uses all pixels of the ball's colour within
-    # its apparent radius. Away from the camera's axis the image of a ball is stretched.
+    # Holes in the depth would bias the centroid. The centroid therefore uses all pixels of the
+    # ball's colour within its apparent radius. Off the camera's axis a ball's image is stretched.
     round_px = camera.focal * thresholds.radius / jnp.maximum(deep, thresholds.radius)
     within = 1.5 * along * round_px + 1.0
     near = mask & ((column - first[0]) ** 2 + (row - first[1]) ** 2 <= within**2)
@@ -180,10 +182,11 @@ def sighting(
 def noisy_depth(
     key: Array, camera: Camera, noise: StereoNoise, depth: Array
 ) -> tuple[Array, Array]:
-    """Return a stereo camera's depth image, from the true one.
+    """Return a stereo camera's noisy depth image, from the true depth image.
 
-    One disparity error is common to the whole image. Each pixel also has its own error. A pixel may
-    have no depth at all (NaN), or a mismatched one: up to twice or half the true depth.
+    One disparity error is common to the whole image, and each pixel has its own error in addition.
+    A pixel may have no depth at all (NaN). A mismatched pixel has a depth from half to twice the
+    true depth.
 
     Args:
         key: random key of the noise.
@@ -193,8 +196,8 @@ def noisy_depth(
 
     Returns:
         depth: (rows, columns) [m].
-        confidence: (rows, columns), 0 to 1; an assumption: uniform over 0.4 to 1 for well-matched
-            pixels, and over 0 to 0.6 for mismatched ones.
+        confidence: (rows, columns), 0 to 1. It is an assumption: uniform over 0.4 to 1 for matched
+            pixels, and over 0 to 0.6 for mismatched pixels.
     """
     common, own, hole, other, factor, trust = jax.random.split(key, 6)
     dtype = depth.dtype
@@ -211,13 +214,13 @@ def noisy_depth(
 
 
 def _middle(counts: Array) -> Array:
-    """Return the index () in counts (n,) at which the cumulative count reaches one half."""
+    """Return the index () at which the cumulative sum of counts (n,) reaches half of its total."""
     until = jnp.cumsum(counts)
     return jnp.searchsorted(until, 0.5 * until[-1])
 
 
 def _median(values: Array, usable: Array) -> Array:
-    """Return the median () of the usable values; 0 if none is usable."""
+    """Return the median () of the usable values of an array; 0 if none is usable."""
     num = jnp.sum(usable)
     ordered = jnp.sort(jnp.where(usable, values, jnp.inf).reshape(-1))
     both = ordered[jnp.maximum(num - 1, 0) // 2] + ordered[num // 2]

@@ -1,8 +1,8 @@
-"""Observations of the balls by motion capture, and their estimated states.
+"""Observations of the balls by motion capture, and estimates of the balls' states and drag.
 
-An observation shows a ball one latency ago, with noise, or nothing. The library's Kalman filter
-estimates position and velocity from the observations. The energy that the ball has lost since the
-first good estimate gives its drag [Yu2023bat, eqs 6 and 7]. World frame, SI units.
+An observation shows the noisy position of a ball one latency ago, or is missing. The library's
+Kalman filter estimates position and velocity from the observations. The energy that the ball has
+lost since the first good estimate gives its drag [Yu2023bat, eqs 6 and 7]. World frame, SI units.
 """
 
 import dataclasses
@@ -16,16 +16,16 @@ from planner_jax.ball.estimation import EkfModel, EkfState, ekf_init, ekf_predic
 from planner_jax.ball.flight import BallState, fly, rk4_step
 from planner_jax.sims.noise import Sensing
 
-_LEAST_STD = 1e-3  # [m], least standard deviation that the filter assumes of a sensor
+_LEAST_STD = 1e-3  # [m], least standard deviation that the filter assumes of an observation
 _ACCELERATION_DENSITY = 0.01  # [m^2/s^3], spectral density of the filter's process noise
-_FLIGHT_STEPS = 4  # integration steps of a prediction over latency and planning
+_FLIGHT_STEPS = 4  # number of integration steps of a prediction over latency and planning
 _DRAG_SPREAD = 0.2  # relative standard deviation of the initial drag estimate
 
 
 def specific_energy(ball: BallState, gravity: Array) -> Array:
-    """Return the mechanical energy per unit mass  |v|^2 / 2 + g z  [m^2/s^2], g > 0 the magnitude.
+    """Return a ball's mechanical energy per unit mass,  |v|^2 / 2 + g z  [m^2/s^2], with g > 0.
 
-    [Yu2023bat] prints  + g' s  above eq. 6. With the paper's own g, which points down, that sum
+    [Yu2023bat] prints  + g' s  above eq. 6. The paper's g points down, so that the printed sum
     would not be conserved in free flight.
     """
     return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
@@ -33,24 +33,24 @@ def specific_energy(ball: BallState, gravity: Array) -> Array:
 
 @struct.dataclass
 class RlsState:
-    """Recursive least squares for one unknown x in  y = h x + noise of unit variance."""
+    """The estimate of one unknown x from measurements  y = h x + (noise of unit variance)."""
 
-    estimate: Array  # () x
-    # () of the estimate; an initial variance v counts like 1 / v measurements, h = 1
+    estimate: Array  # (), estimate of x
+    # (), variance of the estimate. An initial variance v counts like 1 / v measurements with h = 1.
     variance: Array
 
 
 def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsState:
-    """Return the estimate after one more measurement.
+    """Update a recursive least-squares estimate with one more measurement.
 
     Args:
         state: the estimate so far.
-        regressor: () h.
-        measurement: () y; where it is not finite the estimate stays as it is.
+        regressor: (), h.
+        measurement: (), y; if it is not finite, the estimate does not change.
     """
     usable = jnp.isfinite(measurement)
     y = jnp.where(usable, measurement, 0.0)
-    # P / (1 + h^2 P) equals the textbook's (1 - K h) P, but without cancellation.
+    # P / (1 + h^2 P) equals the textbook's (1 - K h) P, but subtracts no nearly equal numbers.
     variance = state.variance / (1.0 + regressor**2 * state.variance)
     error = y - regressor * state.estimate
     after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
@@ -59,18 +59,18 @@ def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsStat
 
 @struct.dataclass
 class Estimate:
-    """The estimate of one ball; the belief is one latency old."""
+    """The estimated state and drag of one ball."""
 
-    belief: EkfState
-    energy: Array  # () [m^2/s^2], specific, at the first good estimate
+    belief: EkfState  # Gaussian estimate of position and velocity, one latency ago
+    energy: Array  # () [m^2/s^2], energy per unit mass at the first good estimate
     energy_variance: Array  # () [m^4/s^4], variance of that energy
-    lever: Array  # () [m^3/s^2], integral of |v|^3 since then
-    prior: RlsState  # estimate of K_D [1/m] before any energy loss
-    drag: Array  # () K_D [1/m], current estimate
+    lever: Array  # () [m^3/s^2], integral of |v|^3 since the first good estimate
+    prior: RlsState  # estimate of K_D [1/m] before any energy loss is observed
+    drag: Array  # () [1/m], current estimate of K_D
 
 
 def observe(key: Array, pos: Array, sensing: Sensing) -> Array:
-    """Return an observation of balls at (N, 3) [m]; a row of NaN where one is missing."""
+    """Return noisy observations of balls at positions (N, 3) [m]; NaN rows where one is missing."""
     noise_key, drop_key = jax.random.split(key)
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
     lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout
@@ -87,9 +87,9 @@ def _model(sensing: Sensing, drag: Array, gravity: Array) -> EkfModel:
 
 
 def first_estimate(pos: Array, drag: Array) -> Estimate:
-    """Return the estimate of a ball that leaves a machine at (3,) [m].
+    """Return the first estimate of a ball that leaves a machine at `pos` (3,) [m].
 
-    Its velocity is unknown; its drag is estimated as `drag` ().
+    The velocity is unknown. `drag` () [1/m] is the initial estimate of K_D.
     """
     zero = jnp.zeros_like(drag)
     wide = ekf_init(pos, jnp.zeros_like(pos), pos_std=zero + 0.1, vel_std=zero + 10.0)
@@ -100,7 +100,7 @@ def first_estimate(pos: Array, drag: Array) -> Estimate:
 
 
 def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
-    """Return the estimate of one ball after one more observation (3,)."""
+    """Update the estimate of one ball by the Kalman filter with one observation (3,)."""
     model = _model(sensing, estimate.drag, gravity)
     period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
     ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
@@ -112,14 +112,15 @@ def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: 
 def update_unfiltered(
     estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array
 ) -> Estimate:
-    """Return the estimate after one more observation without a filter.
+    """Update the estimate of one ball with one observation (3,), without a filter.
 
-    The position is the observed one; the velocity follows from the previous position.
+    The new position is the observed position. The velocity follows from the observed position and
+    the previous position.
     """
     period = 1.0 / sensing.rate
     before = estimate.belief.ball
     flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
-    # The mean velocity over the period, plus half of the change of velocity over the period.
+    # The velocity at the end is the mean velocity, plus half of the velocity's change, in a period.
     vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
     taken = jnp.concatenate([seen, vel])
     blind = jnp.concatenate([flown.pos, flown.vel])
@@ -128,7 +129,7 @@ def update_unfiltered(
 
 
 def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
-    """Return the estimate with its current energy as reference for energy losses."""
+    """Make the ball's current energy the reference from which energy losses are measured."""
     energy, variance = _energy(estimate.belief, gravity)
     return dataclasses.replace(
         estimate, energy=energy, energy_variance=variance, lever=jnp.zeros_like(estimate.lever)
@@ -136,17 +137,18 @@ def anchor_energy(estimate: Estimate, gravity: Array) -> Estimate:
 
 
 def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
-    """Return the specific energy and its variance, to first order."""
+    """Return a ball's energy per unit mass, and the variance of this energy to first order."""
     slope = jnp.concatenate([jnp.stack([0.0 * gravity, 0.0 * gravity, gravity]), belief.ball.vel])
     variance = jnp.sum(slope[:, None] * belief.covariance * slope)
     return specific_energy(belief.ball, gravity), variance
 
 
 def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
-    """Return the estimate with K_D from the energy lost since the reference [Yu2023bat, eq. 7].
+    """Update the drag coefficient K_D from the energy that the ball has lost [Yu2023bat, eq. 7].
 
-    The total loss is combined once with the prior. The paper's running mean of losses between
-    observations would count the same noise repeatedly.
+    Drag takes the energy K_D * (integral of |v|^3) per unit mass since the reference was set. One
+    least-squares update combines this total loss with the prior of K_D. The paper instead averages
+    the losses between single observations, which would count the same noise repeatedly.
     """
     energy, variance = _energy(estimate.belief, gravity)
     std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))
@@ -155,5 +157,5 @@ def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
 
 
 def predict(estimate: Estimate, ahead: Array, gravity: Array) -> BallState:
-    """Return the predicted ball `ahead` [s] after the time of the belief."""
+    """Predict the state of a ball `ahead` [s] after the time of its position estimate."""
     return fly(estimate.belief.ball, ahead, estimate.drag, gravity, num_steps=_FLIGHT_STEPS)[0]

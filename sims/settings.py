@@ -1,6 +1,6 @@
 """Settings of a run of flights, one class per task; their fields become command-line options.
 
-This module imports neither JAX nor MuJoCo; `FlySettings.flight` does.
+This module imports neither JAX nor MuJoCo; the method `FlySettings.flight` imports both.
 """
 
 import dataclasses
@@ -23,24 +23,25 @@ from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
 _REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
-# The decision "given" needs an order and times in the case, which flights do not have.
+# The decision "given" needs an order and times in the case, which cases of flights do not have.
 _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
-_AT_ONCE = 4096  # flights per batch, by default
-# Estimated bytes of a simulated flight in a batch, and of the rows of a finished flight.
+_AT_ONCE = 4096  # greatest default number of flights per batch
+# Estimated memory [bytes] of a simulated flight in a batch, and of the rows of a finished flight.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz], greatest replanning rate
-_MOST_BALLS = 12  # balls of one flight, as in the largest suite; compile time grows with every ball
-INTERVAL = 0.8  # [s], between throws [Yu2023catch, Fig. 1]
+# Greatest number of balls of a flight, as in the largest suite. Compile time grows with every ball.
+_MOST_BALLS = 12
+INTERVAL = 0.8  # [s], time between two throws [Yu2023catch, Fig. 1]
 
 
 def fly_settings(task: str) -> type["FlySettings"]:
-    """Return the class of settings of a task's flights.
+    """Return the class of settings for a task's flights.
 
     Args:
-        task: its name in the registry, whose entry names the class as the task's `flight`.
+        task: name of the task in the registry; its entry names the class in the field `flight`.
 
     Raises:
-        ArgumentError: there is no task of that name, or it has no flights.
+        ArgumentError: there is no task of that name, or the task has no flights.
     """
     flown = {name: found.flight for name, found in all_tasks().items() if found.flight}
     require(task in flown, "task", f"one that can be flown ({', '.join(flown)})", task)
@@ -48,7 +49,7 @@ def fly_settings(task: str) -> type["FlySettings"]:
 
 
 def require_interval(sensing: Sensing, replan: float) -> None:
-    """Raise `ValueError` unless the interval of throws is a whole number of planning periods.
+    """Raise `ValueError` unless a whole number of planning periods fits between two throws.
 
     Args:
         sensing: settings of the observations.
@@ -61,10 +62,10 @@ def require_interval(sensing: Sensing, replan: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class FlySettings:
-    """The settings that the flights of all tasks share; a task's own class adds more.
+    """The settings that the flights of all tasks share; a task's subclass adds more.
 
     Raises:
-        ArgumentError: a value breaks its rule; one line that begins with its name.
+        ArgumentError: a value breaks its rule; the message is one line that begins with its name.
     """
 
     num: int = option(64, "N", "number of flights")
@@ -73,8 +74,8 @@ class FlySettings:
     planner: str = option("exact", "NAME", "planner of plans from scratch")
     replan: float | None = option(None, "HZ", _REPLAN.format("the task's own rate", "the first"))
 
-    TASK: ClassVar[Task]  # with its name and planners; only the first planner can replan
-    FLIGHT: ClassVar[str]  # its `FlightTask`, as "module:Class"
+    TASK: ClassVar[Task]  # the task; only the first of its planners can replan
+    FLIGHT: ClassVar[str]  # the task's subclass of `FlightTask`, as "module:Class"
     RATE: ClassVar[float]  # [Hz], default rate of replanning
 
     def __post_init__(self) -> None:
@@ -89,7 +90,7 @@ class FlySettings:
         self.check_rate()
 
     def require_memory(self) -> None:
-        """Raise `ArgumentError` unless the flights of a batch fit into memory."""
+        """Raise `ArgumentError` unless a batch and the rows of all flights fit into memory."""
         if self.batch is None:
             require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
         else:
@@ -98,7 +99,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; by default zero except for the task's first planner."""
+        """The rate of replanning [Hz]; the default is 0 unless the planner is the task's first."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -108,7 +109,7 @@ class FlySettings:
         return self.planner == next(iter(self.TASK.planners))
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the flights can replan at `rate`."""
+        """Raise `ValueError` unless the flights can replan at the rate `rate`."""
         require(self.rate >= 0.0, "replan", ">= 0", self.rate)
 
     def flight(self) -> Any:
@@ -118,7 +119,7 @@ class FlySettings:
 
 @dataclasses.dataclass(frozen=True)
 class BallFly(FlySettings):
-    """The settings that flights of tasks with balls share."""
+    """The settings that flights of all tasks with balls share."""
 
     noise: str = option("lab", "NAME", f"preset of sensing noise: {', '.join(NOISES)}")
     drag_error: float = option(
@@ -137,7 +138,7 @@ class BallFly(FlySettings):
 
 @dataclasses.dataclass(frozen=True)
 class CatchFly(BallFly):
-    """Flights of a quadrotor that catches thrown balls."""
+    """Settings of flights of a quadrotor that catches thrown balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(100, "exact"))
     planner: str = option("exact", "NAME", "planner of plans from scratch")
@@ -178,7 +179,7 @@ class CatchFly(BallFly):
         """Return the task's `sims.task.FlightTask` with these settings.
 
         Raises:
-            ArgumentError: the policy's file cannot be read.
+            ArgumentError: the file of the policy `decide` cannot be read.
         """
         from planner_jax.task.arguments import find_decision
 
@@ -198,7 +199,7 @@ class CatchFly(BallFly):
 
 @dataclasses.dataclass(frozen=True)
 class HitFly(BallFly):
-    """Flights of a quadrotor that hits served balls."""
+    """Settings of flights of a quadrotor that hits served balls."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(50, "exact"))
     planner: str = option("exact", "NAME", "planner of plans from scratch")
@@ -218,7 +219,7 @@ class HitFly(BallFly):
 
 @dataclasses.dataclass(frozen=True)
 class InterceptFly(FlySettings):
-    """Drives of a car that intercepts a moving target among obstacles."""
+    """Settings of drives of a car that intercepts a moving target among obstacles."""
 
     replan: float | None = option(None, "HZ", _REPLAN.format(1, "spacetime"))
     planner: str = option("spacetime", "NAME", "planner of plans from scratch")
@@ -249,7 +250,7 @@ class InterceptFly(FlySettings):
 
     @property
     def sensing(self) -> PlaneSensing:
-        """The sensing of car and target.
+        """The noise, latency and rate of the sensing of car and target.
 
         Raises:
             ValueError: a value is out of its range.
@@ -266,7 +267,7 @@ class InterceptFly(FlySettings):
 
 @dataclasses.dataclass(frozen=True)
 class BlockFly(FlySettings):
-    """Blocks of thrown balls by an arm with a shield."""
+    """Settings of blocks of thrown balls by an arm with a shield."""
 
     replan: float | None = option(
         None, "HZ", "with --perception: rate of replanning (default: 0, the arm plans once)"
@@ -335,7 +336,8 @@ class BlockFly(FlySettings):
     @property
     def until_known(self) -> float:
         """The time [s] from the first sight of the ball until its flight is known or fitted."""
-        # [Natarajan2024, Section VI-B]: 82.9 ms for perception and 50 ms for the remaining system.
+        # The default without perception is the sum of two times in [Natarajan2024, Section VI-B]:
+        # 82.9 ms for perception and 50 ms for the remaining system.
         usual = 0.25 if self.perception else 0.133
         return usual if self.observe is None else self.observe
 
@@ -347,7 +349,7 @@ class BlockFly(FlySettings):
 
     @property
     def drives(self) -> Drives:
-        """The limits of the drives, and the errors of the encoders.
+        """The torque limits and errors of the arm's drives and encoders.
 
         Raises:
             ValueError: a value is out of its range.
@@ -366,8 +368,8 @@ class BlockFly(FlySettings):
         """Return the task's `sims.task.FlightTask` with these settings.
 
         Raises:
-            ArgumentError: the planner's file is no library, or belongs to another scene or other
-                limits.
+            ArgumentError: the file of a library planner is no library, or the library was built for
+                another scene or other limits.
         """
         if BLOCK.split_planner(self.planner)[1]:
             from planner_jax.task.block import draw
@@ -377,7 +379,7 @@ class BlockFly(FlySettings):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the flights can replan at `rate`, and the drives are valid."""
+        """Raise `ValueError` unless the flights can replan at `rate` and the drives are valid."""
         rule = ">= 0, and 0 without perception: a block is planned once"
         most = math.inf if self.perception else 1e-9
         require(0.0 <= self.rate < most, "replan", rule, self.rate)

@@ -1,4 +1,4 @@
-"""The interface of a task to a run of flights; the classes in `tasks` implement it."""
+"""The interface between a task and a run of flights; the classes in `tasks` implement it."""
 
 import abc
 import dataclasses
@@ -21,9 +21,9 @@ from planner_jax.sims.settings import BallFly
 
 @dataclasses.dataclass(frozen=True)
 class FlightCases:
-    """B cases to fly, NumPy leaves; a task's own class adds the balls or targets."""
+    """B cases to fly, with NumPy leaves; a task's subclass adds the balls or targets."""
 
-    index: np.ndarray  # (B,) index in the run, from which the noise is drawn
+    index: np.ndarray  # (B,), index in the run, from which the noise is drawn
 
     def __len__(self) -> int:
         return len(self.index)
@@ -39,8 +39,8 @@ class Flights(abc.ABC):
     """The result of a batch of flights; leaves with a leading axis B."""
 
     first_plan: Any
-    flown: Any  # the simulated flights; `tracking` (B, 2) [m], rms and worst, and more
-    planning_seconds: float  # wall time spent on plans from scratch
+    flown: Any  # the simulated flights; `tracking` (B, 2) [m] has rms and greatest error
+    planning_seconds: float  # [s], wall time of plans that do not start from an earlier plan
 
     @property
     @abc.abstractmethod
@@ -50,26 +50,26 @@ class Flights(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class FlightTask(abc.ABC):
-    """A task with the settings of a run, as the run uses it.
+    """A task with its settings, as `run.py` uses it to fly, score and draw all cases of a run.
 
-    The settings name this class in `FLIGHT`; `run.py` needs nothing else of a task. A task with
-    balls inherits from `BallFlightTask`.
+    The settings name the task's subclass in `FLIGHT`. A task with balls inherits from
+    `BallFlightTask`.
     """
 
     settings: Any  # settings of the task's class of `FlySettings`
 
     THING: ClassVar[str] = "ball"  # name of the target in pictures
-    THING_RADIUS: ClassVar[float] = BALL_RADIUS  # [m]
-    CONTACT: ClassVar[str]  # participle for a met target in pictures: "caught"
+    THING_RADIUS: ClassVar[float] = BALL_RADIUS  # [m], radius of the target in pictures
+    CONTACT: ClassVar[str]  # participle for a met target in pictures, such as "caught"
     SUCCESS: ClassVar[str]  # predicate of a successful flight in sentences: "caught all balls"
-    PUBLISHED: ClassVar[str]  # published result of the task, for the table
-    # Columns of the rows, in addition to the columns of all tasks
+    PUBLISHED: ClassVar[str]  # published result of the task, for the report's table
+    # Columns of the task's rows, in addition to the columns of all tasks.
     COLUMNS: ClassVar[Sequence[Column]]
     # Corners [m] of the region that pictures show; None to fit all drawn objects.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
-    HAS_REACH: ClassVar[bool] = False  # whether `reachable` returns anything
+    HAS_REACH: ClassVar[bool] = False  # whether the task implements `reachable`
     VIEW: ClassVar[tuple[float, float]] = (18.0, -68.0)  # elevation and azimuth of pictures [deg]
-    # Position of the viewer's camera, and the point that it looks at [m].
+    # Position [m] of the viewer's camera, and the point [m] at which the camera is aimed.
     EYE: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
         (1.5, -8.0, 3.0),
         (1.9, 0.0, 1.2),
@@ -77,15 +77,15 @@ class FlightTask(abc.ABC):
 
     @abc.abstractmethod
     def world(self) -> World:
-        """Return the simulated world."""
+        """Return the simulated world in which the flights take place."""
 
     @abc.abstractmethod
     def cases(self) -> Any:
-        """Return all cases of the run, `FlightCases`."""
+        """Return all cases of the run, an instance of the task's `FlightCases`."""
 
     @abc.abstractmethod
     def fly(self, cases: Any, record: bool) -> Any:
-        """Plan and fly some cases, and return `Flights`.
+        """Plan and fly some cases, and return the task's `Flights`.
 
         With `record`, the result includes a record of every observation.
         """
@@ -95,9 +95,9 @@ class FlightTask(abc.ABC):
         """Return the recording of some of the recorded flights.
 
         Args:
-            cases: the flown cases.
-            flights: their result.
-            lanes: (F,) indices of the flights.
+            cases: the cases that were flown.
+            flights: the result of `fly` for these cases.
+            lanes: (F,) indices of the flights in the batch.
         """
 
     @property
@@ -108,7 +108,7 @@ class FlightTask(abc.ABC):
     @property
     @abc.abstractmethod
     def conditions(self) -> str:
-        """Noise and errors of the flights, as the beginning of a sentence."""
+        """Noise and errors of the flights, as the beginning of a sentence of the report."""
 
     @property
     @abc.abstractmethod
@@ -120,7 +120,7 @@ class FlightTask(abc.ABC):
         """Return all parameters of the simulation, as plain values for the manifest."""
 
     def every_column(self) -> Sequence[Column]:
-        """Return all columns of the task."""
+        """Return all columns of the task's rows, without the columns of all tasks."""
         return self.COLUMNS
 
     def surroundings(self, index: int) -> Sequence[Prism]:
@@ -128,27 +128,27 @@ class FlightTask(abc.ABC):
         return ()
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return where the robot of a flight could be: times [s] and points (P, 2) [m] then."""
+        """Return where a flight's robot could be: times [s], and points (P, 2) [m] at each time."""
         return ()
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return additional numbers from the rows of a run, for the summary."""
+        """Return the task's own numbers from the rows of a run, for the summary."""
         return {}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return additional sentences for the top of the report."""
+        """Return the task's own sentences for the top of the report."""
         return []
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return additional tables from the rows of a run."""
+        """Return the task's own tables from the rows of a run."""
         return ()
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Write additional figures of the rows of a run into a folder; return their file names."""
+        """Draw the task's own figures from the rows into a folder; return the file names."""
         return ()
 
     def title(self, recording: Recording, flight: int) -> str:
-        """Return task, index in the run and outcome of a flight."""
+        """Return a picture's title: task, index of the flight in the run, and outcome."""
         outcome = "success" if recording.success[flight] else "failure"
         return f"{self.settings.TASK.name} {recording.index[flight]}, {outcome}"
 
@@ -166,7 +166,7 @@ _CONTACTS = leaves_of(
 
 @dataclasses.dataclass(frozen=True)
 class BallFlightTask(FlightTask):
-    """A task with balls, flown in `sims.loop`."""
+    """A task with balls, flown by the closed loop `sims.loop`."""
 
     settings: BallFly
 
@@ -175,7 +175,7 @@ class BallFlightTask(FlightTask):
         """Return the states of the balls of some flights before and after their simulation."""
 
     def every_column(self) -> Sequence[Column]:
-        """Return the columns of contacts, and the task's own columns."""
+        """Return the columns of the contacts with balls, and the task's own columns."""
         return [*_CONTACTS, *self.COLUMNS]
 
     @property
@@ -188,24 +188,24 @@ class BallFlightTask(FlightTask):
 
     @property
     def simulated(self) -> str:
-        """Robot, motion capture and balls, for the report of a run."""
+        """A description of robot, motion capture and balls, for the report of a run."""
         exact = NOISES[self.settings.noise] == NOISES["none"]
         seen = "without errors or latency" if exact else "with noise, dropout and latency"
         robot = self.world().robot.WORDS
         return f"{robot}, motion capture {seen}, balls with quadratic drag"
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of the closed loop."""
+        """Return the settings of the closed loop as plain values for the manifest."""
         return dataclasses.asdict(self.loop(record=False))
 
     def loop(self, record: bool) -> Loop:
-        """Return the closed loop of the flights, with or without a record of every observation."""
+        """Return the closed loop's settings, with or without a record of every observation."""
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
 
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """Return the recording of some of the recorded flights; see `FlightTask`."""
+        """Return the recording of some of the recorded flights, as in `FlightTask`."""
         pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
         flown = dataclasses.replace(
             flights.flown,

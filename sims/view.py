@@ -1,7 +1,7 @@
-"""A browser viewer of recorded flights, with time slider, speed and a choice of flights.
+"""A browser viewer of recorded flights, with a time slider, a speed and a choice of flights.
 
-It needs the extra `view`. `recording.frame` computes what is visible at a sample; this module only
-displays it. The server plays whether or not a browser is connected.
+The viewer needs the extra `view`. `recording.frame` computes which objects are visible at a sample,
+and this module displays them. The flight plays whether or not a browser is connected.
 """
 
 import errno
@@ -30,25 +30,25 @@ _STEP = 0.01  # [s], step of the time slider
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
-    """Convert #RRGGBB to bytes."""
+    """Convert a colour #RRGGBB to red, green and blue, 0 to 255."""
     red, green, blue = (int(colour[k : k + 2], 16) for k in (1, 3, 5))
     return red, green, blue
 
 
 def segments(path: np.ndarray) -> np.ndarray:
-    """Return the segments (S, 2, 3) of a path (M, 3) between consecutive finite points."""
+    """Return the segments (S, 2, 3) between consecutive points of a path (M, 3), without NaN."""
     pairs = np.stack([path[:-1], path[1:]], axis=1)
     return pairs[np.isfinite(pairs).all(axis=(1, 2))]
 
 
 def free_address(host: str, port: int) -> str:
-    """Return the numeric address of a host name of this machine whose port is free.
+    """Return the numeric address of a host name of this machine at which a port is free.
 
     Port 0 stands for any free port.
 
     Raises:
-        ArgumentError: there is no such address, or the port is taken; one line that begins with
-            `host` or `port`.
+        ArgumentError: there is no such address, or the port is taken; the message is one line that
+            begins with `host` or `port`.
     """
     require(0 <= port <= 65535, "port", ">= 0 and <= 65535", port)
     own = ArgumentError("host", "an address of this machine", host)
@@ -68,10 +68,10 @@ def free_address(host: str, port: int) -> str:
 
 
 def _viser() -> Any:
-    """Return the package viser.
+    """Import and return the package viser.
 
     Raises:
-        ArgumentError: it is not installed.
+        MissingExtra: viser is not installed.
     """
     try:
         return importlib.import_module("viser")
@@ -84,12 +84,12 @@ class Viewer:
 
     Attributes:
         url: address of the page, with the access token if the host is not the loopback address.
-        flight: choice of the flight; its `value` is one of the task's titles.
+        flight: drop-down list; its `value` is the title of the displayed flight.
         time: slider; its `value` [s] is the displayed time.
-        playing: check box.
+        playing: check box, whether the flight plays.
         speed: slider; 1 is real time.
         reach: check box, whether to show where the robot could be; None if the task cannot compute
-            it.
+            this.
         robot: frames of the robot's shapes in the scene.
     """
 
@@ -102,10 +102,11 @@ class Viewer:
             task: the task of the run.
             recording: the recorded flights.
             host: name or address of this machine, at which the page is served.
-            port: 0 selects any free port.
+            port: port of the server; 0 selects any free port.
 
         Raises:
-            ArgumentError: viser is missing, or the page cannot be served there.
+            ArgumentError: the page cannot be served at this address.
+            MissingExtra: the package viser is not installed.
         """
         viser = _viser()
         address = free_address(host, port)
@@ -156,13 +157,13 @@ class Viewer:
         return self._titles.index(self.flight.value)
 
     def advance(self, seconds: float) -> None:
-        """Play for a time [s]; start again at the beginning once the end is passed."""
+        """Play for a time [s], and start again at the beginning after the end."""
         if self.playing.value:
             later = self.time.value + seconds * self.speed.value
             self.time.value = later if later <= self.time.max else self.time.min
 
     def run(self) -> None:
-        """Play until Ctrl-C, then stop the server."""
+        """Play until Ctrl-C is pressed, then stop the server."""
         try:
             before = time.monotonic()
             while True:
@@ -176,11 +177,11 @@ class Viewer:
             self.close()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the web server."""
         self._server.stop()
 
     def _add_fixed_objects(self) -> None:
-        """Add what all flights share: ground, scenery, robot, balls and their trails."""
+        """Add the objects that all flights share: ground, scenery, robot, balls and trails."""
         add = self._scene
         add.set_up_direction("+z")
         add.add_grid(
@@ -293,7 +294,7 @@ class Viewer:
             self._show()
 
     def _show(self) -> None:
-        """Draw the moving objects at the time of the slider."""
+        """Draw the moving objects at the time that the slider shows."""
         with self._lock, self._server.atomic():
             row, sample = self._row, self.sample
             robot = self.world.robot

@@ -1,1 +1,1 @@
-"""The parts that each task adds to the closed loop and to a run of flights."""
+"""The tasks hit, catch, intercept and block as simulated flights, for the closed loop and runs."""

@@ -1,4 +1,4 @@
-"""Runs of blocks in closed loop, as in `planner-jax fly block`; `block_flights` flies them."""
+"""Runs of blocks by `planner-jax fly block`: rows, recordings and findings of the flights."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -44,12 +44,12 @@ from planner_jax.task.block.scene import FLOOR
 from planner_jax.task.block.spec import SUITES
 from planner_jax.task.block.suites import BALL_RADIUS
 
-_BOUNCE = 0.5  # restitution of a blocked ball, in pictures only: an assumption
-_KEPT = 5  # simulated frames per recorded sample
+_BOUNCE = 0.5  # restitution of a blocked ball, an assumption that only pictures use
+_KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """Blocks as a task of a run of flights; the settings are `BlockFly`."""
+    """The task block for a run of flights; the settings are `BlockFly`."""
 
     settings: BlockFly
 
@@ -94,13 +94,13 @@ class BlockFlight(FlightTask):
     )
 
     def world(self) -> World:
-        """Return the world with the arm and its surroundings."""
+        """Return the simulated world with the arm and its drawn surroundings."""
         return dataclasses.replace(
             BLOCK_WORLD, scenery=scenery(BLOCK_ARM.arm, SUITES[self.suite].has_pole)
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of drives, encoders and control."""
+        """Return the parameters of drives, encoders and control, for the manifest."""
         robot = BLOCK_ARM
         return {
             "drives": dataclasses.asdict(self.settings.drives),
@@ -110,7 +110,7 @@ class BlockFlight(FlightTask):
         }
 
     def cases(self) -> Throws:
-        """Return all throws of the run."""
+        """Draw all throws of the run from its suite and seed."""
         settings = self.settings
         return throws(
             settings.suite,
@@ -122,7 +122,7 @@ class BlockFlight(FlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
-        """Fly blocks of some balls, and return the result; it always includes a record."""
+        """Plan and fly blocks of some balls; the result always includes a record."""
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
@@ -151,7 +151,7 @@ class BlockFlight(FlightTask):
     def recording(
         self, cases: Throws, flights: BlockFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """Return the recording of some of the flights; see `FlightTask`."""
+        """Return the recording of some of the flights, as in `FlightTask`."""
         lanes = np.asarray(lanes)
         some, flown, robot = cases[lanes], flights.flown, BLOCK_ARM
         kept = np.arange(0, flown.times.size, _KEPT)
@@ -172,7 +172,7 @@ class BlockFlight(FlightTask):
 
     @property
     def suite(self) -> str:
-        """The suite of throws."""
+        """The name of the suite of throws."""
         return self.settings.suite
 
     @property
@@ -190,7 +190,7 @@ class BlockFlight(FlightTask):
 
     @property
     def simulated(self) -> str:
-        """Arm and balls, for the report of a run."""
+        """A description of arm and balls, for the report of a run."""
         settings = self.settings
         if not settings.perception:
             return f"{BLOCK_ARM.WORDS}; balls fall freely and are known exactly"
@@ -204,7 +204,7 @@ class BlockFlight(FlightTask):
         )
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers of plans and contacts, misses, torques and times."""
+        """Return numbers of plans and contacts, and statistics of misses, torques and times."""
         planned, miss = np.asarray(rows["planned"]), np.asarray(rows["miss"])
         blocked = np.asarray(rows["blocked"])
         late = np.asarray(rows["time_plan"]) > self.settings.until_set
@@ -234,7 +234,7 @@ class BlockFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences about plans and blocks, contacts, and torques."""
+        """Return sentences about plans, blocked balls, contacts with obstacles, and torques."""
         number = summary["num"]
         planned, blocked, touched, after, late = (
             percent(summary[name], number)
@@ -280,7 +280,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Return positions (F, S, 3) [m] of balls for drawing, in flight and after the shield."""
+    """Return ball positions (F, S, 3) [m] for pictures, in flight and after a bounce."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

@@ -1,11 +1,12 @@
 """Blocks in closed loop: an arm with a shield executes plans against thrown balls [Natarajan2024].
 
-The ball's flight is known after a time of observation. Then a plan is made, and its wall time is
-measured. The arm starts when the planning budget is over, or later if its plan is not ready by
-then. The torques are limited, and nothing else moves the arm. The score depends on the motion of
-the simulated arm, in float64 and with the referee's geometry. Balls follow their parabola and need
-no simulation. Times count from the moment at which the ball is first seen. Positions are in the
-robot's base frame; recordings are in the world frame, with the floor at height 0.
+A ball's flight is known after a time of observation. Then a plan is made, and the wall time of
+planning is measured. The arm starts when the planning budget is over, or later if its plan is not
+ready by then. Only the limited torques of the joints move the arm. The score depends on the motion
+of the simulated arm; it is computed in float64 with the referee's geometry. Balls follow their
+parabola and need no simulation. Times count from the moment at which the ball is first seen.
+Positions are in the robot's base frame; recordings are in the world frame, with the floor at height
+0.
 """
 
 import dataclasses
@@ -41,13 +42,13 @@ BLOCK_ARM = ShieldArm(base_height=-FLOOR)
 BLOCK_WORLD = World(BLOCK_ARM, GRAVITY, num_balls=0, timestep=TIMESTEP)
 TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
 _AFTER = 0.3  # [s], simulated time after the contact, in which the joints brake
-_LANES = 64  # batch size of the computation of clearances
-FALL = np.array([0.0, 0.0, 1.0])  # direction of the vertical
+_LANES = 64  # number of flights for which clearances are computed at once
+FALL = np.array([0.0, 0.0, 1.0])  # unit vector along the vertical
 
 
 @dataclasses.dataclass(frozen=True)
 class Throws(FlightCases):
-    """B thrown balls, NumPy leaves."""
+    """B thrown balls and the arms' states, with NumPy leaves."""
 
     cases: BlockCase  # the delay is the time for sensing and planning
 
@@ -56,15 +57,15 @@ class Throws(FlightCases):
 class Budget:
     """Parts of the time until a ball enters the inner box, (B,) [s] [Natarajan2024, eq. 1].
 
-    The ball is blocked if its time of flight is at least the sum of the other times. A plan that
-    takes longer than the planning budget makes the arm late.
+    The parts sum up to the ball's time of flight. An arm whose plan takes longer than the planning
+    budget starts late.
     """
 
     sense: np.ndarray  # until the ball's flight is known
     plan: np.ndarray  # wall time of planning
     wait: np.ndarray  # from the end of planning until the arm starts
     move: np.ndarray  # duration of the plan's motion
-    # From the end of the motion to the planned contact; negative if the arm is late
+    # From the end of the motion to the planned contact; negative if the arm is late.
     stand: np.ndarray
     rest: np.ndarray  # from the planned contact until the ball enters the inner box
 
@@ -82,19 +83,19 @@ class BlockFlights(Flights):
     budget: Budget
     blocked: np.ndarray  # (B,) bool: the shield's face met the ball before the inner box
     contact: np.ndarray  # (B,) [s], time of contact between ball and shield; NaN without contact
-    contact_pos: np.ndarray  # (B, 3) [m], position of the ball's centre then; NaN without contact
-    # (B,) [m], of the ball from the shield's centre, when it crosses the shield's plane
-    # (B,) [m], distance of the ball from the shield's centre, in the shield's plane
+    contact_pos: np.ndarray  # (B, 3) [m], ball's centre at the contact; NaN without contact
+    # (B,) [m], distance of the ball from the shield's centre, in the shield's plane.
     miss: np.ndarray
-    # (B,) bool, whether the ball touched base or links 1 to 3 before the contact
+    # (B,) bool, whether the ball touched base or links 1 to 3 before the contact.
     struck: np.ndarray
     clearance: np.ndarray  # (B,) [m], least clearance up to the contact; negative inside
     nearest: np.ndarray  # (B,) str, link and obstacle at the least clearance
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    fit_error: np.ndarray  # (B,) [m], error of the first fit, across the flight; NaN if it is known
-    last_fit_error: np.ndarray  # (B,) [m], error of the last fit
+    # (B,) [m], error of the first fit, perpendicular to the flight; NaN if the flight is known.
+    fit_error: np.ndarray
+    last_fit_error: np.ndarray  # (B,) [m], error of the last fit of the ball's flight
 
     @property
     def touched(self) -> np.ndarray:
@@ -116,15 +117,16 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Return throws of a suite; see `pj.block.draw`."""
+    """Draw throws of a suite by `pj.block.draw`."""
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
 
 
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
-    """Return the courses of arms: their plans, which start after the delay, or a standstill.
+    """Return the courses of arms: motion, start time, and braking after the motion's end.
 
-    Arms without a plan stand still. Joints brake with the acceleration limit of the plans.
+    The motion of a plan starts after the delay. An arm without a plan stands still. Joints brake
+    with the acceleration limit of the plans.
     """
     coeffs = np.asarray(plans.motion.coeffs)
     solved = np.asarray(is_solved(plans.status))
@@ -150,7 +152,7 @@ def fly_blocks(
     seconds: np.ndarray | None = None,
     decided: Decided | None = None,
 ) -> BlockFlights:
-    """Plan and execute a batch of blocks.
+    """Plan and execute a batch of blocks, and score them.
 
     Args:
         world: a world with an arm.
@@ -158,15 +160,15 @@ def fly_blocks(
         seed: random seed of the encoders' noise, >= 0.
         drives: limits and errors of the drives.
         planner: planner of all plans, by default `online`.
-        planning_budget: [s], time for planning at the end of the delay; a plan that takes longer
-            starts later by the excess. None: planning takes no time.
-        plan: plans of the cases, instead of plans that are made here.
-        seconds: (B,) [s], wall times of these plans.
-        decided: motions of arms that plan from observations of their balls, instead of plans; with
-            the same delays.
+        planning_budget: [s], time for planning at the end of the delay. A plan that takes longer
+            starts late by the excess. With None, planning takes no time.
+        plan: plans of the cases; by default plans are made here.
+        seconds: (B,) [s], wall times of the passed plans.
+        decided: motions of arms that plan from observations of their balls, used instead of plans;
+            their delays must equal the delays of the cases.
 
     Raises:
-        ValueError: the arm of the cases is not the simulated one, or the planning budget exceeds
+        ValueError: the arm of the cases is not the simulated arm, or the planning budget exceeds
             the delay.
     """
     case = cases.cases
@@ -216,7 +218,7 @@ def fly_blocks(
 
 
 def require_arm(world: World, cases: BlockCase) -> None:
-    """Raise `ValueError` unless the simulated arm is the one for which plans are made."""
+    """Raise `ValueError` unless the simulated arm equals the arm for which plans are made."""
     if not isinstance(world.robot, ShieldArm):
         raise ArgumentError("world", "an arm", verb="hold", shown=f"a {type(world.robot).__name__}")
     own = jax.tree.leaves_with_path(world.robot.arm)
@@ -234,7 +236,7 @@ def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
-    """Return when balls enter the inner box, (B,) [s]; infinite if never."""
+    """Return when each ball enters the inner box, (B,) [s]; infinite if it never does."""
     with np.errstate(invalid="ignore"):  # NaN for balls that never rise as high as the box
         begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
@@ -248,18 +250,19 @@ def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
 
 
 def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
-    """Compare simulated motions with the balls and all obstacles, in float64.
+    """Score simulated motions: which balls are blocked, misses, and clearances from obstacles.
 
-    A ball is blocked when it comes down on the face of the shield, from in front and with its
-    centre over the face, before its centre is in the inner box and before it touches the arm. The
-    miss is its distance from the shield's centre then. Otherwise the miss is this distance where
-    the ball crosses the shield's plane; it is NaN if the ball does not cross the plane in time.
+    A ball is blocked if it reaches the face of the shield from in front, with its centre over the
+    face. This must happen before its centre is in the inner box and before it touches the arm. The
+    miss is the distance of a blocked ball from the shield's centre. For other balls the miss is
+    this distance where the ball crosses the shield's plane; it is NaN if the ball does not cross
+    the plane in time. All computations are in float64.
 
     Args:
         cases: leaves (B, ...).
         plans: the plans of the cases.
         flown: the simulated motions.
-        budget: the times.
+        budget: the parts of the times of flight.
     """
     case, times = referee_leaves(cases), flown.times
     angles = flown.angles.transpose(2, 0, 1)
@@ -316,8 +319,8 @@ def _strikes(
 ) -> np.ndarray:
     """Return whether each ball touches the base or links 1 to 3 in each frame, (B, S) bool.
 
-    The wrist is left out: its capsules protrude through the shield's face, but the real links do
-    not.
+    The wrist is left out, since its capsules protrude through the shield's face, while the real
+    links do not.
     """
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
@@ -336,7 +339,7 @@ def _least(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the least clearance (B,) [m] over the included frames, and the nearest obstacle.
 
-    The clearance is infinite where no frame is included.
+    The clearance is infinite if no frame is included.
     """
     least, names = [], []
     for begin in range(0, len(included), _LANES):

@@ -1,4 +1,4 @@
-"""Presentation of blocks: the scene around the arm, the time budget, and tables of the joints."""
+"""Pictures and tables of blocks: the scene around the arm, the time budget, and the joints."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
 _POLE = 3.0  # [m], height of the drawn pole
 _BARS = 32  # greatest number of balls in the picture of the time budget
-# Descriptions of the parts of `Budget`, which add up to the time of flight.
+# Descriptions of the times in `Budget`, whose sum is the ball's time of flight.
 BUDGET = {
     "sense": "until the ball's flight is known",
     "plan": "wall time of planning",
@@ -24,7 +24,7 @@ BUDGET = {
 
 
 def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
-    """Return a box of the scene as a part for drawing, in the world frame."""
+    """Convert a box of the scene to a part for drawing, in the world frame."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     (x, y, z), (length, width, height) = 0.5 * (lower + upper), upper - lower
     return Part("box", (length, width, height), (x, y, z - FLOOR), colour, opacity=opacity)
@@ -37,7 +37,7 @@ def _around(ends: np.ndarray, radius: float) -> np.ndarray:
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return parts for drawing: both boxes, the beams, the arm's pedestal and the pole."""
+    """Return the parts for drawing: both boxes, the beams, the arm's pedestal and the pole."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
@@ -55,7 +55,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Return the table of the time budget [Natarajan2024, eq. 1] from the rows of a run."""
+    """Make the table of the time budget [Natarajan2024, eq. 1] from the rows of a run."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -69,7 +69,7 @@ def budget_table(rows: Any) -> RateTable:
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Return the table of joint errors and torques of arms with a plan."""
+    """Make the table of joint errors and torques, over all arms that had a plan."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:
@@ -97,7 +97,7 @@ def joint_table(rows: Any) -> RateTable:
 
 
 def budget_figure(figure: Any, rows: Any) -> None:
-    """Draw one bar per ball, from the first sight of the ball until it enters the inner box."""
+    """Draw one bar per ball: the times from its first sight until it enters the inner box."""
     axes = figure.add_subplot()
     number = min(len(rows), _BARS)
     flights = np.arange(number)
@@ -105,7 +105,7 @@ def budget_figure(figure: Any, rows: Any) -> None:
     for name, colour in zip(BUDGET, (PURPLE, RED, PALE, BLUE, GREEN, SKY), strict=True):
         width = 1e3 * np.asarray(rows[f"time_{name}"])[:number]
         axes.barh(flights, np.maximum(width, 0.0), 0.8, left, color=colour, label=name)
-        left += width  # negative where an arm still moves at the planned contact
+        left += width  # a width is negative if the arm still moves at the planned contact
     contact = 1e3 * np.asarray(rows["contact_time"])[:number]
     axes.plot(contact, flights, "|", color=INK, ms=9, label="blocked")
     axes.set_yticks([])

@@ -1,9 +1,9 @@
 """Catches in closed loop: one or more balls, thrown at equal intervals [Yu2023catch].
 
-When a ball comes into sight, the previous one is about to be caught. The state of the quadrotor
-after that catch decides whether the next catch is possible. So every plan includes one more catch
-than there are visible balls. The next ball is assumed to be the shortest throw of the machine,
-which leaves the least time, and is planned again once it is seen.
+When a ball comes into sight, the previous ball is about to be caught. The state of the quadrotor
+after that catch decides whether the next catch is possible. Every plan therefore includes one more
+catch than there are visible balls. The next ball is assumed to be the shortest throw of the
+machine, which leaves the least time. Its catch is planned again once the ball is seen.
 """
 
 import dataclasses
@@ -52,14 +52,15 @@ from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.spec import DRAG  # of the published serves; [Yu2023catch] has no value
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-SEEN = 0.3  # [s], flight of a throw before its first plan: 2 m and more [Yu2023catch, VII-A]
+# [s], duration of a throw's flight before its first plan: at least 2 m [Yu2023catch, VII-A].
+SEEN = 0.3
 _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 
 
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Return the planner with higher initial thrusts if it is `exact` behind a decision."""
+    """Return the planner, with guesses of higher thrust if it is `exact` behind a decision."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -68,15 +69,15 @@ def _steadier(
 
 @dataclasses.dataclass(frozen=True)
 class Throws(FlightCases):
-    """B flights of N balls each, NumPy leaves.
+    """B flights of N thrown balls each, with NumPy leaves.
 
-    A ball's own time 0 is the start of the plan for it.
+    A ball's own time 0 is the start of the plan for this ball.
     """
 
     balls: BallState  # leaves (B, N, 3), each at its own time 0
     horizon: np.ndarray  # (B, N) [s], last time at which each ball may be caught, in its own time
-    drag: np.ndarray  # (B, N) K_D [1/m], the true one
-    believed: np.ndarray  # (B, N) K_D [1/m], initial estimate
+    drag: np.ndarray  # (B, N), true K_D [1/m]
+    believed: np.ndarray  # (B, N), initial estimate of K_D [1/m]
     gravity: np.ndarray  # (B,) [m/s^2], magnitude
     net_height: np.ndarray  # (B,) [m], height of the hoop above the propeller plane
     net_radius: np.ndarray  # (B,) [m], radius of the hoop
@@ -91,13 +92,13 @@ def throws(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_CATCHER,
 ) -> Throws:
-    """Return balls of the suite `throws`, which fly with quadratic drag.
+    """Draw flights of balls of the suite `throws`, which fly with quadratic drag.
 
     Args:
-        num: B >= 1.
-        num_balls: N, 1 to 3 in the paper.
+        num: B >= 1, number of flights.
+        num_balls: N, number of balls per flight, 1 to 3 in the paper.
         seed: >= 0, of the throws and of the signs of the drag's errors.
-        drag: K_D [1/m], the true one.
+        drag: true K_D [1/m].
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a net.
     """
@@ -123,7 +124,7 @@ def throws(
 
 
 class CatchFlights(Flights):
-    """The result of a batch of throws; leaves with a leading axis B."""
+    """The result of a batch of flights with thrown balls; leaves with a leading axis B."""
 
     @property
     def caught(self) -> np.ndarray:
@@ -145,22 +146,22 @@ def fly_catches(
     pilot: CatchPilot | None = None,
     plan: CatchPlan | None = None,
 ) -> CatchFlights:
-    """Plan and fly a batch of throws.
+    """Plan and fly a batch of flights with thrown balls.
 
-    Whenever a ball comes into sight, its catch and the next, awaited catch are planned from scratch
-    (`plan_ahead`). The plan starts where the last catch of an earlier ball will be made. Inside the
-    loop, all remaining catches are then replanned.
+    Whenever a ball comes into sight, its catch and the next, awaited catch are planned without an
+    earlier plan as guess (`plan_ahead`). This plan starts where the last catch of an earlier ball
+    will be made. Inside the loop, all remaining catches are then replanned.
 
     Args:
         loop: world, sensing, rates and gains.
         cases: the balls.
         seed: random seed of the noise, >= 0.
-        planner: planner of plans from scratch, by default `exact` with greedy decisions.
-        pilot: replans between these plans.
-        plan: first plan of each flight, for the first ball, instead of a plan that is made here.
+        planner: planner of `plan_ahead`, by default `exact` with greedy decisions.
+        pilot: part of the loop that replans between these plans.
+        plan: first plan of each flight, for the first ball; by default it is made here.
 
     Raises:
-        ValueError: the world, the plan or the number of balls does not fit.
+        ValueError: the world, the plan or the number of balls does not match the cases.
     """
     num_balls = cases.horizon.shape[1]
     sizes = {name: getattr(cases, name) for name in ("gravity", "net_height", "net_radius")}
@@ -200,7 +201,7 @@ def fly_catches(
             known = jax.tree.map(np.asarray, known)
             began = time.perf_counter()
             limits = [bounds(loop, each) for each in LIMITS]
-            if ball == 0 and not last and in_parts(flight):  # some lanes need all attempts
+            if ball == 0 and not last and in_parts(flight):  # some flights need all attempts
                 compile_attempts(planner, known)
             known, found = plan_ahead(planner, known, ball, limits)
             planning += time.perf_counter() - began
@@ -221,7 +222,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """Catches as a task of a run of flights; the settings are `CatchFly`."""
+    """The task catch for a run of flights; the settings are `CatchFly`."""
 
     settings: CatchFly
 
@@ -231,17 +232,17 @@ class CatchFlight(BallFlightTask):
     COLUMNS = (Column("caught", "", "each ball", list_of(BOOL), lambda b: b.verdict.caught),)
 
     def world(self) -> World:
-        """Return the simulated world, with the number of balls of the settings."""
+        """Return the simulated world, with as many balls as the settings request."""
         robot = Quadrotor(self.robot)
         return dataclasses.replace(CATCH_WORLD, robot=robot, num_balls=self.settings.balls)
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor."""
+        """The model of the quadrotor, by default the quadrotor of the paper."""
         return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:
-        """Return all throws of the run."""
+        """Draw all flights of the run from its seed."""
         settings = self.settings
         return throws(
             settings.num,
@@ -252,7 +253,7 @@ class CatchFlight(BallFlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
-        """Fly some throws, and return the result."""
+        """Plan and fly some flights by the settings, and return the result."""
         settings = self.settings
         return fly_catches(
             self.loop(record),
@@ -263,15 +264,15 @@ class CatchFlight(BallFlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of the closed loop, and the rate of new decisions."""
+        """Return the settings of the closed loop, and the rate of new decisions."""
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """Return the throws; no ball comes back."""
+        """Return the balls' states at the start of their plans; no ball is returned."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 
     @property
     def suite(self) -> str:
-        """The number of balls per flight."""
+        """The number of balls per flight, as text."""
         return "1 ball" if self.settings.balls == 1 else f"{self.settings.balls} balls"

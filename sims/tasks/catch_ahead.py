@@ -1,4 +1,4 @@
-"""Plans from scratch for a ball that comes into sight and for the next ball."""
+"""Plans from scratch, without an earlier plan, for a ball that comes into sight and the next."""
 
 import dataclasses
 import functools
@@ -26,30 +26,31 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.case import case as catch_case
 from planner_jax.task.catch.plan import CatchPlan
 
-_AIM = 0.4  # share of the net's radius that plans use; the remainder is a margin for errors
-# Limits of plans, from tight to the robot's own. Each pair has the margin above the robot's least
-# thrust, as a share of the range from there to hover, and a share of the robot's body rate limit.
-# Weak thrusts and fast rotations leave little control authority. Plans of the first catch start
-# with the first pair, so that the next plan can start within its limits; plans of later catches
-# start with the second pair. Where no plan satisfies a pair, the next pair is used.
+# Fraction of the net's radius within which plans catch; the remainder is a margin for errors.
+_AIM = 0.4
+# Limits of plans, from tight limits to the robot's own. Each pair has a margin above the robot's
+# least thrust, as a fraction of the range up to hover, and a fraction of the robot's body rate
+# limit. Weak thrusts and fast rotations leave little control authority. Plans of the first catch
+# use the first pair, so that the next plan can start within its limits. Plans of later catches use
+# the second pair. If no plan satisfies a pair, the next pair is used.
 LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
-    """Return the predicted cases of a ball that has come into sight and of the next ball.
+    """Return the cases for planning the catches of a new ball and of the next ball.
 
     A plan starts at the last catch of an earlier ball, or now if no such catch is left. Times of
-    the case count from there.
+    the case count from the start of the plan.
 
     Args:
         loop: settings of the flights' loop.
-        flights: leaves (B, ...).
-        new: (N,) bool, the balls that are to be planned.
+        flights: states of the flights, leaves (B, ...).
+        new: (N,) bool, the balls whose catches are to be planned.
         horizon: (B, N) [s] from now, last time at which each ball may be caught.
     """
     robot = loop.world.carrier
-    # The predicted targets are filled in below.
+    # The targets are placeholders; the function `one` replaces them by predictions.
     zeros = jnp.zeros((*horizon.shape, 3), horizon.dtype)
     nowhere = BallPath(BallState(zeros, zeros), drag=zeros, gravity=zeros[..., 0])
     empty = catch_case(
@@ -82,9 +83,9 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
 
 
 def until_last_catch(flight: FlightState, new: Array) -> Array:
-    """Return the time () [s] to the last planned catch of balls that are not `new` (N,).
+    """Return the time () [s] until the last planned catch of a ball that is not `new` (N,).
 
-    It is 0 if none is left.
+    The time is 0 if no such catch is left.
     """
     planned = CatchPilot().times(flight.plan) - (flight.time - flight.began)
     return jnp.maximum(jnp.max(jnp.where(flight.present & ~new, planned, 0.0)), 0.0)
@@ -94,12 +95,12 @@ def until_last_catch(flight: FlightState, new: Array) -> Array:
 def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
     """Return flights (B, ...) whose plans continue with catches of new balls.
 
-    Where an earlier ball is still to be caught, the new plan is appended to the current plan, after
-    the last such catch. Elsewhere the new plan is flown alone, from now on.
+    If an earlier ball is still to be caught, the new plan is appended to the current plan, after
+    the last catch of an earlier ball. Otherwise the new plan replaces the current plan from now on.
 
     Args:
         flights: the flights that were passed to `predict_case`.
-        found: plans (B, ...) of the cases that it returned.
+        found: plans (B, ...) of the cases that `predict_case` returned.
         new: (B, N) bool, the balls that `found` catches.
     """
 
@@ -111,14 +112,14 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
         used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # The number of catches of the old plan that stay, past ones included. The awaited catch
-        # comes last in the old plan; the found plan replaces it.
+        # Number of catches of the old plan that stay, including past catches. The awaited catch
+        # comes last in the old plan, and the found plan replaces it.
         num_kept = jnp.sum(used & ~new[old.order])
         place = jnp.arange(number)
         kept = place < num_kept
 
         def behind(old: Array, found: Array) -> Array:
-            """Return rows (N, ...), one per catch: first of the old plan, then of the new one."""
+            """Return rows (N, ...), one per catch: first of the old plan, then of the new plan."""
             rows = jnp.where(kept, 0, place - num_kept)
             shape = (number, *(1,) * (old.ndim - 1))
             return jnp.where(kept.reshape(shape), old, found[rows])
@@ -140,7 +141,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
             times=behind(old.times, end + found.times),
         )
         joined = dataclasses.replace(flight, plan=joined, present=present)
-        busy = until_last_catch(flight, new) > 0.0  # a ball seen before is still to be caught
+        busy = until_last_catch(flight, new) > 0.0  # whether an earlier ball is still to be caught
         return jax.tree.map(lambda a, b: jnp.where(busy, a, b), joined, alone)
 
     return jax.vmap(one)(flights, found, new)
@@ -148,9 +149,9 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """A driver that makes all attempts of a planner concurrently, needed or not."""
+    """A driver that makes all attempts of a planner concurrently, whether needed or not."""
 
-    # Starts no further attempts
+    # A time limit of 0 s, so that a call starts no further attempts.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
@@ -167,10 +168,10 @@ class _EveryAttempt(Driver):
 
 
 def compile_attempts(planner: Planner, cases: Any) -> None:
-    """Compile all programs that plans of a batch may need, with one thread for each attempt.
+    """Compile the programs of all attempts of a planner concurrently, one thread per attempt.
 
-    `plan` compiles an attempt only when the previous one has left cases unsolved. Some throws need
-    all attempts, and compiling one after another would take several times as long.
+    `plan` compiles an attempt only when the previous attempt has left cases unsolved. Some throws
+    need all attempts, and compiling one after another would take several times as long.
     """
     _EveryAttempt()(planner, cases)
 
@@ -181,19 +182,19 @@ def plan_ahead(
     ball: int,
     limits: Sequence[dict[str, Any]],
 ) -> tuple[CatchCase, CatchPlan]:
-    """Plan from scratch to catch a ball and, where possible, also the next one.
+    """Plan to catch a ball and, if possible, also the next ball, without an earlier plan.
 
-    Where no plan of both satisfies the limits, both are planned with wider limits: a plan for the
-    ball alone may leave the quadrotor where it cannot reach the next one. Where even that plan
-    breaks a limit by more than the loop would fly, the ball is planned alone. If nothing is solved,
-    the plan for the ball with the least violation is returned.
+    Cases without a solved plan for both balls are planned for both balls with wider limits. This is
+    tried first because a plan for the ball alone may leave the quadrotor where it cannot reach the
+    next ball. If even that plan exceeds a limit by more than the loop accepts, the ball is planned
+    alone. If no plan is solved, the plan for the ball with the least violation is returned.
 
     Args:
         planner: planner of catches, which also decides their order.
-        known: cases with both balls, or with the last one; a batch with NumPy leaves.
-        ball: its index among the targets.
-        limits: increasingly wide limits, as returned by `bounds`. `known` has the first ones for
-            the first ball, and the second ones for the others.
+        known: cases with both balls, or with the last ball; a batch with NumPy leaves.
+        ball: index of the ball among the targets.
+        limits: increasingly wide limits, as returned by `bounds`. `known` has the first limits if
+            this is the first ball, and the second limits for later balls.
 
     Returns:
         The cases and their plans; `present` marks the balls that each plan catches.
@@ -230,7 +231,7 @@ def plan_ahead(
 
 
 def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Return cases with NumPy leaves and other limits, as returned by `bounds`."""
+    """Return cases whose limits are replaced by `limits` from `bounds`; unchanged with None."""
     if limits is None:
         return cases
     leaves = {
@@ -240,7 +241,7 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Return least thrust [m/s^2] and greatest body rate [rad/s] for a pair of `LIMITS`."""
+    """Return the least thrust [m/s^2] and greatest body rate [rad/s] of a pair of `LIMITS`."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance

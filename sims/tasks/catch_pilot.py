@@ -1,4 +1,4 @@
-"""Replanning of catches during a flight."""
+"""Replanning of catches during a flight: the pilot that the closed loop calls every period."""
 
 import dataclasses
 import functools
@@ -22,48 +22,48 @@ from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.replan import ReplanCatch
 from planner_jax.task.catch.spec import DECISIONS, TRAINED
 
-_TABLE_NODES = 36
+_TABLE_NODES = 36  # number of nodes at which a ball's predicted trajectory is tabulated
 BORNE = 0.1  # greatest relative violation of a limit by a plan that is flown
 _KEPT = 0.01  # relative violation up to which a plan of the loop counts as feasible
-_CHEAPER = 0.95  # cost ratio below which a plan from scratch replaces a feasible warm-started one
-_INSTANT = 1e-3  # [s], shorter than any observation period
-LIFT = 0.1  # thrust at every catch in guesses of plans: 0 is hover, 1 the greatest thrust
+_CHEAPER = 0.95  # cost ratio below which a plan from scratch replaces a feasible warm-started plan
+_INSTANT = 1e-3  # [s], time shorter than any observation period
+LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greatest thrust
 
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """Replans catches from the current plan, and from new decisions of order and times."""
+    """The pilot that replans catches from the current plan, and with new orders and times."""
 
-    # In the last 0.2 s before a catch, changing the plan costs more accuracy than new observations
-    # of the ball gain.
+    # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
+    # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # Greatest relative violation of a limit by a new plan that is flown. A new plan with a greater
-    # violation is flown only if the old plan violates its limits at least as much. The first value
-    # holds for the last catch, the second while several are left. In the second case most of the
-    # violation lies in later catches, which will be planned again from scratch. Rejecting the new
-    # plan would miss the ball that comes first.
+    # Greatest relative violation of a limit by a new plan that is flown. The first value is for the
+    # last catch, the second for several remaining catches. A new plan with a greater violation is
+    # flown only if the old plan's violation is at least as large. While several catches are left,
+    # most of the violation lies in later catches, which will be planned again. Rejecting the new
+    # plan would miss the first ball.
     excess: tuple[float, float] = (BORNE, 1.0)
-    # The name of a method of deciding, or "policy:FILE". With "given", order and times of the
-    # current plan stay, and only the trajectory is planned from scratch.
+    # Name of the method that decides order and times of the catches, or "policy:FILE". With "given"
+    # the order and times of the current plan stay, and only the trajectory is planned from scratch.
     decide: str = "greedy"
     redecide: float = 100.0  # [Hz], rate of new decisions, divides the replanning rate; 0 for never
     search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # search after a new decision
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
-        """Return planned catch times (N,) [s], in the balls' order."""
+        """Return the planned catch times (N,) [s], in the order of the balls."""
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
 
     def plan_shapes(self, cases: CatchCase) -> CatchPlan:
-        """Return the shapes of the plans of the planner behind the re-planner."""
+        """Return the shapes of the plans that this pilot's planner makes of cases (B, ...)."""
         return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """Return the problem of the remaining catches, while a plan is flown."""
+        """Return the problem of the remaining catches, while `plan` is flown."""
         made = plan.times <= outlook.elapsed
-        first = jnp.argsort(made, stable=True)  # remaining catches come first
+        first = jnp.argsort(made, stable=True)  # indices of catches, the remaining catches first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
         horizon = case.horizon - outlook.time
         left = dataclasses.replace(
@@ -79,7 +79,7 @@ class CatchPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
-        """A short round of the re-planner from the current plan, and a search from scratch.
+        """Two searches: a short round from the current plan, and a search from scratch.
 
         The search from scratch uses a new decision of order and times.
         """
@@ -92,15 +92,15 @@ class CatchPilot:
         outlook: Outlook,
         found: tuple[CatchPlan, ...],
     ) -> tuple[CatchPlan, Array]:
-        """Return the better of the plans, and whether it is good enough to be flown.
+        """Return the better of the found plans, and whether it is good enough to be flown.
 
-        A plan from scratch is selected if it violates the limits less, or if it is feasible at a
+        A plan from scratch is better if it exceeds the limits less, or if it is feasible at a
         clearly lower cost.
         """
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            # [s], since a decision was due.
+            # [s], time since a new decision was last due.
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)
@@ -110,7 +110,7 @@ class CatchPilot:
         return plan, good & (plan.violation <= jnp.maximum(excess, asked.previous.violation))
 
     def _decide_again(self, asked: Replanning[CatchCase, CatchPlan]) -> CatchPlan:
-        """Plan the remaining catches from scratch, with the first choice of a new decision."""
+        """Plan the remaining catches from scratch, with a newly decided order and times."""
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
@@ -118,12 +118,12 @@ class CatchPilot:
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Return whether () bool a plan from scratch is preferred to a warm-started one."""
+    """Return whether a plan from scratch is preferred to a warm-started plan, () bool."""
     return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
-    """Return predicted paths with quadratic drag of balls (N, ...) up to a horizon (N,) [s]."""
+    """Predict trajectories with quadratic drag of balls (N, ...) up to horizons (N,) [s]."""
     predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
     horizon = jnp.maximum(horizon, 0.1)
     return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)

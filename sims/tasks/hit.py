@@ -1,4 +1,4 @@
-"""Hits in closed loop: one served ball, volleyed to a target with a racket [Yu2023bat]."""
+"""Hits in closed loop: a quadrotor volleys a served ball to a target with a racket [Yu2023bat]."""
 
 import dataclasses
 import functools
@@ -47,17 +47,18 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-SEEN = 0.25  # [s], flight of a serve before its first plan: 2 m and more [Yu2023catch, VII-A]
+# [s], duration of a serve's flight before its first plan: at least 2 m [Yu2023catch, VII-A].
+SEEN = 0.25
 _AFTER = 0.1  # [s], simulated time after the last planned impact
-_LONGEST = 1.9  # [s], the longest flight
-_NEAR, _FAR = 0.5, 1.0  # [m] from the target: the two success radii of [Yu2023bat]
+_LONGEST = 1.9  # [s], duration of the longest flight of a serve
+_NEAR, _FAR = 0.5, 1.0  # [m], distances from the target: the two success radii of [Yu2023bat]
 
 _LINE_COLOUR, _MIDDLE_COLOUR, _DEAD_COLOUR = "#FFFFFF", "#24292F", "#D98880"
 _LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
 
 
 def court_parts() -> list[Part]:
-    """Return the court of [Yu2023bat] as flat boxes: dead zone, and lines of both halves."""
+    """Return the court of [Yu2023bat] as flat boxes: its dead zone and the lines of both halves."""
     length, width = court.HALF_LENGTH, court.HALF_WIDTH
     lines = [((0.0, -width), (0.0, width))]  # the first line is at the net
     for side in (-1.0, 1.0):
@@ -82,7 +83,7 @@ HIT_WORLD = World(
     Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
-    # Serves come from anywhere in a region; the machine is drawn in the middle of the far region.
+    # Serves start anywhere in a region; the machine is drawn in the middle of the far region.
     mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
 )
 
@@ -90,9 +91,9 @@ HIT_WORLD = World(
 def smooth_planner() -> ExactHit:
     """Return `ExactHit` with a first search of 60 iterations, and drag after the impact.
 
-    The limits of a plan do not include angular acceleration. After few iterations one plan in 150
-    satisfies them but needs more torque than the rotors have, and the ball lands up to 30 cm off.
-    The smoother plan at the end of a longer search avoids this.
+    The limits of a plan do not include angular acceleration. After few iterations one plan of 150
+    satisfies the limits but needs more torque than the rotors have, and the ball lands up to 30 cm
+    off. A longer search ends with a smoother plan, which avoids this.
     """
     planner = ExactHit(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
@@ -101,27 +102,27 @@ def smooth_planner() -> ExactHit:
 
 @dataclasses.dataclass(frozen=True)
 class HitPilot:
-    """Replans a hit from the current plan."""
+    """The pilot that replans a hit from the current plan, called by the loop every period."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
-    # Least time [s] to an impact that is replanned: the racket must settle.
+    # [s], least time to an impact at which the hit is replanned, since the racket must settle.
     shortest: float = 0.3
     # Greatest relative violation of a limit by a new plan that is flown.
     excess: float = 0.1
     passage = staticmethod(passage)
 
     def times(self, plan: HitPlan) -> Array:
-        """Return the planned time of the hit (1,) [s]."""
+        """Return the planned time of the hit, (1,) [s] since the start of the plan."""
         return plan.stroke.time[None]
 
     def plan_shapes(self, cases: HitCase) -> HitPlan:
-        """Return the shapes of the plans of the planner behind the re-planner."""
+        """Return the shapes of the plans that this pilot's planner makes of cases (B, ...)."""
         return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """Return the replanning problem, while a plan is flown."""
+        """Return the problem with the predicted ball and robot state, while `plan` is flown."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
@@ -130,7 +131,7 @@ class HitPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
-        """A short round of the re-planner."""
+        """The only search: a short round of the planner from the current plan."""
         return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
 
     def choose(
@@ -144,7 +145,7 @@ class HitPilot:
 
 
 def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
-    """Return one case with the estimated ball (leaves (1, 3)), its drag (1,) and a robot state."""
+    """Return a case with another ball (leaves (1, 3)), drag (1,) and state of the robot."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 
@@ -154,7 +155,7 @@ class Volleys(FlightCases):
     """B serves at the start of the plans for them."""
 
     cases: HitCase  # leaves (B, ...), with the true ball and drag
-    believed: np.ndarray  # (B,) K_D [1/m], initial estimate
+    believed: np.ndarray  # (B,), initial estimate of K_D [1/m]
 
 
 def volleys(
@@ -165,11 +166,11 @@ def volleys(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_HITTER,
 ) -> Volleys:
-    """Return drawn serves at the start of their plans, `SEEN` seconds after the serve.
+    """Draw serves, and return them at the start of their plans, `SEEN` seconds after the serve.
 
     Args:
-        num: B >= 1.
-        names: out of `court.SCENARIOS`; all of them by default.
+        num: B >= 1, number of serves.
+        names: scenarios out of `court.SCENARIOS`; by default all of them.
         seed: >= 0, of the serves and of the signs of the drag's errors.
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a racket.
@@ -187,8 +188,8 @@ def volleys(
 class HitFlights(Flights):
     """The result of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
 
-    landing: np.ndarray  # (B, 3) [m], landing point of the returned ball; NaN where it was missed
-    miss: np.ndarray  # (B,) [m], distance from the target; inf where the ball was missed
+    landing: np.ndarray  # (B, 3) [m], landing point of the returned ball; NaN without a contact
+    miss: np.ndarray  # (B,) [m], landing point's distance from the target; inf without a contact
 
     @property
     def success(self) -> np.ndarray:
@@ -197,14 +198,14 @@ class HitFlights(Flights):
 
 
 def reflect_ball(contact: Contact, restitution: Array) -> BallState:
-    """Return one ball just after the racket's impact, by the library's map [Yu2023bat, eq. 3]."""
+    """Return one ball just after its impact on the racket [Yu2023bat, eq. 3]."""
     vel = racket_impact(contact.ball_vel, contact.tool_vel, contact.normal, restitution)
     return BallState(pos=contact.ball_pos, vel=vel)
 
 
 @functools.partial(jax.jit, static_argnames="loop")
 def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
-    """Return the cases with the estimated balls."""
+    """Return the cases with estimated instead of true balls, at the end of the planning period."""
 
     def one(flight: FlightState, case: HitCase) -> HitCase:
         balls = predict_balls(loop, flight.earlier, loop.period)
@@ -214,7 +215,7 @@ def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
 
 
 def _reflect_balls(contact: Contact, truth: HitCase) -> BallState:
-    """Return balls just after their impacts, leaves (B, 3) in NumPy, NaN where they were missed."""
+    """Return balls just after their impacts, NumPy leaves (B, 3); NaN for balls not met."""
     one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
     balls = jax.device_get(jax.vmap(reflect_ball)(one, truth.restitution))
     return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
@@ -236,11 +237,11 @@ def fly_hits(
         cases: the serves.
         seed: random seed of the noise, >= 0.
         planner: planner of the first plan, by default `smooth_planner()`.
-        pilot: replans after the first plan.
-        plan: first plan of each flight, instead of a plan that is made here.
+        pilot: part of the loop that replans after the first plan.
+        plan: first plan of each flight; by default it is made here.
 
     Raises:
-        ValueError: a world or plan does not fit.
+        ValueError: a world or plan does not match the cases.
     """
     planner, pilot = planner or smooth_planner(), pilot or HitPilot()
     truth = cases.cases
@@ -260,8 +261,8 @@ def fly_hits(
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
     require_plan(first, HitPlan, known.head_state)
-    # The plan is copied through the host. Otherwise the first period would get arrays committed to
-    # a device, the later ones uncommitted arrays, and the programs would be compiled twice.
+    # The plan is copied through the host. Otherwise the arrays of the first period would be
+    # committed to a device and those of later periods not, and the programs would compile twice.
     begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
@@ -274,13 +275,13 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """Hits as a task of a run of flights; the settings are `HitFly`."""
+    """The task hit for a run of flights; the settings are `HitFly`."""
 
     settings: HitFly
 
     CONTACT = "hit"
     SUCCESS = f"landed within {_NEAR:g} m of the target"
-    # [Yu2023bat] shows its rates in a figure without numbers.
+    # [Yu2023bat] shows its success rates in a figure without numbers.
     PUBLISHED = "Bat, 600 real serves: within 0.5 m and 1 m, in a figure without numbers"
     COLUMNS = (
         Column("met", "", "by the racket", BOOL, lambda b: b.verdict.flown.contact.met[:, 0]),
@@ -289,16 +290,16 @@ class HitFlight(BallFlightTask):
     )
 
     def world(self) -> World:
-        """Return the simulated world with the court."""
+        """Return the simulated world with the drawn court."""
         return dataclasses.replace(HIT_WORLD, robot=Quadrotor(self.robot))
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor."""
+        """The model of the quadrotor, by default the quadrotor of the paper."""
         return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:
-        """Return all serves of the run."""
+        """Draw all serves of the run from its suite and seed."""
         settings = self.settings
         regions = REAL_SCENARIOS.get(settings.suite)
         return volleys(
@@ -310,13 +311,13 @@ class HitFlight(BallFlightTask):
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
-        """Fly some serves, and return the result."""
+        """Plan and fly some serves by the settings, and return the result."""
         name = self.settings.planner
         planner = None if name == "exact" else hit_planner(name)
         return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
 
     def launches(self, cases: Volleys, flown: Flown) -> Launches:
-        """Return the serves, and the balls that the racket returns."""
+        """Return the serves' states, and the states of the balls that the racket returns."""
         truth = cases.cases
         back = _reflect_balls(flown.contact, truth)
         balls = jax.tree.map(lambda leaf: leaf[:, None], truth.ball)
@@ -325,15 +326,15 @@ class HitFlight(BallFlightTask):
 
     @property
     def suite(self) -> str:
-        """The suite of serves."""
+        """The name of the suite of serves."""
         return self.settings.suite
 
     def counts(self, rows: Any) -> dict[str, int]:
-        """Return the numbers of balls that were hit, and that landed within the wider circle."""
+        """Return how many balls were hit, and how many landed within 1 m of the target."""
         miss, met = np.asarray(rows["miss"]), np.asarray(rows["met"])
         return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return a sentence about the wider circle and the racket."""
+        """Return a sentence about the balls within 1 m and the balls that the racket met."""
         within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
         return [f"{within} % within 1 m; the racket met the ball in {met} %."]

@@ -1,10 +1,10 @@
 """Interceptions in closed loop: a car meets a moving target among obstacles [Qu2022].
 
-The car has observed its target 15 times, once a second, before it starts; it continues to observe
-during the drive. Every plan uses a prediction of the target from the observations that have arrived
-until then, and starts at the car's estimated pose. Walls are known. Moving obstacles are known too,
-unless they are predicted from observations like the target. World frame in the plane, SI units;
-times count from the start of the first plan.
+Before it starts, the car has observed its target 15 times, once a second; it continues to observe
+during the drive. Every plan starts at the car's estimated pose and uses a prediction of the target
+from the observations that have arrived by then. Walls are known. Moving obstacles, the movers, are
+known too, unless they are predicted from observations like the target. World frame in the plane, SI
+units; times count from the start of the first plan.
 """
 
 import dataclasses
@@ -47,22 +47,22 @@ from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
 CAR_WORLD = World(Car(), GRAVITY, num_balls=0, timestep=1.0 / CONTROL_RATE)
-SUCCESS = 0.3  # [m], greatest miss of a success
+SUCCESS = 0.3  # [m], greatest distance from the target of a successful drive at its end
 TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
 _SHORTEST = 0.3  # [s], least time to the meeting at which the car replans
 _LEAST_STD = 1e-3  # [m], least standard deviation that the prediction assumes of an observation
-_CAUTION = 2.0  # standard deviations by which predicted movers are enlarged
-_POINTS = 9  # points of a predicted path in a recording
+_CAUTION = 2.0  # number of standard deviations by which predicted movers are enlarged
+_POINTS = 9  # number of points of a predicted path in a recording
 
 
 @dataclasses.dataclass(frozen=True)
 class Meetings(FlightCases):
-    """B interceptions and their observations, NumPy leaves."""
+    """B interceptions and their observations, with NumPy leaves."""
 
-    cases: InterceptCase  # the true ones
+    cases: InterceptCase  # the true cases
     times: np.ndarray  # (B, L) [s], times of the observations
     target: np.ndarray  # (B, L, 2) [m], observed positions of the target
-    movers: np.ndarray  # (B, L, N, 2) [m], observed centres of the movers
+    movers: np.ndarray  # (B, L, N, 2) [m], observed centres of the moving obstacles
 
 
 jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fields(Meetings)], [])
@@ -71,14 +71,14 @@ jax.tree_util.register_dataclass(Meetings, [each.name for each in dataclasses.fi
 def meetings(
     suite: str, num: int, seed: int = 0, *, noise: float = 0.1, observation_rate: float = 1.0
 ) -> Meetings:
-    """Return interceptions of a suite, with observations before the start and during the drive.
+    """Draw interceptions of a suite, with observations before the start and during the drive.
 
     Args:
         suite: name of a suite of `pj.intercept.draw`.
-        num: B >= 1.
+        num: B >= 1, number of interceptions.
         seed: >= 0, of cases and noise.
         noise: [m], standard deviation of an observed coordinate.
-        observation_rate: [Hz], during the drive; 0 for none.
+        observation_rate: [Hz], rate of observations during the drive; 0 for none.
     """
     cases = jax.tree.map(np.asarray, draw(num, suite, seed))
     before, seen = observe(cases, seed, noise)
@@ -113,14 +113,14 @@ def meetings(
 def predict_scene(
     loop: DriveLoop, meetings: Meetings, now: Array, *, known_target: bool, predict_movers: bool
 ) -> tuple[TurningPath, Obstacles]:
-    """Return the predicted targets and movers; times of both count from now.
+    """Predict targets and moving obstacles; times of the predictions count from `now`.
 
     Predicted movers are enlarged by `_CAUTION` standard deviations of their position.
 
     Args:
         loop: settings of the loop, with the sensing.
         meetings: leaves (B, ...).
-        now: () [s].
+        now: () [s], time since the start of the first plan.
         known_target: whether the targets' paths are known (static).
         predict_movers: whether movers are predicted from observations (static).
     """
@@ -129,7 +129,7 @@ def predict_scene(
 
     def one(meeting: Meetings) -> tuple[TurningPath, Obstacles]:
         case = meeting.cases
-        # Observations from before the start have all arrived; later ones arrive one latency late.
+        # Observations before the start have all arrived; later ones arrive one latency late.
         shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
         times, weights = meeting.times - now, shown.astype(now.dtype)
         if known_target:
@@ -144,7 +144,7 @@ def predict_scene(
             return target, dataclasses.replace(movers, centre=centre)
         fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
         state = jax.vmap(fit, in_axes=1)(meeting.movers)
-        # Standard deviation of a fitted line's value at time 0, from the noise of an observation.
+        # Standard deviation of a fitted line's position now, from the noise of an observation.
         number = jnp.sum(weights)
         middle = jnp.sum(weights * times) / number
         spread = jnp.sum(weights * (times - middle) ** 2)
@@ -168,16 +168,16 @@ def remaining(
     speed: Array,
     curvature: Array,
 ) -> InterceptCase:
-    """Return the remaining cases (B, ...), `elapsed` (B,) [s] after their start.
+    """Return the cases (B, ...) that remain after a part of their drive.
 
     Args:
         cases: the cases at their start.
-        elapsed: (B,) [s].
+        elapsed: (B,) [s], time since the start of the cases.
         target: predicted paths, with times that count from now.
-        movers: predicted movers at their current positions.
-        pose: (B, 3) [m, m, rad], of the rear axle.
-        speed: (B,) [m/s].
-        curvature: (B,) [1/m].
+        movers: predicted moving obstacles at their current positions.
+        pose: (B, 3) [m, m, rad], current pose of the rear axle.
+        speed: (B,) [m/s], current speed.
+        curvature: (B,) [1/m], current curvature of the path.
     """
     limits = cases.limits
     return dataclasses.replace(
@@ -197,12 +197,12 @@ class Driven:
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
     poses: np.ndarray  # (B, S, 3), x, y [m] of the rear axle's centre and heading [rad]
-    wanted: np.ndarray  # (B, S, 2) [m], planned positions
+    wanted: np.ndarray  # (B, S, 2) [m], planned positions of the rear axle
     meeting: np.ndarray  # (B,) [s], end of the last plan
     tracking: np.ndarray  # (B, 2) [m], distance of the rear axle from its plans: rms and worst
-    saturation: np.ndarray  # (B, 2), share of the time with drive and steering saturated
+    saturation: np.ndarray  # (B, 2), fraction of the time with drive and steering saturated
     plans: np.ndarray  # (B,) int, number of executed plans
-    paths: np.ndarray  # (B, S, M, 2) [m], predicted path of the target from each frame on
+    paths: np.ndarray  # (B, S, M, 2) [m], path of the target as predicted at each frame
 
 
 @dataclasses.dataclass(frozen=True)
@@ -211,9 +211,9 @@ class InterceptFlights(Flights):
 
     flown: Driven
     miss: np.ndarray  # (B,) [m], distance from the body's centre to the true target at the end
-    target: np.ndarray  # (B, 2) [m], true position of the target then
+    target: np.ndarray  # (B, 2) [m], true position of the target at the end
     wall_clearance: np.ndarray  # (B,) [m], least clearance from walls; negative inside
-    mover_clearance: np.ndarray  # (B,) [m], least clearance from movers; negative inside
+    mover_clearance: np.ndarray  # (B,) [m], least clearance from moving obstacles; negative inside
 
     @property
     def touched(self) -> np.ndarray:
@@ -237,24 +237,24 @@ def fly_intercepts(
     known_target: bool = False,
     predict_movers: bool = False,
 ) -> InterceptFlights:
-    """Plan and drive a batch of interceptions.
+    """Plan and drive a batch of interceptions, with replanning at a rate.
 
-    A new plan starts at the car's estimated pose. It replaces the old one if it satisfies every
+    A new plan starts at the car's estimated pose. It replaces the old plan if it satisfies every
     limit.
 
     Args:
         loop: world and sensing.
         cases: targets, obstacles and observations.
         seed: random seed of the noise on the car's pose, >= 0.
-        replan: [Hz]; 0 drives the first plan to its end.
+        replan: [Hz], rate of replanning; 0 drives the first plan to its end.
         planner: planner of all plans, by default `spacetime`.
-        plan: first plan of each drive, instead of a plan that is made here.
+        plan: first plan of each drive; by default it is made here.
         known_target: whether the targets' paths are known instead of predicted.
         predict_movers: whether movers are predicted from observations instead of known.
 
     Raises:
         ValueError: `replan` does not divide the rate of the frames, or the cases' car is not the
-            simulated one.
+            simulated car.
     """
     require_car(loop.car.vehicle, cases.cases)
     frames = loop.sensing.frames_per_plan(replan)
@@ -300,10 +300,10 @@ def plan_again(
     Args:
         loop: settings of the drives' loop.
         planner: planner of the remaining cases.
-        drive: leaves (B, ...).
+        drive: states of the drives, leaves (B, ...).
         begun: the cases of the current plans, at the start of those plans.
-        target: predicted from now on.
-        movers: predicted from now on.
+        target: predicted paths of the targets, with times that count from now.
+        movers: predicted moving obstacles at their current positions.
 
     Returns:
         The drives, the cases of their plans, and (B,) bool, which plans are new.
@@ -329,7 +329,7 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Return drives and the cases of their plans, with the new plans where those are good (B,)."""
+    """Return drives and the cases of their plans, with the found plans where `good` (B,)."""
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -340,7 +340,7 @@ def _replace_plans(
 
 @jax.jit
 def _sample_paths(path: TurningPath, span: Array) -> Array:
-    """Return points (B, M, 2) [m] on paths up to times (B,) [s]."""
+    """Return M equally spaced points (B, M, 2) [m] of each path from now to a time (B,) [s]."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
@@ -353,7 +353,7 @@ def _collect_drives(
     seen: list[tuple[Array, int]],
     number: np.ndarray,
 ) -> Driven:
-    """Return the result of drives at their end, on the host."""
+    """Collect the result of drives at their end, on the host."""
     drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]
@@ -374,7 +374,7 @@ def _collect_drives(
 def score(
     cases: InterceptCase, first: InterceptPlan, flown: Driven, planning_seconds: float = 0.0
 ) -> InterceptFlights:
-    """Compare drives with the true targets and obstacles in float64: misses and contacts.
+    """Score drives against the true targets and obstacles in float64: misses and clearances.
 
     Args:
         cases: the true cases, leaves (B, ...).
@@ -415,7 +415,7 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Return obstacles in the form of the referee's clearances; absent ones are zero."""
+    """Return obstacles in the form of the referee's clearances; absent obstacles are zero."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)
@@ -427,7 +427,7 @@ def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
 
 
 def require_car(vehicle: Vehicle, cases: InterceptCase) -> None:
-    """Raise `ValueError` unless the simulated car is the one for which plans are made."""
+    """Raise `ValueError` unless the simulated car equals the car for which plans are made."""
     for name in ("length", "width", "wheelbase", "rear_overhang"):
         own, planned = getattr(vehicle, name), np.asarray(getattr(cases.body, name))
         if not np.allclose(planned, own, rtol=1e-5):

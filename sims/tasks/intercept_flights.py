@@ -1,4 +1,4 @@
-"""Runs of interceptions: settings, columns, recordings and findings."""
+"""Runs of interceptions by `planner-jax fly intercept`: rows, recordings and findings."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,14 +33,14 @@ from planner_jax.task.intercept.api import planner as intercept_planner
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.searches import SEARCHES, search_reach
 
-NEAR, FAR = 0.05, 0.5  # [m], further radii of the miss for which successes are counted
-_KEPT = 2  # simulated frames per recorded sample
-_WALL, _MOVER = "#8C959F", "#D9A441"  # colours
-_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], for drawing
+NEAR, FAR = 0.05, 0.5  # [m], two more distances from the target within which drives are counted
+_KEPT = 2  # number of simulated frames from one recorded sample to the next
+_WALL, _MOVER = "#8C959F", "#D9A441"  # colours of walls and moving obstacles in pictures
+_WALL_HEIGHT, _MOVER_HEIGHT, _TARGET_HEIGHT = 0.25, 0.2, 0.08  # [m], heights in pictures
 
 
 class InterceptFlight(FlightTask):
-    """Interceptions as a task of a run of flights; the settings are `InterceptFly`."""
+    """The task intercept for a run of flights; the settings are `InterceptFly`."""
 
     settings: InterceptFly
 
@@ -70,20 +70,20 @@ class InterceptFlight(FlightTask):
     )
 
     def world(self) -> World:
-        """Return the ground with the car; obstacles differ from drive to drive."""
+        """Return the simulated ground with the car; obstacles differ from drive to drive."""
         tyres = Tyres() if self.settings.slip else None
         return dataclasses.replace(CAR_WORLD, robot=Car(Vehicle(tyres=tyres)))
 
     def loop(self) -> DriveLoop:
-        """Return the closed loop of the drives."""
+        """Return the settings of the closed loop: the world and its sensing."""
         return DriveLoop(self.world(), self.settings.sensing)
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of the closed loop."""
+        """Return the settings of the closed loop as plain values for the manifest."""
         return dataclasses.asdict(self.loop())
 
     def cases(self) -> Meetings:
-        """Return all interceptions of the run."""
+        """Draw all interceptions of the run from its suite and seed."""
         settings = self.settings
         sensing = settings.sensing
         return meetings(
@@ -95,7 +95,7 @@ class InterceptFlight(FlightTask):
         )
 
     def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
-        """Drive some interceptions, and return the result; it always includes a record."""
+        """Plan and drive some interceptions; the result always includes a record."""
         settings = self.settings
         return fly_intercepts(
             self.loop(),
@@ -110,7 +110,7 @@ class InterceptFlight(FlightTask):
     def recording(
         self, cases: Meetings, flights: InterceptFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """Return the recording of some of the drives; see `FlightTask`."""
+        """Return the recording of some of the drives, as in `FlightTask`."""
         some, flown = cases[np.asarray(lanes)], flights.flown
         kept = np.arange(0, flown.times.size, _KEPT)
         times = np.tile(flown.times[kept], (len(some), 1))
@@ -132,12 +132,12 @@ class InterceptFlight(FlightTask):
 
     @property
     def suite(self) -> str:
-        """The suite of interceptions."""
+        """The name of the suite of interceptions."""
         return self.settings.suite
 
     @property
     def conditions(self) -> str:
-        """Noise, latency, prediction and tyres, as the beginning of a sentence."""
+        """Noise, latency, prediction and tyres, as the beginning of a sentence of the report."""
         settings = self.settings
         of = (
             "known"
@@ -153,11 +153,11 @@ class InterceptFlight(FlightTask):
 
     @property
     def simulated(self) -> str:
-        """The car and its sensing, for the report of a run."""
+        """A description of the car and its sensing, for the report of a run."""
         return f"{self.world().robot.WORDS}; poses and observations with noise and latency"
 
     def surroundings(self, index: int) -> Sequence[Prism]:
-        """Return walls and movers of one drive."""
+        """Return the walls and moving obstacles of one drive as prisms for drawing."""
         case = self._case(index)
         found = []
         for group, height, colour in (
@@ -172,7 +172,7 @@ class InterceptFlight(FlightTask):
         return found
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return the cells of the planner's reachable set, layer by layer."""
+        """Return the cells that a drive's car could reach, for each time layer of the planner."""
         return reach_layers(jax.tree.map(jnp.asarray, self._case(index)))
 
     def _case(self, index: int) -> InterceptCase:
@@ -181,7 +181,7 @@ class InterceptFlight(FlightTask):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers of meetings and contacts, and the saturation of the actuators."""
+        """Return numbers of meetings and contacts, and the saturation of drive and steering."""
         miss = np.asarray(rows["miss"])
         wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
         return {
@@ -196,7 +196,7 @@ class InterceptFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences about misses, contacts and saturation."""
+        """Return sentences about misses, contacts and saturation of the drives."""
         number = summary["num"]
         near, success, far = (
             percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)
@@ -216,13 +216,13 @@ def _get_drives(batch: Any) -> Driven:
 
 
 def _add_height(points: np.ndarray, height: float) -> np.ndarray:
-    """Return points of the plane (..., 2) at a height, (..., 3) [m]."""
+    """Return points of the plane (..., 2) as points (..., 3) [m] at a height [m]."""
     high = np.where(np.isfinite(points[..., :1]), height, np.nan)
     return np.concatenate([points, high], axis=-1)
 
 
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
-    """Return where the car of one case could be: time [s] and cells (P, 2) [m], by layer."""
+    """Return where the car of one case could be: times [s] and positions (P, 2) [m] of cells."""
     search = SEARCHES["given"][0]
     found = jax.device_get(
         jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)
