@@ -22,11 +22,11 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.context import targets_at
 from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
-HANDICAP = 4.0  # [s] handicap of an action component of 1
-STRETCH = 0.5  # natural logarithm of the factor on a time, for an action component of 1
+HANDICAP = 4.0  # [s] added to a target's earliest time if its first action component is 1
+STRETCH = 0.5  # logarithm of the factor on a catch time if the second action component is 1
 _SHARES = 8  # number of future times at which a target's predicted position is a feature
-FEATURES = 3 + 3 + 3 + 1 + 3 * _SHARES + 3 + 1  # per target; the last is 1 for a present target
-PER_TARGET = 2  # components of the action per target
+FEATURES = 3 + 3 + 3 + 1 + 3 * _SHARES + 3 + 1  # number per target; the last is 1 if present
+PER_TARGET = 2  # number of action components per target
 
 
 def observe(case: CatchCase, table: Timetable) -> Array:

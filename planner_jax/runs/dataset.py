@@ -50,14 +50,14 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
 
 
 def number_of(path: Path) -> int:
-    """Return the part number in a file's name; raise `DamagedPart` if no part has such a name."""
+    """Return the number in the name of a row file; raise `DamagedPart` for any other name."""
     if (name := _NAME.fullmatch(path.name)) is None:
         raise DamagedPart("is not a part of a run")
     return int(name[1])
 
 
 def check_part(path: Path) -> Entries:
-    """Return a part's record; raise `DamagedPart` if the file's checksum or format is wrong."""
+    """Return the record in a row file's metadata; raise `DamagedPart` if the file is damaged."""
     number_of(path)
     with open_plain(path) as file:
         content = file.read()
@@ -87,7 +87,7 @@ class Dataset:
         return sorted(path for path in there if not path.name.startswith("."))
 
     def write(self, number: int, content: bytes) -> None:
-        """Write the file of part `number`, and remove other files with the same part number."""
+        """Write the row file with this number, and remove other files with the same number."""
         self.folder.mkdir(exist_ok=True)
         path = self.folder / f"part-{number:06d}-{zlib.crc32(content):08x}.parquet"
         with replacing(path) as scratch:

@@ -36,7 +36,7 @@ def option(default: object, metavar: str, text: str) -> Any:
 
 def recovery_option(usual: str = NONE) -> str:
     """Return the field `recovery` of settings: what the quadrotor does after its last contact."""
-    words = f"flown behind the last contact, within all limits: {', '.join(CHOICES)}"
+    words = f"trajectory after the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
@@ -112,15 +112,15 @@ class SweepSettings:
         return dataclasses.asdict(self)
 
     def planner_options(self) -> Options:
-        """Return the keyword arguments for the task's `planner` that follow from the settings."""
+        """Return the keyword arguments for creating the planner that follow from the settings."""
         return self._values(self.PLANNER)
 
     def draw_options(self) -> Options:
-        """Return the keyword arguments for the task's `draw` that follow from the settings."""
+        """Return the keyword arguments for drawing cases that follow from the settings."""
         return {k: value for k, value in self._values(self.DRAW).items() if value is not None}
 
     def judge_options(self) -> Options:
-        """Return the keyword arguments for the task's `judge` that follow from the settings."""
+        """Return the keyword arguments for the task's referee that follow from the settings."""
         return self._values(self.JUDGE)
 
     def _values(self, names: tuple[str, ...]) -> Options:

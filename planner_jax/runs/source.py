@@ -61,7 +61,7 @@ class Source(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class DrawnSource(Source):
-    """A source that draws the cases of one of the task's suites, chunk by chunk, from a seed."""
+    """A source that draws the cases of a suite (a family of cases) from a seed, in chunks."""
 
     task: Task
 

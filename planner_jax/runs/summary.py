@@ -51,7 +51,7 @@ class Tally:
         self._sums = dict.fromkeys(self.MEANS, 0.0)
 
     def add(self, rows: pa.Table) -> None:
-        """Add some rows of the run to the counts."""
+        """Add rows, one for each planned and judged case, to the counts."""
         success = rows["success"].to_numpy().astype(bool)
         self.num += len(success)
         self.successes += int(success.sum())
@@ -66,7 +66,7 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
+        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:

@@ -49,7 +49,7 @@ class CompileClock:
         return total
 
     def lap(self) -> float:
-        """Return the growth of `seconds` since the last call, or since the start."""
+        """Return the time [s] spent on compilation since the last call of `lap`, or in total."""
         last, self._last = self._last, self.seconds
         return self._last - last
 
@@ -60,13 +60,13 @@ class CompileClock:
 
 
 class Stopwatch:
-    """A clock that returns the seconds since its last call."""
+    """A clock whose method `lap` returns the seconds since the last call of `lap`."""
 
     def __init__(self) -> None:
         self._last = time.perf_counter()
 
     def lap(self) -> float:
-        """Return the seconds since the last call, or since the start."""
+        """Return the seconds since the last call of `lap`, or since the clock was created."""
         last, self._last = self._last, time.perf_counter()
         return self._last - last
 

@@ -63,7 +63,7 @@ class QuadrotorSettings(SweepSettings):
 
     limit_scale: float = option(1.0, "F", "factor on the limits of speed, body rate and thrust")
     robot: object = robot_option("the task's")
-    effort: str = option(EFFORTS[0], "NAME", f"of the planner: {', '.join(EFFORTS)}")
+    effort: str = option(EFFORTS[0], "NAME", f"how long the planner searches: {', '.join(EFFORTS)}")
     recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
@@ -80,6 +80,6 @@ class QuadrotorSettings(SweepSettings):
         require_one_of(CHOICES, "recovery", self.recovery)
 
     def planner_options(self) -> Entries:
-        """Return the keyword arguments for the task's `planner` that follow from the settings."""
+        """Return the keyword arguments for creating the planner that follow from the settings."""
         more = {} if self.effort == EFFORTS[0] else {"effort": self.effort}
         return super().planner_options() | more | recovery_options(self.recovery)

@@ -21,14 +21,14 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 class PlannedRow(NamedTuple):
-    """The plan that a row of a run stores, and the referee's reason for rejecting it."""
+    """A plan restored from a stored row of results, and the referee's reason for rejecting it."""
 
     plan: Plan  # an object of the robot's plan class, such as `QuadrotorPlan`
     sentence: str  # the referee's reason as a sentence; "" if the referee accepts the plan
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a row: drawn again from the run's seed, or read again from its files.
+    """Return the case of a stored row of results: drawn again from the seed, or read again.
 
     Raises:
         ArgumentError: the folder does not hold a complete, finished sweep, or physics or limits of
@@ -44,7 +44,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
 
 
 def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Return the plan that a row of a run stores, and the referee's reason for rejecting it.
+    """Restore the plan from a stored row of results, with the referee's reason for rejecting it.
 
     Raises:
         ArgumentError: the folder does not hold a complete, finished sweep, or has no such row.
@@ -63,7 +63,7 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
 
 
 def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
-    """Restore a quadrotor's plan from a row of a run; gravity comes from the run's `setting`."""
+    """Restore a quadrotor's plan from a stored row of results; `setting` holds the gravity."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
@@ -74,14 +74,14 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
 
 
 def arm_plan(row: Row, _: Entries) -> ArmPlan:
-    """Restore an arm's plan from a row of a block sweep; its motion starts at the row's `delay`."""
+    """Restore an arm's plan from a stored row of results; it starts at the row's `delay`."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )
 
 
 def car_plan(row: Row, _: Entries) -> CarPlan:
-    """Restore a car's plan from a row of an interception sweep: speed and curvature at knots."""
+    """Restore a car's plan from a stored row of results: speed and curvature at knots in time."""
     knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
     return CarPlan(**_outcome(row), time=_numbers(row["meeting_time"]), **knots)
 

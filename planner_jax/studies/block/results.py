@@ -1,6 +1,6 @@
-"""Parts of a sweep of blocks that simulates a camera or the planning time.
+"""Additions to a sweep of blocks that simulates a camera or the planning time.
 
-It wraps the planner, and adds columns, counts and sentences of the report.
+The module wraps the planner, and adds columns, counts and sentences of the report.
 """
 
 import numpy as np
@@ -82,7 +82,7 @@ class StudyCounts:
         self._errors, self._seconds = [], []
 
     def add(self, rows: pa.Table) -> None:
-        """Collect the values in some rows of the run."""
+        """Collect fit errors and planning times from rows, one for each case."""
         for name, values in zip(self.READS, (self._errors, self._seconds), strict=True):
             if name in rows.column_names:
                 values.append(rows[name].to_numpy())

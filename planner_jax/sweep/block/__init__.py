@@ -1,1 +1,1 @@
-"""The sweep of blocks: a robot arm blocks thrown balls with a shield."""
+"""The sweep of blocks: plan and judge many cases of an arm that blocks a ball with a shield."""

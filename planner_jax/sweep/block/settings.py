@@ -15,7 +15,7 @@ REGIMES = ("R1", "R2", "R3")
 
 @dataclasses.dataclass(frozen=True)
 class BlockSettings(StudySettings):
-    """Settings of a sweep of blocks."""
+    """Settings of a sweep of blocks, which plans and judges many drawn cases."""
 
     regime: str = option(
         "R2",
@@ -44,5 +44,5 @@ class BlockSettings(StudySettings):
             require(self.delay == 0.0, "delay", rule, self.delay)
 
     def draw_options(self) -> Entries:
-        """Return keyword arguments for the task's `draw`; from `delay` on the arm may move."""
+        """Return the keyword arguments for drawing cases; from `delay` [s] on the arm may move."""
         return {**super().draw_options(), "delay": self.delay + self.first_motion}

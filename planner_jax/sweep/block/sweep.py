@@ -36,7 +36,7 @@ class BlockTally(Tally):
         self._study = StudyCounts()
 
     def add(self, rows: pa.Table) -> None:
-        """Add some rows of the run to the counts and sums."""
+        """Add rows, one for each planned and judged case, to the counts and sums."""
         super().add(rows)
         self._study.add(rows)
 
@@ -46,7 +46,7 @@ class BlockTally(Tally):
 
 
 class BlockSweep(Sweep[BlockSettings]):
-    """Sweeps of arms that block thrown balls."""
+    """Sweeps that plan and judge many cases of an arm that blocks a thrown ball."""
 
     frame, counts = FRAME, BlockTally
     plan_of_row = staticmethod(arm_plan)
@@ -56,7 +56,7 @@ class BlockSweep(Sweep[BlockSettings]):
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Return the run's planner; it simulates a camera or planning time if the settings ask."""
+        """Return the run's planner, wrapped if settings ask for a simulated camera or clock."""
         return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:

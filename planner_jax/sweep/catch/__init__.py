@@ -1,1 +1,1 @@
-"""The sweep of catches: a quadrotor catches flying targets with a net."""
+"""The sweep of catches: plan and judge many cases of a quadrotor that catches with a net."""

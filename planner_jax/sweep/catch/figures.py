@@ -20,7 +20,7 @@ from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
 
 
 def target_paths(row: Row) -> BallPath | HarmonicPath:
-    """Restore the paths of the N targets of a row; every leaf has a leading axis N."""
+    """Restore the paths of N targets from a stored row of results; leaves are (N, ...)."""
 
     def leaf(name: str, *trailing: int) -> jax.Array:
         return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
@@ -33,7 +33,7 @@ def target_paths(row: Row) -> BallPath | HarmonicPath:
 
 
 def target_positions(row: Row, times: np.ndarray) -> np.ndarray:
-    """Return the predicted positions (N, K, 3) [m] of a row's N targets at times (K,) [s]."""
+    """Return positions (N, K, 3) [m] of the N targets of a stored row at times (K,) [s]."""
     return np.asarray(_positions(target_paths(row), jnp.asarray(times, jnp.float32)))
 
 
@@ -43,7 +43,7 @@ def _positions(paths: BallPath | HarmonicPath, times: jax.Array) -> jax.Array:
 
 
 class SampledCatch(NamedTuple):
-    """The plan of a row, and quadrotor, net and N targets sampled at K times of the plan."""
+    """The plan of a stored row, with net and N targets sampled at K times of the plan."""
 
     row: Row
     motion: SampledMotion
@@ -84,7 +84,7 @@ _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style
 
 
 def flight_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the plan of the run's example case: from the side, from above, and each catch close."""
+    """Draw the example case's plan from the side and from above, and a close-up of each catch."""
     setting, (_, row) = run.manifest["setting"], run.same_case()[0]
     motion = sample_motion(row["coeffs"], row["durations"], _SAMPLES)
     plan = sample_catch(row, motion, setting)

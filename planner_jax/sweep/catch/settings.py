@@ -15,13 +15,13 @@ NET_TESTS = ("plane", "ball")  # how the referee tests the net's radius: see the
 
 @dataclasses.dataclass(frozen=True)
 class CatchSettings(QuadrotorSettings):
-    """Settings of a sweep of catches."""
+    """Settings of a sweep of catches, which plans and judges many drawn cases."""
 
     decide: str = option(
-        "best", "NAME", f"order and first times: {', '.join(DECISIONS)}, policy:FILE"
+        "best", "NAME", f"decision of the order and times: {', '.join(DECISIONS)}, policy:FILE"
     )
     tolerance: float = option(
-        1e-3, "R", "relative, of the referee; the published protocol has 0.05 with --net-test ball"
+        1e-3, "R", "relative tolerance of the referee; published protocol: 0.05 and --net-test ball"
     )
     net_test: str = option(
         "plane",

@@ -46,7 +46,7 @@ class CatchTally(Tally):
         self._num_ratios = self._num_caught = 0
 
     def add(self, rows: pa.Table) -> None:
-        """Add some rows of the run to the counts and sums."""
+        """Add rows, one for each planned and judged case, to the counts and sums."""
         super().add(rows)
         caught, present, times = (
             np.stack(rows[name].to_pylist()) for name in ("caught", "present", "catch_times")
@@ -60,7 +60,7 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return rates from 0 to 1 and mean times [s]; a mean over no values is None."""
+        """Return success rates, mean catch time [s] and optimal time ratio; None without values."""
         return {
             **super().summary(),
             "caught": self._shares / self.num,
@@ -70,7 +70,7 @@ class CatchTally(Tally):
 
 
 class CatchSweep(Sweep[CatchSettings]):
-    """Sweeps of quadrotors that catch flying targets with a net."""
+    """Sweeps that plan and judge many cases of a quadrotor that catches with a net."""
 
     frame, own_columns, single_columns = FRAME, COLUMNS, COLUMNS
     plan_of_row = staticmethod(quadrotor_plan)

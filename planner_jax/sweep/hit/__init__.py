@@ -1,1 +1,1 @@
-"""The sweep of hits: a quadrotor returns served balls with its racket."""
+"""The sweep of hits: plan and judge many cases of a quadrotor that returns a served ball."""

@@ -18,7 +18,7 @@ _FARTHEST = 1e6  # [m] greatest absolute coordinate of the start that is accepte
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(QuadrotorSettings):
-    """Settings of a sweep of hits.
+    """Settings of a sweep of hits, which plans and judges many drawn or published cases.
 
     `num` is the number of serves: by default all serves of the folder `serves`, or `DEFAULT_NUM` if
     serves are drawn. `seed` determines the drawn serves, and the starts if `start` is "uniform".
@@ -53,7 +53,7 @@ class HitSettings(QuadrotorSettings):
             object.__setattr__(self, "serves", os.path.abspath(self.serves))
 
     def planner_options(self) -> Entries:
-        """Return the keyword arguments for the task's `planner` that follow from the settings."""
+        """Return the keyword arguments for creating the planner that follow from the settings."""
         truer = {"drag_after_impact": True} if self.drag_after_impact else {}
         return super().planner_options() | truer
 

@@ -88,12 +88,12 @@ class HitTally(Tally):
         self._scenarios = ScenarioCounts()
 
     def add(self, rows: pa.Table) -> None:
-        """Add some rows of the run to the counts."""
+        """Add rows, one for each planned and judged case, to the counts."""
         super().add(rows)
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
+        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
@@ -104,7 +104,7 @@ class HitTally(Tally):
 
 
 class HitSweep(Sweep[HitSettings]):
-    """Sweeps of quadrotors that return served balls with a racket."""
+    """Sweeps that plan and judge many cases of a quadrotor that returns a served ball."""
 
     frame, own_columns, counts = FRAME, COLUMNS, HitTally
     plan_of_row = staticmethod(quadrotor_plan)

@@ -1,1 +1,1 @@
-"""The sweeps of cars that meet one moving target, or a group of targets one after another."""
+"""Sweeps of interceptions: plan and judge many cases of a car that meets moving targets."""

@@ -27,7 +27,7 @@ from planner_jax.sweep.figures import draw_upper_limit, look_of, write_verdicts
 
 @dataclasses.dataclass(frozen=True)
 class SampledDrive:
-    """The plan of a row: its obstacles as polygons, and car and target sampled at K times."""
+    """The plan of a stored row: obstacles as polygons, car and target sampled at K times."""
 
     row: Row
     setting: Entries  # entry `setting` of the manifest
@@ -62,7 +62,7 @@ class SampledDrive:
 
 
 def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
-    """Sample a row's plan at `num` evenly spaced times; `setting` is an entry of the manifest."""
+    """Sample a stored row's plan at `num` even times; `setting` holds the size of the car."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )

@@ -27,13 +27,13 @@ class InterceptTally(Tally):
     NEAR = 0.1  # [m] the example's clearance to moving obstacles is below this distance
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of rows that may be the report's example, preferred masks first."""
+        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
 
 class InterceptSweep(Sweep[InterceptSettings]):
-    """Sweeps of cars that meet moving targets among obstacles."""
+    """Sweeps that plan and judge many cases of a car that meets a moving target."""
 
     frame, own_columns, counts = FRAME, COLUMNS, InterceptTally
     plan_of_row = staticmethod(car_plan)
