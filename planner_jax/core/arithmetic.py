@@ -67,7 +67,7 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 def components(x: Components) -> list[Array]:
     """Return the n components (...) of vectors (..., n), or the entries of a tuple.
 
-    One split yields them all; its derivative is one concatenation instead of n paddings.
+    They come from one split, whose derivative is one concatenation instead of n paddings.
     """
     if isinstance(x, tuple):
         return [*x]

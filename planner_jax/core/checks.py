@@ -70,7 +70,7 @@ def require_path_name(name: str, value: object) -> None:
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-# Types that a fast `isinstance` recognises as no arrays of JAX.
+# Types that `isinstance` tests quickly; a value of such a type is no array of JAX.
 _HOSTS = (np.ndarray, np.generic, float)
 
 

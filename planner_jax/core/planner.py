@@ -102,11 +102,11 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def solve(self, case: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plan that one attempt makes of one case; pure."""
+        """Return the plan that one attempt makes for one case; pure."""
         raise NotImplementedError
 
     def solve_lanes(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes of a batch; pure."""
+        """Return the plans that one attempt makes for a batch; pure."""
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
@@ -117,11 +117,11 @@ class Planner(Generic[CaseT, PlanT]):
         )
 
     def solve_at_once(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes of a batch, all cases together; pure."""
+        """Return the plans that one attempt makes for a batch, all cases together; pure."""
         return jax.vmap(lambda case: self.solve(case, attempt))(cases)
 
     def solve_on_host(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
-        """Return the plans that one attempt makes of a batch; NumPy leaves in and out."""
+        """Return the plans that one attempt makes for a batch; NumPy leaves in and out."""
         raise NotImplementedError
 
     def plan_by(self, drive: Drive, cases: CaseT, /) -> PlanT:

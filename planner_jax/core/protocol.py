@@ -201,7 +201,7 @@ class Decision(Protocol):
         """Raise `ArgumentError` for a batch that the rule cannot decide; called on the host."""
 
     def propose(self, case: PyTree, /) -> PyTree:
-        """Return choices for `case.with_choice`, best first, leaves (F, ...); a pure function."""
+        """Return F choices for `case.with_choice`, best first, with leaves (F, ...); pure."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
@@ -336,7 +336,7 @@ def select_first_solved(plan_of: Callable[[Array], PlanT], num: Array | int, bes
     """Return the first solved plan in a sequence of plans of one case, or else the best; pure.
 
     `plan_of` makes the plan at a position () int32 below `num`. If the existing plan `best` is
-    is solved already, no other plan is made.
+    solved already, no other plan is made.
     """
 
     def next_one(state: tuple[Array, PlanT]) -> tuple[Array, PlanT]:

@@ -174,7 +174,7 @@ def split_name(
 
 
 def task_named(name: object) -> Task:
-    """Return the task with this name; raise `UnknownName` if neither package nor library has it."""
+    """Return the task with this name, of this library or another package; else `UnknownName`."""
     tasks = all_tasks()
     return tasks[require_name(tasks, "task", name)]
 

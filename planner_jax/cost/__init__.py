@@ -1,1 +1,1 @@
-"""Penalties, limits, quadrature along a trajectory, and contact."""
+"""Limits of trajectories, penalties for exceeding them, and their integrals over time."""

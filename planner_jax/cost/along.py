@@ -70,17 +70,17 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from columns to samples of the derivatives, for h = 1."""
+        """Return matrices (K, orders, C) from columns to samples, with times in units of h."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 
     def times(self) -> np.ndarray:
-        """Return the times (K,) of the samples, for h = 1."""
+        """Return the times (K,) of the samples, in units of h, the mean duration of a piece."""
         steps = np.repeat(self.maps.proportions / self.nodes, self.nodes)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def weights(self) -> np.ndarray:
-        """Return quadrature weights (K,) of the samples, for h = 1."""
+        """Return the samples' quadrature weights (K,), in units of h, a piece's mean duration."""
         return join_trapezoid_weights(self.nodes, self.maps.proportions)
 
 
@@ -160,7 +160,7 @@ def _greatest_of_segments(
 
     def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
         motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
-        # The barrier keeps XLA from computing every sample three times, once for each parabola.
+        # Each sample is part of three parabolas; the barrier keeps XLA from computing it thrice.
         excess = jax.lax.optimization_barrier(along.excess(motion, parameters))
         return tuple(greatest_by_parabolas(each, along.times()) for each in excess)
 
@@ -234,5 +234,5 @@ def _of_segment(
     penalty = duration * jnp.sum(hinges * weights[None])
     if along.rate is not None:
         penalty = penalty + duration * jnp.sum(along.rate(motion, parameters) * weights)
-    # First over the limits at each sample, which is faster on a CPU than a maximum of the stack.
+    # A CPU computes a maximum of pairs of limits faster than a maximum of stacked limits.
     return penalty, jnp.max(functools.reduce(jnp.maximum, each))

@@ -41,9 +41,8 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives at the K samples, which `columns_columns` and `block_and_diagonal` read. An
-    # array (terms K, pairs) belongs to the pairs of axes that have the same terms (pairs of
-    # orders).
+    # Second derivatives at the K samples, the input of `columns_columns` and `block_and_diagonal`:
+    # an array (terms K, pairs) for all pairs of axes with the same terms (pairs of derivatives).
     at_samples: tuple[Array, ...]
 
 
@@ -112,7 +111,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return all second derivatives by the variable columns, as an array (C, 3, C, 3)."""
+    """Return a segment penalty's second derivatives by its variable columns, (C, 3, C, 3)."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -121,9 +120,9 @@ def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0)
 def block_and_diagonal(
     along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
 ) -> tuple[Array, Array]:
-    """Return second derivatives among the first E = `num` columns, and the others' diagonal.
+    """Return a penalty's second derivatives among the first E columns, and a diagonal.
 
-    The shapes are (E, 3, E, 3) and (C - E, 3).
+    E is `num`, and the diagonal is of the others: shapes (E, 3, E, 3) and (C - E, 3).
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
@@ -138,7 +137,7 @@ def _at_samples(
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
     """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,).
 
-    Groups of derivatives that no limit has in common share the tangents of one differentiation.
+    No limit depends on derivatives of two groups, so all groups share tangents.
     """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
@@ -194,7 +193,7 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return second derivatives by some pairs of variable columns, for each pair of axes."""
+    """Return a penalty's second derivatives by pairs of columns, for each pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -263,7 +262,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return, for each group of pairs of axes, the matrix (places, terms K) for the samples."""
+    """Return, for each group of pairs of axes, the matrix (places, terms K) that sums samples."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

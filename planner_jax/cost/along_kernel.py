@@ -57,7 +57,7 @@ class Grid:
     def shares(self) -> int:
         """Number of GPU threads, 1 to 8, among which the samples of one trajectory are divided.
 
-        Small batches need several threads a trajectory to occupy the GPU.
+        Small batches need several threads for each trajectory to occupy the GPU.
         """
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
@@ -72,8 +72,8 @@ def grid_of(
     """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
 
     `leaves` are the leaves of all arguments. `points` has columns, durations and parameters of a
-    point, and for a directional derivative the same of a direction. The result is None if the
-    kernel does not support the arguments.
+    point, and for a directional derivative also those of the direction. The result is None if
+    the kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
@@ -100,7 +100,7 @@ def call_on_grid(
     name: str,
     interpret: bool,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a function that runs a kernel; its results have one more axis, for parts of the samples.
+    """Make a function that runs a kernel; the first axis of its results is over parts of samples.
 
     `body` takes references to the leaves, to the `constants`, which every block reads, and to the
     results. `shapes` are the results' shapes for one trajectory of one lane.

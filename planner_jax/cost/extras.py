@@ -27,8 +27,8 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Intervals of each piece at which a finished plan is checked against extra limits. They are short
-# because near an edge or a small sphere the excess peaks between the samples of the search.
+# Number of intervals of each piece at which a finished plan is checked against extra limits. It is
+# large because near an edge or a small sphere the excess peaks between the samples of the search.
 _CLOSE_NODES = 64
 
 
@@ -97,7 +97,7 @@ class Plane:
     normal: Numbers  # (3,), of any length
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the distance [m] of the positions beyond the plane, negative on the good side."""
+        """Return the distance [m] of positions beyond the plane, negative on the allowed side."""
         return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
 
 

@@ -25,7 +25,7 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
 def _size_squared(vector: Components) -> Array:
-    """Return |v|^2 of (..., 3), written out: XLA compiles a sum over an axis to its own loop."""
+    """Return |v|^2 of vectors (..., 3), without a sum over an axis, for which XLA adds a loop."""
     x, y, z = components(vector)
     return x * x + y * y + z * z
 
@@ -94,7 +94,7 @@ class QuadrotorCase(Protocol):
 
     @property
     def head_state(self) -> Array:
-        """Position to jerk (4, 3) of the quadrotor at time 0."""
+        """Position, velocity, acceleration and jerk (4, 3) of the quadrotor at time 0."""
         ...
 
     @property
@@ -233,7 +233,7 @@ def flight_along(
 
 
 def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Return groups of derivatives (order, axis) in common limits; of positions, the height."""
+    """Group the derivatives (order, axis) of the motion that occur together in a limit."""
     together: list[set[int]] = []
     for kind in _kinds(limits):
         joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))
@@ -249,9 +249,8 @@ def greatest_excess(
 ) -> list[Array]:
     """Return the greatest relative excess over each limit in N segments of a plan, (N,) each.
 
-    Peaks between the samples count, by parabolas for limits of flight and by tangents for extras.
-    The other arguments are as for `greatest_along`. Peaks between samples count: they are computed
-    by parabolas for limits of flight and by tangents for extras.
+    Peaks between samples are included, by parabolas for limits of flight and by tangents for
+    extras. The other arguments are as for `greatest_along`.
     """
     bare = dataclasses.replace(case, extras=())
     along = flight_along(maps, nodes, bare, 0.0, 1.0)

@@ -57,8 +57,8 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
 
     Returns:
         A function of the same pytrees with the lanes as one more, last, axis on every leaf. Its
-        results have the lanes last, too. Up to rounding it is `jax.vmap` with all axes -1. It is
-        meant for use inside a compiled function. It cannot be differentiated if `function` has
+        results have the lanes last, too. Up to rounding it equals `jax.vmap` with all axes -1. It
+        is meant for use inside a compiled function. It cannot be differentiated if `function` has
         custom derivatives; differentiate within `function` instead.
     """
 
@@ -229,7 +229,7 @@ def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]
 
 
 def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
-    """Take a window that starts at another index in each lane."""
+    """Take a window of an array that starts at a different index in each lane (problem)."""
     operand, *starts = inputs
     shape = shape_of(eqn.invars[0])
     window = _widen(operand, shape, lanes)

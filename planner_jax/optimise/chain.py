@@ -69,8 +69,8 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Intervals of each piece at which finished plans are checked, with one and with several
-    # segments. Body rates peak sharply where the thrust is small, as happens between catches.
+    # Numbers of intervals of each piece at which finished plans are checked, with one segment and
+    # with several. Body rates peak sharply where the thrust is small, as happens between catches.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
     proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of the pieces
     nodes: int = 8  # intervals of each piece at whose ends the penalties are evaluated
@@ -133,7 +133,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Extend the units of fewer variables to all variables of this planner."""
+        """Return the units of all variables; a subclass adds units that `scale` lacks."""
         return scale
 
     @property
@@ -157,7 +157,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return the smoothest trajectories to guessed ends; a network may improve the first."""
+        """Return starting points (smoothest trajectories); a network may improve the first."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
@@ -189,7 +189,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Return all that the objective needs to know about the end variables.
+        """Compute the part of the objective that depends on the end variables alone.
 
         Returns:
             Boundary rows (N, 8, 3), which are scaled states at both ends of the segments; mean
@@ -212,7 +212,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return the cost and the largest excess over a limit, with squared ratios at the nodes."""
+        """Return the cost, and the largest excess at the nodes: mostly q^2 / limit^2 - 1."""
         case = context.case
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
@@ -251,7 +251,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point, with its violation at `decode_nodes` and between them."""
+        """Return the plan at a point; its violation is found at and between `decode_nodes`."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

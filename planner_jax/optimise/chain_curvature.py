@@ -42,7 +42,7 @@ def chain_curvature(
     The objective is the cost of the ends, plus for each active segment the energy of its offsets
     and the integral of its penalties. A point lists, segment by segment, the offsets and the end
     variables, in units of `scale`. Products with the Hessian contain all second derivatives. The
-    preconditioner contains the ones among the end variables, and the offsets' diagonal.
+    preconditioner contains those among the end variables, and the diagonal for the offsets.
 
     Args:
         maps: constants of a segment; M pieces, s = order.
@@ -89,8 +89,7 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within` is the Hessian (N k, N k) of `pull_back`, `turned` the rows' Jacobian (N k, N, rows,
-    # 3).
+    # `within`: Hessian (N k, N k) of `pull_back`; `turned`: Jacobian of rows (N k, N, rows, 3).
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies
@@ -126,7 +125,7 @@ def chain_curvature(
 
     by_natural = by_natural.reshape(num, -1).at[:, 0].add(of.by_theta - power * energies)
     by_offsets = of.by_columns[:, num_rows:] + bend * offsets
-    # For the preconditioner: second derivatives among all end variables, and the offsets' diagonal.
+    # The preconditioner needs second derivatives among the end variables, and a diagonal.
     strong = functools.partial(block_and_diagonal, along, num=num_rows, given=given)
     among_rows, alone = jax.vmap(strong)(of.at_samples)
     half = einsum("pnca,ncafb->pnfb", turned, among_rows)

@@ -84,7 +84,7 @@ def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Arr
 
 
 def start_scale(newest: Array, change: Array, grad: Array) -> Array:
-    """Return gamma from the newest pair's 1 / s.y and y.y; without a pair (0), 1 / sqrt(g.g)."""
+    """Return gamma = s.y / y.y of the newest pair, given 1 / s.y and y.y; without one, 1 / |g|."""
     size = change * newest
     slope = jnp.sqrt(jnp.maximum(grad, 1e-30))
     return jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
@@ -151,7 +151,7 @@ def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsS
     """Return the state after one iteration: gradient, memory, direction, and the best trial step.
 
     The gradient is evaluated first, so that k iterations take exactly k gradients. A finished
-    problem of a batch keeps its point; only its memory and gradient change, which are not used.
+    problem of a batch keeps its point; only its memory and gradient change, without effect.
     """
 
     def value(point: Array) -> tuple[Array, Array]:

@@ -58,8 +58,7 @@ def _call(
         keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
-        # From the newest pair to the oldest. If the new pair is stored, pair k + 1 moves to index
-        # k.
+        # The newest pair comes first. If the new pair is stored, pair k + 1 moves to index k.
         alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
             old, earlier = [read(steps, k), read(changes, k)], inverses[k]

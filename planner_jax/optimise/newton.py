@@ -65,7 +65,7 @@ class NewtonState:
 
 
 def by_products(objective: Objective) -> Curved:
-    """Return the derivatives of an objective; Hessian products use automatic differentiation."""
+    """Make the function of an objective's derivatives at a point, by automatic differentiation."""
 
     def preconditioner(damping: Array) -> Callable[[Array], Array]:
         return lambda right: right / damping  # nothing but the damping of the Hessian is known
@@ -185,7 +185,7 @@ def _lanczos(
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # `images` has a row M d, and `directions` the row d, for each direction d.
+    # For each direction d, `directions` has the row d, and `images` has the row M d.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []
@@ -194,7 +194,7 @@ def _lanczos(
         diagonal.append(jnp.sum(directions[k] * product))
         if k + 1 == num:
             break
-        # Remove the parts along all previous directions, which rounding errors would bring back.
+        # Orthogonalise against all previous directions, since rounding errors add parts of them.
         shares = jnp.matmul(directions, product, precision=_HIGHEST)
         product = product - jnp.matmul(shares, images, precision=_HIGHEST)
         turned = turned - jnp.matmul(shares, directions, precision=_HIGHEST)
@@ -268,7 +268,10 @@ def _choose(
     trials: Evaluation,
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
-    """Choose a trial: new numbers, weights of the trials in the step, is best, is unfinished."""
+    """Choose the best trial step; return new scalars, weights of the trials, and two bools.
+
+    The bools are whether the new point is the best so far, and whether the search was unfinished.
+    """
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)
     places = jnp.arange(costs.size)

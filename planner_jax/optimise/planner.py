@@ -23,7 +23,7 @@ from planner_jax.optimise.settings import (
     Stage,
 )
 
-# Newton's method from the end of the first search to the optimum.
+# Settings of Newton's method, which continues from the first search to the optimum.
 _POLISH = NewtonConfig(
     max_steps=8,
     damping=1e-6,
@@ -35,7 +35,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Newton's method after the first round (attempt), for each effort.
+# Settings of Newton's method after the first round (attempt), for each effort.
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(
@@ -93,7 +93,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @abc.abstractmethod
     def decode(self, point: Array, context: PyTree) -> PyTree:
-        """Return the plan at a point (n,), with its violation computed more exactly.
+        """Return the plan at a point (n,), with a more exact violation than in `objective`.
 
         The solver sets the plan's `cost`, `iterations` and `status` afterwards; see `pending`.
         """

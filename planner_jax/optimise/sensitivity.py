@@ -1,6 +1,6 @@
-"""Gradients of many plans at once: one adjoint solve for each lane.
+"""Gradients of many plans at once: one adjoint solve for each plan.
 
-For a number q(u, theta) of a plan, where u minimises cost(u, theta),
+For a number q(u, theta) of a plan, where u minimises cost(u, theta) and theta is the case,
 
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
@@ -113,7 +113,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point of the inner planner with other settings to its present variables."""
+        """Convert a point of `before`, which has other settings, to this planner's variables."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
@@ -160,8 +160,8 @@ def gradient_at(
     Args:
         planner: the planner whose objective the point minimises.
         case: one case.
-        point: (n,) minimiser of the planner's objective. At another point the result is the
-            derivative along points at which the cost has the same gradient, not of the optimum.
+        point: (n,) minimiser of the planner's objective. At another point the result
+            is not the gradient at the optimum.
         quantity: dotted name of a number in the plan, or a function of the plan.
         by: dotted names in the case.
         steps: iterations of conjugate gradients, each with one product with the Hessian. They stop
@@ -205,7 +205,7 @@ def gradient_at(
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
     def products(direction: Array) -> tuple[Array, list]:
-        """Return (p^T cost_uu, p^T cost_uc): the derivative of both gradients along p."""
+        """Return p^T cost_uu and p^T cost_uc (c: context): derivatives of gradients along p."""
         slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
         return jax.jvp(slopes, (point,), (direction,))[1]
 

@@ -85,13 +85,11 @@ class NewtonConfig:
     tolerance: float = 1e-4  # predicted relative decrease below which a problem is stationary
     trusted: float = MOST_DAMPING  # greatest damping at which the predicted decrease is reliable
     patience: int = 3  # iterations without progress after which a problem is stationary
-    # Relative difference of costs, in units of machine epsilon, that counts as rounding error.
-    # Steps that raise the cost by no more are accepted; they are progress if the predicted decrease
-    # halves.
+    # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
+    # cost by this error; such a step counts as progress if the predicted decrease halves.
     slack: float = 0.0
-    # After the iterations, groups of unfinished problems continue, those with the greatest
-    # predicted decreases first: a group's fraction of the batch, its iterations, and the most
-    # groups.
+    # After `max_steps`, unfinished problems continue in groups, greatest predicted decrease first:
+    # a group's fraction of the batch, its iterations, and the greatest number of groups.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:

@@ -116,7 +116,7 @@ class Watch:
         self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
-# Indices of the lanes of one compiled call, padded with the first index; number before padding.
+# One compiled call: indices of its lanes, padded with the first index, and their unpadded number.
 _Call = tuple[np.ndarray, int]
 
 
@@ -157,7 +157,7 @@ def plan_batch(
 def plan_on_host(
     planner: Planner, attempts: Sequence[Attempt], cases: PyTree, watch: Watch
 ) -> tuple[PyTree, int]:
-    """Return plans with NumPy leaves, and the number unsolved, for a planner on the host."""
+    """Return NumPy plans, and the number of unsolved ones, by a planner that runs on the host."""
     alone = cases.batch_shape == ()
     cases = jax.tree.map(lambda leaf: np.asarray(leaf)[None] if alone else np.asarray(leaf), cases)
 
@@ -268,7 +268,7 @@ class _Batch:
         if threads == 1:  # JAX returns before a result is ready, so the next call is prepared early
             yield from map(solve, calls) if watch.waits else [solve(call) for call in calls]
             return
-        # The first call compiles the program before other threads use it: it is compiled only once.
+        # One call runs alone at first, so that its program is not compiled in every thread.
         key = program_key(self.planner, attempt, calls[0][0].size, cases)
         alone = [] if key in compiled else [solve(calls[0])]
         compiled.add(key)
@@ -310,7 +310,7 @@ class _Batch:
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Return the first attempt's plans, by chunks, and each device's number unsolved."""
+        """Make the first attempt by chunks; return plans, and each device's unsolved number."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)

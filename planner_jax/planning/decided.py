@@ -1,4 +1,4 @@
-"""The composite planner that first decides what a case leaves open, such as a catching order."""
+"""The composite planner that first decides what a case leaves open, such as an order of targets."""
 
 from collections.abc import Callable
 

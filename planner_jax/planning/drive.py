@@ -24,7 +24,7 @@ from planner_jax.planning.programs import solve_cases, solve_one
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """The implementation of `Drive`, with settings for `plan`, and pure for `solve`."""
+    """The implementation of `Drive`: with the caller's settings in `plan`, pure in `solve`."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]

@@ -29,10 +29,10 @@ def plan(
 ) -> PlanT:
     """Plan one case, or a batch of cases with a leading axis on every leaf.
 
-    Inside a compiled function of the caller this is `solve`. Equal calls return equal bits. If
-    other cases of the batch, the chunks or the devices change, a case's arithmetic is rounded
-    differently. A search that ends before the optimum may then end at another point, rarely with
-    another status.
+    Inside a compiled function of the caller this is `solve`. The same call returns
+    bitwise the same plans. With other cases in the batch, other chunks or other devices, a case's
+    arithmetic is rounded differently. A search that ends before the optimum may then end at
+    another point, rarely with another status.
 
     Args:
         planner: a planner such as `pj.hit.planner("exact")`; its attempts are made in order, each

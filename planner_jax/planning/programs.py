@@ -74,7 +74,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
         return Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
-    # Small chunks: sequential solving gains nothing from large ones, and no core waits at the end.
+    # Small chunks are enough for sequential solving, and keep all cores busy until the end.
     if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # rounded up to a power of two
@@ -123,7 +123,7 @@ def run_per_device(mesh: Mesh, function: Callable, *specs: PartitionSpec) -> Cal
     """
     if mesh.size == 1:
         return function
-    # Lanes of different devices are independent: JAX need not check for replicated values.
+    # Each device solves its own cases, so that JAX need not check for replicated values.
     return jax.shard_map(
         function, mesh=mesh, in_specs=specs or LANES, out_specs=LANES, check_vma=False
     )
@@ -143,7 +143,7 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 
 
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
-# on a GPU, while cuBLAS is as fast for products of these shapes. No effect on a CPU.
+# on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 

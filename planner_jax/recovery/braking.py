@@ -72,14 +72,12 @@ def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, n
         for limit in (limits.acceleration, limits.curvature)
     )
     targets = [bend, *(_SPARE * share * sharpest for share in _CURVATURES)]
-    # For the steering angle delta, d(delta)/d(kappa) = L / (1 + (L kappa)^2) is greatest at kappa =
-    # 0.
+    # The slope d(delta)/d(kappa) = L / (1 + (L kappa)^2) of the steering angle is greatest at 0.
     turn = _SPARE * float(limits.steering_rate) / float(case.body.wheelbase) * step
     for share in _DECELERATIONS:
         num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)
         speed = first * np.linspace(1.0, 0.0, num + 1)
-        # The limit of lateral acceleration bounds the curvature, by the speed at the preceding
-        # knot.
+        # The limit of lateral acceleration bounds the curvature, by the speed at the last knot.
         before = np.maximum(speed[:-1] ** 2, 1e-9)
         most = np.maximum(_SPARE * float(limits.lateral_acceleration) / before, abs(bend))
         for target in targets:
@@ -186,7 +184,7 @@ def _arm_candidates(
 
 
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
-    """Return why a motion with coefficients (M, 3, 6) and durations (M,) is bad, or "" if not."""
+    """Return why a motion, coefficients (M, 3, 6) and durations (M,), is not allowed, or ""."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
     angles = (first + tau * (second + tau * third)).reshape(-1, 6)

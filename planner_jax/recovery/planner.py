@@ -18,13 +18,13 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _ABOVE_GROUND = 0.2  # [m] lowest guess of the position of standstill, above the least height
 # Starting points, best first. Column 1 is a base duration [s], to which the time for the distance
-# at half the greatest speed is added. Column 2 is the distance / the distance of uniform braking.
+# at half the greatest speed is added. Column 2 is the distance over the distance of braking.
 _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3), (4.0, 1.0)])
 
 
 @struct.dataclass
 class RecoveryContext:
-    """The context that `ChainPlanner` reads; it has nothing but the case."""
+    """The context of a recovery for `ChainPlanner`; it consists of the case alone."""
 
     case: RecoveryCase
 
@@ -67,7 +67,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
             raise ArgumentError("to", f"one of {', '.join(RECOVERIES)}", self.to)
 
     def prepare(self, case: RecoveryCase) -> RecoveryContext:
-        """Return the context of a case, which has nothing but the case."""
+        """Return the context of a case, which consists of the case alone."""
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:

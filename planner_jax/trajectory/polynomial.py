@@ -77,8 +77,8 @@ def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the integral of the squared `order`-th derivative of a polynomial, a quadratic form.
 
     Returns:
-        The form in the coefficients over a unit of time, (degree + 1, degree + 1), and for each
-        entry the power of the duration by which it grows.
+        The matrix (degree + 1, degree + 1) of the form for duration 1, and for each entry the power
+        of the duration by which it must be multiplied.
     """
     factors, powers = derivative_factors(degree, order), np.arange(degree + 1)
     exponents = np.maximum(powers[:, None] + powers[None, :] - 2 * order + 1, 1)

@@ -5,8 +5,8 @@ MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints
 differentiable.
 
 Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that
-h = T / M. One constant matrix in time over h then maps the boundary rows and the waypoints to the
-coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
+h = T / M. With times in units of h, one constant matrix maps the boundary rows and the waypoints to
+the coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
 (p, v h, a h^2, j h^3) at both ends.
 
 The waypoints q are expressed by whitened offsets y from the waypoints that need the least energy
@@ -102,8 +102,8 @@ def _hermite_energy(order: int) -> np.ndarray:
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the energy of all pieces as a quadratic form (C, C) in the columns.
 
-    The form is a sum of squares. The equal form in the nodes' derivatives would lose the small
-    energy of smooth motion far from the origin to rounding.
+    The form is a sum of squares. The same form in the nodes' derivatives would lose the small
+    energy of smooth motions far from the origin to rounding errors.
 
     Args:
         coefficients: (M, 2s, C), of the powers of each piece's unit time.
@@ -138,7 +138,7 @@ def proportional_minco(
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # A derivative of order d in the unit time of piece i is r_i^d times the one in time over h.
+    # With times in units of piece i's duration, d-th derivatives are r_i^d times as large as for h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
@@ -159,9 +159,8 @@ def proportional_minco(
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
     from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # Offsets of this kind (positions or velocities) are deviations from the values of least
-        # energy for the columns before them; the columns after them take their values of least
-        # energy.
+        # Offsets of a kind (positions, or velocities) are deviations from values of least energy,
+        # for given columns before them and the best values of the columns after them.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         reduced = _least_energy(energy, end)
@@ -188,7 +187,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return the boundary rows (2s, 3) of two states (s, 3): the d-th derivatives times h^d."""
+    """Return the boundary rows (2s, 3) of two states (s, 3): d-th derivatives times h^d."""
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -196,11 +195,11 @@ def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -
 def sample_motion(
     maps: ProportionalMinco, nodes: int, columns: Array, piece_duration: Array, orders: int = 4
 ) -> Motion:
-    """Sample position, velocity, acceleration and jerk at `nodes` intervals a piece.
+    """Sample position, velocity, acceleration and jerk at `nodes` intervals of each piece.
 
     Args:
         maps: constant maps of M pieces.
-        nodes: intervals a piece. There are N = M nodes + 1 samples: neighbouring pieces share one.
+        nodes: intervals of each piece. Neighbouring pieces share one of N = M nodes + 1 samples.
         columns: (C, 3) boundary rows and whitened offsets y.
         piece_duration: () h = T / M [s].
         orders: 4, or 5 to sample the snap as well.
@@ -259,12 +258,12 @@ def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piec
 
 
 def boundary_energy(maps: ProportionalMinco, rows: Array, piece_duration: Array) -> Array:
-    """Return the part () of `trajectory_energy` without offsets: the least for these ends."""
+    """Return the least energy () for given boundary rows: the energy with zero offsets."""
     return _boundary_form(maps, rows) * reciprocal(piece_duration) ** (2 * maps.order - 1)
 
 
 def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array) -> Array:
-    """Return the part () of `trajectory_energy` that the offsets add."""
+    """Return the energy () that the offsets add to the energy of the boundary rows."""
     rate = reciprocal(piece_duration)
     return maps.offset_energy * jnp.sum(offsets**2) * rate ** (2 * maps.order - 1)
 

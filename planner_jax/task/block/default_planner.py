@@ -74,7 +74,7 @@ Refine = Callable[[BlockCase, Flight, Array, "Search", BlockPlan], BlockPlan]
 class Search(Attempt):
     """An attempt: a number of straight motions, then least squares from some starts; static.
 
-    Two cases in three have a straight motion that is free; it is nearly always among the first.
+    Two cases in three have a straight motion without collision, nearly always among the first.
     """
 
     starts: int = 8
@@ -84,7 +84,7 @@ class Search(Attempt):
     kept: int = 5  # number of starts that continue after the solver's trial steps
     # Whether a single case refines each start to its end before the next one, without trial steps.
     in_turn: bool = True
-    # `hope` is above the cost that nearly all successful starts have at that step.
+    # The bound `hope` on the cost after the trial lets nearly all successful starts continue.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -198,7 +198,7 @@ class OnlineBlock(Planner):
         return self._solve_by(refine, case, attempt)
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; the starts of all cases are refined together, in step."""
+        """Return the plans of a batch; the starts of all cases are refined together."""
         return jax.vmap(lambda case: self._solve_by(self.refine_in_step, case, attempt))(cases)
 
     def _solve_by(self, refine: Refine, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -350,8 +350,7 @@ class OnlineBlock(Planner):
         slopes = clearance_slopes(case.arm, case.scene, angles[worst])  # (R, 6, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
-        # The barrier keeps the compiler from repeating this computation in each term of the
-        # products.
+        # The barrier keeps the compiler from repeating this computation in each product.
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)

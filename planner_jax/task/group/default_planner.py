@@ -91,7 +91,7 @@ class GroupIntercept(Planner):
 def _is_open(status: Array) -> Array:
     """Return whether the planner `patient` may solve a leg that has this status.
 
-    Legs without a path count too, since that planner ends at other times and scales the body.
+    This includes legs without a path: `patient` tries other end times and sizes of the body.
     """
     return is_unsolved(status) | (status == Status.NO_PATH)
 

@@ -41,7 +41,7 @@ class ReplanHitContext:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanHit(OptimisedPlanner):
-    """Re-plans hits for `pj.replan` from plans of any hit planner; `planner` makes new plans."""
+    """A planner for `pj.replan` of hits; the previous plans may be of any hit planner."""
 
     case_type = Replanning
     plan_type = HitPlan

@@ -89,7 +89,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     @property
     def problem(self) -> MotionProblem:
-        """The least-squares problem."""
+        """The least-squares problem that every search solves."""
         return MotionProblem(self.meet, self.pieces, self.samples, self.checked)
 
     def replanner(self) -> ReplanIntercept:
@@ -99,7 +99,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def smooth_near(
         self, cases: InterceptCase, plans: InterceptPlan
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return a planner that minimises the cost from plans, and the cases with these plans.
+        """Return a planner that minimises the cost from existing plans, and cases with these plans.
 
         `pj.gradient` and `pj.optimal_plan` use both results.
         """
@@ -112,7 +112,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Return `smooth_near` for the plans of `plan_of`, by default of the first attempt."""
+        """Plan the cases, by `plan_of` or the first attempt; return `smooth_near` of the plans."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:

@@ -47,7 +47,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """A re-plan of the previous plan, then one search from scratch; more take too long."""
+        """One attempt from the previous plan, then one search from scratch, to save time."""
         return (self.warm, self.search)
 
     @property
@@ -99,7 +99,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         if movers is None:
             moved = cases.movers.velocity * elapsed[..., None, None]
             movers = dataclasses.replace(cases.movers, centre=cases.movers.centre + moved)
-        # A planner that is free to choose the meeting time may choose a later time than it did.
+        # If the meeting time is free, the new plan may meet the target later than the previous one.
         until = cases.time if self.problem.is_time_free else previous.time
         remainder = dataclasses.replace(
             cases,
