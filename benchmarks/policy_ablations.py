@@ -3,15 +3,21 @@
     python -m benchmarks.policy_ablations [--suite triangle3] [--decisions 1500000] [--seeds 3]
         [--variants whole,mlp,...] [--num 1000] [--seed 777] [--out DIR]
 
-"whole" is the training of `planner-jax train`: the attention network, every decision planned, and
-rewards for success, early last catches and feasible times. Each other variant differs in one part.
-"mlp" has another network. "estimate" judges decisions by the estimate, without a planner. "no last"
-and "no ratio" lack a term of the reward. "small" has the size that the paper states (IV-B): its
-network, 100 environments, and a tenth of the decisions, which already takes longer.
+A policy decides in which order and when a quadrotor catches several balls. It is trained by
+reinforcement learning. The variants of the training are:
+* "whole": the training of `planner-jax train`. It has an attention network, plans every decision,
+  and rewards success, an early last catch, and decided times that are close to the optimised times;
+* "mlp": a multilayer perceptron instead of the attention network;
+* "estimate": decisions are rewarded by an estimate of the times, without a planner;
+* "no last" and "no ratio": the reward lacks the term of the last catch or of the decided times;
+* "small": the network of [Yu2023catch, Section IV-B], 100 environments as in the paper, and a tenth
+  of the decisions. Even so its training takes longer than the other variants.
 
-The trained policies decide on cases of a seed that no training uses. Every plan is by `exact` and
-judged by the referee. Last catches and optimal time ratios (OTR) are over accepted plans. The
-variation over training seeds is printed as minimum and maximum. Training times include compilation.
+The trained policies decide on cases of a seed that no training uses. The planner `exact` plans
+these cases, and the referee judges the plans. The table has means over accepted plans of the time
+of the last catch and of the optimal time ratio (OTR), which compares decided and optimised times.
+The variation over training seeds is printed as minimum and maximum. Training times include
+compilation.
 """
 
 import argparse
@@ -33,7 +39,8 @@ from planner_jax.policies.training import Part, Training, train
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.spec import SUITES
 
-ITERATIONS = 25  # of the planner in training
+ITERATIONS = 25  # Number of the planner's iterations for each decision in training.
+# Name of a variant -> arguments of `training_settings`.
 VARIANTS: dict[str, dict[str, Any]] = {
     "whole": {},
     "mlp": {"network": "mlp"},
@@ -55,7 +62,17 @@ def training_settings(
     weights: Mapping[str, float] | None = None,
     **others: Any,
 ) -> Training:
-    """Return the training settings of a variant."""
+    """Return the settings of a training.
+
+    Args:
+        suite: suite of catches on which the policy is trained.
+        decisions: number of decisions in training.
+        seed: seed of the training.
+        iterations: number of the planner's iterations for each decision.
+        share: factor of the number of decisions.
+        weights: weights of terms of the reward that differ from the defaults.
+        **others: other fields of `Training`.
+    """
     part = Part(steps=int(share * decisions), iterations=(iterations,))
     terms = tuple({**WEIGHTS, **(weights or {})}.items())
     usual = Training(suites=(suite,), parts=(part,), seed=seed, weights=terms, eval_cases=0)
@@ -65,9 +82,10 @@ def training_settings(
 def judge_decision(
     bench: Bench, decision: Any, suite: str, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Judge a decision's plans, and count the successes.
+    """Plan a suite's cases with a policy or another decision, and judge the plans.
 
-    Returns success [%], mean last catch [s], and optimal time ratio.
+    The successes are added to the benchmark's summary. Returns the success rate [%], the mean time
+    of the last catch [s], and the mean optimal time ratio.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
@@ -81,7 +99,7 @@ def judge_decision(
 
 
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
-    """Print all rows."""
+    """Train and judge every variant, and print the table, with two untrained decisions first."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
@@ -108,7 +126,7 @@ def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> N
 
 
 def train_policy(training: Training) -> Policy:
-    """Train a policy in a temporary folder."""
+    """Train a policy with given settings; the training's files are deleted afterwards."""
     with tempfile.TemporaryDirectory() as scratch:
         return train(training, scratch, progress=False)
 
@@ -119,13 +137,13 @@ def report_seeds(
     train_by: Callable[[int], Any],
     options: argparse.Namespace,
 ) -> None:
-    """Train with every seed; store a row for each, and print the line of minima and maxima.
+    """Train a policy with every seed, judge the policies, and print their minima and maxima.
 
     Args:
-        bench: receives the rows.
-        named: the name of the training, under the heading of its column.
-        train_by: function that trains a decision with a seed.
-        options: `suite` and `seeds`, and the options of `judge_decision`.
+        bench: stores a row for each seed.
+        named: the column heading of the training's name -> this name.
+        train_by: function that trains a policy with a seed.
+        options: command-line options with `suite`, `seeds` (their number), `num` and `seed`.
     """
     rows = []
     for seed in range(options.seeds):
@@ -146,7 +164,7 @@ def report_seeds(
 
 
 def main() -> None:
-    """Print the table."""
+    """Parse the arguments, and print the table of all variants."""
     parser = argument_parser("policy_ablations", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
     parser.add_argument(

@@ -1,18 +1,23 @@
-"""Compare PPO of Stable-Baselines3 with this library's training, on the same environment.
+"""Compare this library's training of policies with PPO of Stable-Baselines3.
 
     python -m benchmarks.policy_peer [--suite triangle3] [--decisions 150000] [--seeds 3]
         [--num 1000] [--seed 777] [--out DIR]
 
-Needs `pip install stable-baselines3`, in an environment without the extra `gpu`: PyTorch needs
-other CUDA libraries than those pinned for JAX, so no extra contains it.
+The benchmark needs `pip install stable-baselines3`, in an environment without the extra `gpu`.
+PyTorch needs other versions of the CUDA libraries than JAX, so no extra of this library contains
+it.
 
-Both train the paper's network, two hidden layers of 64 units with ReLU, in 100 environments at
+Both trainings use the same environment, in which a policy decides order and times of catches. They
+train the network of [Yu2023catch], two hidden layers of 64 units with ReLU, in 100 environments at
 once, with the same number of decisions and the same rewards. Every 100 decisions are used in four
-passes of four minibatches. "sb3" clips Gaussian actions to -1 and 1, scales advantages in its own
-manner, and has a value network of the same size and a learning rate of 3e-4. "brax" is this
-library's training, whose learning rate follows the divergence. Each policy decides, by its mean, on
-cases of a seed that no training uses. Every plan is by `exact` and judged by the referee. Figures
-are minimum and maximum over the training seeds. Training times include compilation.
+passes of four minibatches. In the table, "sb3" is PPO of Stable-Baselines3. It clips Gaussian
+actions to -1 and 1, normalises advantages in each minibatch, and has a value network of the same
+size and a learning rate of 3e-4. "brax" is this library's training. It adapts the learning rate to
+the divergence between the old and the new policy.
+
+Each policy decides by the mean of its action, on cases of a seed that no training uses. The planner
+`exact` plans these cases, and the referee judges the plans. The table has the minimum and the
+maximum over training seeds. Training times include compilation.
 """
 
 import argparse
@@ -47,12 +52,13 @@ spaces: Any = importlib.import_module("gymnasium.spaces")
 sb3: Any = importlib.import_module("stable_baselines3")
 vec_env: Any = importlib.import_module("stable_baselines3.common.vec_env")
 
+# Number of parallel environments, of minibatches in a pass, and of passes over the same decisions.
 LANES, MINIBATCHES, PASSES = 100, 4, 4
-FIRST_STD = 0.15
+FIRST_STD = 0.15  # Standard deviation of actions at the start of the training by sb3.
 
 
 class CatchVecEnv(vec_env.VecEnv):
-    """`CatchEnv`, which is a batch by itself, with the interface of Stable-Baselines3."""
+    """Adapter of the batched environment `CatchEnv` to the interface of Stable-Baselines3."""
 
     def __init__(self, suite: str, iterations: int, seed: int):
         self.env = CatchEnv((suite,), (iterations,))
@@ -62,16 +68,19 @@ class CatchVecEnv(vec_env.VecEnv):
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
     def reset(self) -> np.ndarray:
-        """Return observations (LANES, F) of new cases."""
+        """Draw new cases, and return their observations (LANES, F)."""
         self._state = self._reset(self._keys)
         return np.array(self._state.obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Decide on all cases."""
+        """Plan all cases with the decisions `actions` (LANES, A), and draw the next cases."""
         self._state = self._step(self._state, jnp.asarray(actions, jnp.float32))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Return observations of the next cases, rewards, ended episodes (all), and no info."""
+        """Return observations of the next cases, rewards, ended episodes, and empty infos.
+
+        Every episode ends after one step, because it has a single decision.
+        """
         seen, reward = np.array(self._state.obs), np.array(self._state.reward)
         return seen, reward, np.ones(LANES, bool), [{} for _ in range(LANES)]
 
@@ -79,28 +88,28 @@ class CatchVecEnv(vec_env.VecEnv):
         """Do nothing: no resource is open."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, once for each batch element."""
+        """Return an attribute of the environment, repeated for each of the `LANES` environments."""
         return [getattr(self.env, attr_name, None)] * LANES
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Do nothing: the environment has no settings."""
+        """Do nothing, because the environment has no settings that can change."""
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> Any:
-        """Do nothing: no method is called."""
+        """Do nothing, because PPO calls no method of the environment by name."""
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for each batch element."""
+        """Return False for each environment: no wrapper class is used."""
         return [False] * LANES
 
 
 @struct.dataclass
 class PeerPolicy(CatchDecision):
-    """Decision by the mean of a network that Stable-Baselines3 trained."""
+    """Decision of order and times by the mean action of a policy from Stable-Baselines3."""
 
-    layers: Sequence[tuple[Any, Any]]  # weights and biases; no ReLU after the last layer
+    layers: Sequence[tuple[Any, Any]]  # weights and biases; ReLU follows all layers but the last
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the single choice for one case, leaves (1, N)."""
+        """Return the policy's choice of order and times for one case, leaves (1, N)."""
         table = timetable(case)
         hidden = observe(case, table).ravel()
         *inner, (weights, bias) = self.layers
@@ -116,7 +125,7 @@ def _affine(weights: Any, bias: Any, hidden: jax.Array) -> jax.Array:
 
 
 def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
-    """Train a policy on a suite with Stable-Baselines3."""
+    """Train a policy on a suite with Stable-Baselines3, with a number of decisions and a seed."""
     network = {
         "net_arch": [64, 64],
         "activation_fn": torch.nn.ReLU,
@@ -144,7 +153,7 @@ def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
 
 
 def train_own(suite: str, decisions: int, seed: int) -> Any:
-    """Train a policy on a suite with this library."""
+    """Train a policy on a suite with this library, with a number of decisions and a seed."""
     return train_policy(
         training_settings(
             suite,
@@ -159,7 +168,7 @@ def train_own(suite: str, decisions: int, seed: int) -> Any:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Print all rows."""
+    """Train policies with both trainings, judge them, and print the table."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
@@ -178,7 +187,7 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Print the table."""
+    """Parse the arguments, and print the table of both trainings."""
     parser = argument_parser("policy_peer", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
     parser.add_argument(

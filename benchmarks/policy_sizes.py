@@ -1,15 +1,21 @@
-"""Measure a policy on numbers of targets that it was not trained on, beside training on each.
+"""Measure a policy of catches with numbers of targets that it was not trained on.
 
     python -m benchmarks.policy_sizes [--sizes 4,5,7] [--num 1000] [--seed 777]
         [--decisions 1500000] [--policy FILE] [--init-from FILE] [--out DIR]
 
-The suites `square4`, `pentagon5` and `heptagon7` differ from `hexagon6` only in the number of
-targets. Row `best` plans the six most promising of all orders (for seven targets, of the orders
-that a search finds), and row `greedy` plans one. Row "policy" is the policy in --policy, unchanged,
-by default the shipped one. Row "trained" is the result of training on this suite with --decisions
-decisions and the shipped policy's reward, starting with the weights of --init-from, by default
---policy. Every plan is by `exact` and judged by the referee. Last catches and optimal time ratios
-(OTR) are over accepted plans. Training times include compilation.
+The suites `square4`, `pentagon5` and `heptagon7` have four, five and seven targets. Otherwise they
+equal `hexagon6`, one of the suites on which the shipped policy was trained. The rows of each suite
+are
+* "best": plan the six most promising of all orders (with seven targets, of the orders that a search
+  finds), and use the best plan;
+* "greedy": plan the one order that catches the earliest target next;
+* "policy": the policy in --policy, by default the shipped policy, without further training;
+* "trained": a policy trained on this suite with --decisions decisions and the shipped policy's
+  reward. It starts with the weights of --init-from, by default of --policy.
+
+The planner `exact` plans all cases, and the referee judges the plans. The table has means over
+accepted plans of the time of the last catch and of the optimal time ratio (OTR), which compares
+decided and optimised times. Training times include compilation.
 """
 
 import argparse
@@ -32,7 +38,7 @@ REWARD = {**WEIGHTS, "solved": 5.0, "last": 10.0, "ratio": -14.0}
 
 
 def train_on_suite(suite: str, options: argparse.Namespace) -> tuple[Policy, float]:
-    """Train a policy on one suite from initial weights; return it with the duration [s]."""
+    """Train a policy on one suite, starting with given weights; return it and the duration [s]."""
     training = Training(
         suites=(suite,),
         parts=(Part(options.decisions, (usual_iterations(suite),)),),
@@ -48,7 +54,7 @@ def train_on_suite(suite: str, options: argparse.Namespace) -> tuple[Policy, flo
 
 
 def measure(bench: Bench, sizes: list[str], options: argparse.Namespace) -> None:
-    """Print all rows."""
+    """Train a policy for each suite, judge it beside the other decisions, and print the table."""
     bench.say(
         f"{options.num} cases each, seed {options.seed}; trained with {options.decisions:,} "
         f"decisions, {jax.devices()[0]}",
@@ -82,7 +88,7 @@ def measure(bench: Bench, sizes: list[str], options: argparse.Namespace) -> None
 
 
 def main() -> None:
-    """Print the table."""
+    """Parse the arguments, and print the table of all suites."""
     parser = argument_parser("policy_sizes", __doc__, num=1000, seed=777)
     parser.add_argument(
         "--sizes", default=",".join(SUITES), help="numbers of targets, comma-separated"

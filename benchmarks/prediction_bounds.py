@@ -1,4 +1,7 @@
-"""Cramer-Rao bounds for predicted targets: the smallest errors of unbiased predictions."""
+"""Cramer-Rao bounds for predicted targets: the smallest errors of unbiased predictions.
+
+The benchmarks of predicted targets compare the errors of predictions with these bounds.
+"""
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,10 +23,10 @@ def cramer_rao(
 
     Args:
         path: true path of the target.
-        times: (L,) [s], of the observations.
-        noise: () [m], standard deviation of a coordinate.
-        time: () [s], of the prediction.
-        turning: whether the turn rate is unknown too; False if it is known to be zero.
+        times: (L,) [s], times of the observations.
+        noise: () [m], standard deviation of each observed coordinate.
+        time: () [s], time for which the position is predicted.
+        turning: whether the turn rate is unknown, too. False if the path is known to be straight.
 
     Raises:
         ValueError: there are fewer than two observations, or three with a turn rate.
@@ -46,17 +49,24 @@ def cramer_rao(
 
 
 def mean_distance(bound: Array) -> Array:
-    """Return the mean length () [m] of a Gaussian error of a covariance (2, 2) [m^2]."""
+    """Return the mean length () [m] of a Gaussian error with covariance `bound` (2, 2) [m^2]."""
     return np.sqrt(0.5 * np.pi) * jnp.mean(safe_sqrt(_square_radii(bound)))
 
 
 def share_within(bound: Array, radius: ArrayLike) -> Array:
-    """Return the probability () that a Gaussian error of a covariance is within a radius [m]."""
+    """Return the probability () that a Gaussian error is shorter than a radius [m].
+
+    `bound` (2, 2) [m^2] is the covariance of the error, which has zero mean.
+    """
     return 1.0 - jnp.mean(jnp.exp(-0.5 * radius**2 / _square_radii(bound)))
 
 
 def _square_radii(bound: Array) -> Array:
-    """Return squared radii (64,) of the standard ellipse at equal steps of its parameter."""
+    """Return squared distances (64,) [m^2] of points on the error ellipse from its centre.
+
+    The ellipse belongs to one standard deviation of the covariance `bound`. The points are at equal
+    steps of the ellipse's parameter over half a turn, as nodes of an integral over the directions.
+    """
     mean = 0.5 * (bound[0, 0] + bound[1, 1])
     apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)
     return mean + apart * jnp.asarray(np.cos(np.arange(64) * (np.pi / 32.0)), bound.dtype)

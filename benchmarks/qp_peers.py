@@ -1,4 +1,8 @@
-"""Published solvers for the programs of `baselines.intercept.qp`, with the extra `peers`."""
+"""Clarabel and OSQP, published solvers of quadratic programs, for comparison in `intercept_speed`.
+
+They are installed with the extra `peers`, and solve the programs of `baselines.intercept.qp`:
+minimise x' Q x / 2 subject to equalities and to lower and upper bounds of R x.
+"""
 
 import dataclasses
 import importlib
@@ -14,25 +18,27 @@ INSTALL = "pip install 'planner-jax[peers]' adds Clarabel and OSQP to compare wi
 
 
 def is_installed(name: str) -> bool:
-    """Return whether a peer can be imported."""
+    """Return whether the Python package of a solver is installed."""
     return importlib.util.find_spec(name) is not None
 
 
 @dataclasses.dataclass(frozen=True)
 class PeerSolution:
-    """Solution of one program by a peer, and its duration, compiled before."""
+    """Solution of one quadratic program by Clarabel or OSQP, and the duration of the call."""
 
     point: np.ndarray  # (n,)
-    cost: float
-    solved: bool
-    seconds: float
+    cost: float  # x' Q x / 2
+    solved: bool  # as reported by the solver
+    seconds: float  # duration of the call [s], NaN if the solver was not called
 
 
 def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
-    """Return Clarabel, an interior-point method, for these matrices (as of `qp_template`).
+    """Return a function that solves quadratic programs with given matrices by Clarabel.
 
-    It is set up for every program, which is part of its time, because its interface cannot change
-    which bounds are infinite.
+    Clarabel is an interior-point method. `matrices` are the arguments of `qp_template`. The
+    function takes right-hand sides of the equalities, lower bounds and upper bounds. Clarabel is
+    set up anew for every program, because its interface cannot change which bounds are infinite.
+    This is part of the measured time.
     """
     clarabel: Any = importlib.import_module("clarabel")
 
@@ -63,10 +69,11 @@ def clarabel_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSol
 
 
 def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolution]:
-    """Return OSQP, the solver of [Qu2022], for these matrices (as of `qp_template`).
+    """Return a function that solves quadratic programs with given matrices by OSQP.
 
-    It is set up once, and gets new bounds for every program, with a warm start at the solution
-    before.
+    OSQP is the solver of [Qu2022]. `matrices` are the arguments of `qp_template`. The function
+    takes right-hand sides of the equalities, lower bounds and upper bounds. OSQP is set up once.
+    For every program it gets new bounds, and starts at the solution of the previous program.
     """
     osqp: Any = importlib.import_module("osqp")
 
@@ -101,14 +108,14 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
 
 
 def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Return the upper triangle of the Hessian, all equalities and the rows, as sparse matrices."""
+    """Return as sparse matrices the upper triangle of Q, the equalities, and the bounded rows R."""
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])
 
 
 def _equality_values(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
-    """Return the right-hand sides of all equalities."""
+    """Return the right-hand sides of all equalities: the given ones, then zeros."""
     return np.concatenate([np.asarray(right_side, float), np.zeros(len(matrices["zeros"]))])
 
 

@@ -1,10 +1,11 @@
-"""Count recovery trajectories that bring the robot to a standstill after a plan, as in `export`.
+"""Measure how often a plan can be followed by a recovery trajectory to a standstill.
 
     python -m benchmarks.recoveries [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
 
-Cases of each row are drawn and planned. For every plan that the referee accepts and that does not
-end at rest, a recovery trajectory is computed by itself. If none is found, the limit that fails is
-counted.
+A recovery trajectory brings the robot to a standstill after the last contact of a plan, as
+`planner-jax export` appends it to plans. Cases of each row are drawn and planned. For every plan
+that the referee accepts and that does not end at a standstill, a recovery trajectory is computed.
+If none is found, the limit that it would exceed is counted.
 """
 
 import time
@@ -19,7 +20,8 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.core.errors import NoRecovery
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 
-# Row -> API of the task, options of `draw` and of `planner`, and kind of recovery.
+# Row name -> module of the task, options of its `draw`, options of its `planner`, and kind of the
+# recovery: "brake" to a standstill at any position, or "home" to the start of the case.
 ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
     "hits": (pj.hit, {}, {}, "brake"),
     "hits-home": (pj.hit, {}, {}, "home"),
@@ -31,9 +33,17 @@ ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
 
 
 def count_recoveries(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[Counter, float]:
-    """Count recoveries, and return the median duration of a computation [s], warm.
+    """Compute a recovery trajectory for each accepted plan of a batch.
 
-    The counts are plans that end at rest, found recoveries, and failed limits.
+    Args:
+        cases: a batch of B cases.
+        plans: the plans of these cases.
+        passed: (B,) bool, whether the referee accepts the plan.
+        to: kind of the recovery, "brake" or "home".
+
+    Returns:
+        The numbers of plans that end at a standstill ("rests"), of recoveries that were found
+        ("found"), and of failures by the name of the limit. Then the median duration [s].
     """
     counts: Counter[str] = Counter()
     seconds = []

@@ -1,10 +1,11 @@
-"""Compare quadrotor models: refereed success, and the computing cost of their rotor limits.
+"""Compare quadrotor models: success of their plans, and the time that rotor limits add to planning.
 
     python -m benchmarks.robot_rows [--robots NAME|FILE ...] [--num 2048] [--repeats 5] [--out DIR]
 
-Every robot plans with and without the limits of its rotors (`rotor_share` null). The two take
-turns, so that other load on the machine affects both. Rackets hit the serves of the suite court,
-nets catch the throws of parabola2. Plans without rotor limits are judged without them too.
+Every model plans with limits on the thrust of each rotor, and without them (`rotor_share` null).
+Both kinds of calls take turns, so that other load on the machine affects both. Models with a racket
+hit the serves of the suite `court`. Models with a net catch the balls of the suite `parabola2`. The
+referee judges plans without rotor limits also without these limits.
 """
 
 import dataclasses
@@ -19,11 +20,12 @@ from planner_jax.benchmarks.run import argument_parser, begin
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel
 from planner_jax.robot.quadrotor_models import MODELS, robot_named
 
-SHARE = 0.9  # share of a rotor's range, for robots without a rotor limit
+# Part of a rotor's thrust range that plans may use, for models that state no rotor limit.
+SHARE = 0.9
 
 
 def vary_rotor_limits(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
-    """Return the robot without and with limits of its rotors."""
+    """Return two copies of a quadrotor model, without and with limits on its rotors' thrust."""
     share = robot.limits.rotor_share or SHARE
 
     def with_share(share: float | None) -> QuadrotorModel:
@@ -34,9 +36,11 @@ def vary_rotor_limits(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
 
 
 def measure_robot(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
-    """Return success (num,) and plans/s by wall-clock and by CPU time, without and with limits.
+    """Plan `num` cases for a quadrotor model without and with rotor limits, several times.
 
-    The first plans compile and are not timed; a rate is the best of the others.
+    Returns for each of both whether the referee accepts the plans, (num,) bool, and plans per
+    second of wall-clock time and of CPU time. The first call compiles and is not timed. The fastest
+    of the other calls counts.
     """
     task, suite = (pj.catch, "parabola2") if robot.tool.kind == NET else (pj.hit, "court")
     planner, found = task.planner(), {}

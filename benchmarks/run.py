@@ -1,9 +1,14 @@
 """Shared parts of all benchmarks: arguments, printed output, and the run folder.
 
-The folder holds manifest.json (kind "bench NAME", state, parameters, versions, device, commit,
-times, summary), table.md with the printed lines and, if the benchmark has rows, rows.json. Every
-summary has `num`, the number of plans that the referee judged, and `success_rate`. If the benchmark
-computes `cost_gaps`, the summary also has their median, 90 % and 99 % quantile.
+A run folder has the following files:
+* manifest.json: the kind "bench NAME", state, parameters, versions, device, commit, times, and a
+  summary;
+* table.md: the printed lines;
+* rows.json: the rows of the benchmark's tables, if it has any.
+
+Every summary has `num`, the number of plans that the referee judged, and `success_rate`, the share
+that it accepted. If the benchmark computes `cost_gaps`, the summary also has their median, 90 % and
+99 % quantile.
 """
 
 import argparse
@@ -25,9 +30,13 @@ from planner_jax.runs.run_folder import RunFolder
 
 
 def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.ArgumentParser:
-    """Build a benchmark's parser with --out and one integer option per count.
+    """Build the command-line parser of a benchmark.
 
-    The keywords `counts` are the names of these options with their defaults.
+    Args:
+        name: name of the benchmark's module.
+        doc: docstring of the module, whose first line describes the program.
+        **counts: names of integer options with their defaults. Values must be at least 1, or at
+            least 0 for the option `seed`. The option --out for the run folder is added, too.
     """
     head, _, _ = (doc or "").partition("\n")
     parser = argparse.ArgumentParser(f"python -m benchmarks.{name}", description=head)
@@ -53,7 +62,11 @@ def at_least(least: int) -> Callable[[str], int]:
 def parse_names(
     parser: argparse.ArgumentParser, flag: str, text: str, known: Iterable[str]
 ) -> list:
-    """Split a comma-separated argument into names; exit with an error for an unknown name."""
+    """Split the text of a comma-separated argument into names.
+
+    The program exits with an error if a name is not in `known`. `flag` is the argument's name in
+    the error message.
+    """
     for name in (names := text.split(",")):
         if name not in known:
             parser.error(f"argument {flag}: must be among {', '.join(known)}, got {name!r}")
@@ -61,7 +74,10 @@ def parse_names(
 
 
 def begin(parser: argparse.ArgumentParser, options: argparse.Namespace) -> "Bench":
-    """Create the run of parsed arguments; exit with an error if its folder cannot be created."""
+    """Create the run of a benchmark with parsed arguments.
+
+    The program exits with an error if the run folder cannot be created.
+    """
     given = {name: value for name, value in vars(options).items() if name != "benchmark"}
     try:
         return Bench(options.benchmark, given, given.pop("out"))
@@ -72,8 +88,15 @@ def begin(parser: argparse.ArgumentParser, options: argparse.Namespace) -> "Benc
 class Bench:
     """One run of a benchmark: a context manager that creates the run folder on entry.
 
-    JAX is not started before entry. Raises `ArgumentError` unless `out` (None:
-    runs/bench-NAME-DATE-TIME) can be a new folder.
+    JAX is not started before entry, so that a benchmark can start other processes first.
+
+    Args:
+        name: name of the benchmark.
+        parameters: arguments of the benchmark, which are stored in the manifest.
+        out: run folder, new or empty; None for runs/bench-NAME-DATE-TIME.
+
+    Raises:
+        ArgumentError: the folder cannot be created or is not empty.
     """
 
     def __init__(self, name: str, parameters: Mapping[str, Any], out: Any = None):
@@ -109,17 +132,22 @@ class Bench:
         self._lines += lines
 
     def row(self, **figures: Any) -> None:
-        """Add a row to rows.json."""
+        """Add a row of named numbers or texts to the file rows.json of the run folder."""
         self._rows.append(plain(figures))
         self._folder.write_text("rows.json", json.dumps(self._rows, indent=1) + "\n")
 
     def count(self, accepted: Any, *gaps: np.ndarray | None) -> None:
-        """Add plans to the summary: whether the referee accepts each, and their `cost_gaps`."""
+        """Add plans to the summary.
+
+        Args:
+            accepted: (B,) bool, whether the referee accepts each plan.
+            *gaps: results of `cost_gaps` for these plans.
+        """
         self._accepted += np.asarray(accepted, bool).tolist()
         self._gaps += gaps
 
     def note(self, **figures: Any) -> None:
-        """Add the benchmark's own figures to the summary."""
+        """Add named numbers of the benchmark to the summary in the manifest."""
         self._figures |= figures
 
 
