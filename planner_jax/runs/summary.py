@@ -24,7 +24,7 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
 
 
 def percent(successes: int, num: int) -> str:
-    """Return a rate in percent; rounding gives "0.00" or "100.00" only for the exact rates."""
+    """Return a rate in percent; a rate near 0 or 1 is never rounded to "0.00" or "100.00"."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)

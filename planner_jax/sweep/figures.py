@@ -24,8 +24,8 @@ DASHED: Look = {"color": style.RED, "linewidth": 1.2, "linestyle": "--", "zorder
 FORBIDDEN: Look = {"color": style.RED, "alpha": 0.08, "linewidth": 0.0}
 _SAMPLES = 800  # number of times at which a plan is sampled for its curves
 CAPTION = (
-    "One plan along its time against the limits, beside the other planners' plans for the same "
-    "case. Thin: the recovery trajectory behind the last contact, if there is one."
+    "Plans of several planners for one case over time, with the limits. Thin lines: the recovery "
+    "trajectory after the last contact, if there is one."
 )
 _OF_REST: Look = {"linewidth": 0.9}
 

@@ -56,7 +56,7 @@ def recovery_remark(parameters: Row) -> list[str]:
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
-    return [f"Behind the last contact: {words}; a plan is a success only together with it."]
+    return [f"After the last contact: {words}; a plan is a success only together with it."]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -28,7 +28,7 @@ class PlannedRow(NamedTuple):
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a stored row of results: drawn again from the seed, or read again.
+    """Return the case of a stored row of results: drawn again from its seed, or read from files.
 
     Raises:
         ArgumentError: the folder does not hold a complete, finished sweep, or physics or limits of

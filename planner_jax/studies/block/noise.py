@@ -74,7 +74,7 @@ def stereo_noise(
 
 
 def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
-    """Return the standard deviations (...) [m] of measured depths (...) [m], to first order."""
+    """Return the standard deviations (...) [m] of the depths (...) [m] that noise causes."""
     return depths**2 * noise.disparity_std / (camera.focal * noise.baseline)
 
 

@@ -88,7 +88,7 @@ class StudyCounts:
                 values.append(rows[name].to_numpy())
 
     def summary(self) -> Entries:
-        """Return median fit error [m], share of errors up to 0.1 m, and quantiles of times [s]."""
+        """Return median fit error [m], share of errors up to 0.1 m, and planning times [s]."""
         found = {}
         if self._errors:
             errors = np.concatenate(self._errors)

@@ -23,8 +23,8 @@ from planner_jax.task.block.plan import BlockPlan
 class SeenPlan(BlockPlan):
     """The executed motion of an arm up to the true contact, and the quality of its observations.
 
-    Errors of fits are normal to the ball's velocity, at the middle of the time in which it can be
-    blocked.
+    Errors of fits are distances normal to the ball's velocity, halfway in time between its entries
+    into the outer and the inner box.
     """
 
     sight: Array  # () int32, a `Sight`: whether the first fit had enough observations

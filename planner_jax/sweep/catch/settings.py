@@ -48,7 +48,7 @@ class CatchSettings(QuadrotorSettings):
 
     @property
     def case_bytes(self) -> int:
-        """Estimated memory [bytes] of one case; it grows with the number of evaluated orders."""
+        """Estimated memory [bytes] of one case; it grows with the number of target orders."""
         suite = SUITES.get(self.suite or next(iter(SUITES)))
         all_orders = self.decide == "best" and suite is not None and not suite.optional
         orders = math.factorial(min(suite.num_targets, 6)) if suite and all_orders else 1

@@ -97,7 +97,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success and time ratio of the run and of [Yu2023catch, Tables I and III]."""
+        """Return success and optimal time ratio, beside [Yu2023catch, Tables I and III]."""
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:
