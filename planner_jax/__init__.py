@@ -6,33 +6,35 @@
     plans = pj.plan(pj.hit.planner("exact"), cases)
     verdict = pj.hit.judge(cases, plans)
 
-The tasks are `hit`, `catch`, `intercept`, `group`, `block`, and the tasks of other packages
-(`task_named`). Every task has the functions `case`, `draw`, `planner` and `judge`. The functions
-for all tasks:
+The tasks are `hit`, `catch`, `intercept`, `group` and `block`. `task_named` also returns tasks that
+other installed packages register. Every task has the functions `case`, `draw`, `planner` and
+`judge`. These functions apply to every task:
 
-* `plan`: plans one case or many, on all devices; `solve`: does so inside compiled functions
-* `keep_compiled_programs`: keeps compiled programs on the disk
-* `replan`: plans again from a plan that is being executed
-* `gradient`: differentiates a number of every plan; `optimal_plan`: does so inside a loss
+* `plan`: plans one case or a batch, on all devices; `solve`: plans inside `jax.jit` or `jax.vmap`
+* `keep_compiled_programs`: stores compiled programs on disk, for processes that start later
+* `replan`: updates a plan while a robot executes it
+* `gradient`: differentiates one number of every plan by parts of its case; `optimal_plan`: a plan
+  that `jax.grad` can differentiate, for use inside a loss function
 * `take`, `are_solved`, `Status`: read plans; a plan has `sample`, `save` and `load`
 * `export`: writes one plan to a file for a controller
 
 Classes for parts of cases and plans:
 
-* a user's limits and costs, `extras` of a case: `KeepOut`, `KeepOutBox`, `Plane`, `Geofence`,
-  `SpeedZone`, `Dislike`, or any class with their methods
+* extra limits and costs that a user adds to a case as its `extras`: `KeepOut`, `KeepOutBox`,
+  `Plane`, `Geofence`, `SpeedZone`, `Dislike`, or any class with the same methods
 * targets in space: `BallState`, `fly`, `BallPath`, `HarmonicPath`, `table_path`, `predict_path`,
   `target_at`; in the plane: `TurningPath`, `PolynomialPath`
 * obstacles of a car: `Obstacles`, made by `obstacles`
 * trajectories: `PiecewisePolynomial`, `evaluate`
-* a user's planners and tasks: `Planner`, `Plan`, `Attempt`, `outcome`, `OptimisedPlanner`,
-  `pending`, `Round`, `LbfgsConfig`, `NewtonConfig`, `Evaluation`, `Verdict`, `Task`
+* base classes and settings for planners and tasks that a user writes: `Planner`, `Plan`, `Attempt`,
+  `outcome`, `OptimisedPlanner`, `pending`, `Round`, `LbfgsConfig`, `NewtonConfig`, `Evaluation`,
+  `Verdict`, `Task`
 
 All errors are `PlannerJaxError`s. A wrong argument raises an `ArgumentError`, which is a
-`ValueError` or, for a wrong type, a `TypeError`. A wrong number in a case raises its subclass
-`CaseError`.
+`ValueError` or, for a wrong type, a `TypeError`. A wrong number in a case raises a `CaseError`, a
+subclass of `ArgumentError`.
 
-Everything is imported on first use, so that `import planner_jax` itself is fast.
+Every name is imported on its first use, so that `import planner_jax` itself is fast.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""Entry point of the command `planner-jax`: handles signals before anything large is imported."""
+"""Entry point of the command `planner-jax`; it installs signal handlers before it imports JAX."""
 
 import importlib.util
 import os
@@ -8,18 +8,18 @@ from planner_jax.host import signals as stopping
 
 
 def run() -> None:
-    """Run the command in the process's arguments, and end the process."""
+    """Run the subcommand that `sys.argv` names, and end the process with its exit code."""
     stopping.listen()
     if sys.argv[1:2] == ["sweep"] and _is_on_cpu():
-        # Chunks keep the cores busy. By default a computation has one thread for each core, so
-        # that rows would depend on the number of cores.
+        # One thread per computation, since a sweep runs several computations at once. With JAX's
+        # default, one thread per core, results would depend on the number of cores.
         os.environ.setdefault("PJRT_NPROC", os.environ.get("NPROC", "1"))
     try:
         from planner_jax.cli.main import main
 
         code = main()
     except Exception:
-        if stopping.is_stopped():  # errors that a stop causes are not reported
+        if stopping.is_stopped():  # the user's interrupt caused the error: do not report it
             stopping.leave()
         raise
     if stopping.is_stopped():
@@ -30,9 +30,9 @@ def run() -> None:
 def _is_on_cpu() -> bool:
     """Return whether JAX will certainly compute on a CPU.
 
-    On a GPU one thread would compile programs one after another.
+    With a GPU the number of threads is not limited, because compilation would then be sequential.
     """
-    plugins = importlib.util.find_spec("jax_plugins")  # JAX finds other devices in this package
+    plugins = importlib.util.find_spec("jax_plugins")  # exists if JAX can use a GPU or a TPU
     return plugins is None or os.environ.get("JAX_PLATFORMS") == "cpu"
 
 

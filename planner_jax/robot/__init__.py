@@ -1,1 +1,1 @@
-"""Models of quadrotors, cars and arms: kinematics, limits, robots from files, and plans."""
+"""Models of quadrotors, cars and arms: kinematics, limits, readers of files, and plan classes."""

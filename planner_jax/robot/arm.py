@@ -19,17 +19,17 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @struct.dataclass
 class Arm:
-    """An arm's joints and links 1 to 6, the capsules around its links, its base and its shield."""
+    """A six-axis arm: joints, links 1 to 6, capsules around the links, base and shield."""
 
     origin: Array  # (6, 3) [m], position of each joint in the frame of the previous link
     turn: Array  # (6, 4) unit quaternion w, x, y, z: rotation of the joint's frame at angle 0
-    axis: Array  # (6, 3) unit, in the joint's frame
-    lower: Array  # (6,) [rad], position limits
-    upper: Array  # (6,) [rad]
-    home: Array  # (6,) [rad], angles at which the arm waits
-    mass: Array  # (6,) [kg]
-    centre: Array  # (6, 3) [m], centre of mass in the link's frame
-    inertia: Array  # (6, 3, 3) [kg m^2], about the centre of mass, along the link's axes
+    axis: Array  # (6, 3) unit vector along each joint's axis, in the joint's frame
+    lower: Array  # (6,) [rad], least joint angles
+    upper: Array  # (6,) [rad], greatest joint angles
+    home: Array  # (6,) [rad], joint angles at which the arm waits
+    mass: Array  # (6,) [kg], of each link
+    centre: Array  # (6, 3) [m], centre of mass of each link, in the link's frame
+    inertia: Array  # (6, 3, 3) [kg m^2], of each link about its centre of mass, link's axes
     capsule_ends: Array  # (C, 2, 3) [m], ends of each capsule's axis in the frame of its link
     capsule_radius: Array  # (C,) [m]
     base_box: Array  # (2, 3) [m], lowest and highest corner of the box around the base
@@ -41,7 +41,7 @@ class Arm:
 
 @struct.dataclass
 class ArmLimits:
-    """Limits on magnitudes of joint velocities and accelerations; `Arm` has the position limits."""
+    """Greatest magnitudes of joint velocities and accelerations; `Arm` has the limits of angles."""
 
     velocity: Array  # (6,) [rad/s]
     acceleration: Array  # (6,) [rad/s^2]
@@ -49,7 +49,7 @@ class ArmLimits:
 
 @struct.dataclass
 class Regime:
-    """Limits of an arm, and whether its motions have to end at rest."""
+    """Joint limits of an arm, and whether its motions have to end at rest."""
 
     limits: ArmLimits
     ends_at_rest: bool = struct.field(pytree_node=False)
@@ -63,8 +63,9 @@ def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
-# Regimes of the IRB 1600-6/1.2. R1: limits in the code of [Natarajan2024]. R2: speeds of the data
-# sheet; it gives no acceleration, so a usual one is assumed. R3: limits of R1, ending at rest.
+# Regimes of the IRB 1600-6/1.2. R1: limits in the code of [Natarajan2024]; the motion may end at
+# any velocity. R2: speeds of the data sheet, and 30 rad/s^2 as an assumption, since the data sheet
+# states no accelerations; the motion ends at rest. R3: limits of R1; the motion ends at rest.
 REGIMES = {
     "R1": _regime(2.0, 60.0, ends_at_rest=False),
     "R2": _regime(1.0, 30.0, ends_at_rest=True),
@@ -73,7 +74,7 @@ REGIMES = {
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the matrix product in the full precision of its arguments."""
+    """Return the matrix product a b in the precision of its arguments, which GPUs may reduce."""
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 
@@ -89,16 +90,16 @@ def quaternion_rotation(quaternion: Array) -> Array:
 
 
 def _joint_rotations(arm: Arm, angles: Array) -> Array:
-    """Return rotations (6, 3, 3) of the links, each relative to the previous link.
+    """Return the rotations (6, 3, 3) of links relative to the previous links, at angles (6,) [rad].
 
-    Each joint turns about its axis by Rodrigues' formula.
+    The rotation of a joint about its axis is given by Rodrigues' formula.
     """
     turn = quaternion_rotation(jnp.asarray(arm.turn))
     axis = jnp.asarray(arm.axis)
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
     cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
-    # These products do not depend on the angles: `vmap` over angles computes them once.
+    # `along` and `across` do not depend on the angles: `vmap` over angles computes them once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
     cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
@@ -106,11 +107,11 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
 
 
 def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return the poses of the links at angles (6,) [rad].
+    """Return the poses of the six links' frames at joint angles (6,) [rad].
 
     Returns:
-        rotations: (6, 3, 3), link to base.
-        positions: (6, 3) [m], joints in the base frame.
+        rotations: (6, 3, 3), from the link's frame to the base frame.
+        positions: (6, 3) [m], of the joints in the base frame.
     """
     turned = _joint_rotations(arm, angles)
     origin = jnp.asarray(arm.origin)
@@ -127,19 +128,19 @@ def joint_axes(arm: Arm, rotations: Array) -> Array:
 
 
 def shield_pose(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return the shield's rotation (3, 3) and the middle (3,) [m] of its face, at angles (6,).
+    """Return the shield's rotation (3, 3) and its face's middle (3,) [m], at angles (6,) [rad].
 
-    The columns of the rotation are the outward normal and the directions of the two edges.
+    The columns of the rotation are the outward normal and the two edges, in the base frame.
     """
     rotations, positions = link_frames(arm, angles)
     return rotations[5], positions[5] + product(rotations[5], jnp.asarray(arm.shield_centre))
 
 
 def shield_jacobian(arm: Arm, angles: Array) -> Array:
-    """Return the geometric Jacobian (6, 6) of the shield at angles (6,), in the base frame.
+    """Return the geometric Jacobian (6, 6) of the shield at angles (6,) [rad], in the base frame.
 
-    Rows 0 to 2: velocity [m/rad] of the middle of the front face. Rows 3 to 5: angular velocity
-    [rad/rad]. Each column belongs to a joint.
+    Each column belongs to a joint. Rows 0 to 2 are the velocity of the middle of the shield's face
+    for a joint rate of 1 rad/s, [m/rad]. Rows 3 to 5 are the angular velocity.
     """
     rotations, positions = link_frames(arm, angles)
     axes = joint_axes(arm, rotations)
@@ -148,9 +149,9 @@ def shield_jacobian(arm: Arm, angles: Array) -> Array:
 
 
 def capsules(arm: Arm, angles: Array) -> Array:
-    """Return ends (C, 2, 3) [m] of the capsules' axes in the base frame, at angles (6,)."""
+    """Return the ends (C, 2, 3) [m] of the capsules' axes in the base frame, at angles (6,)."""
     rotations, positions = link_frames(arm, angles)
-    # The base is the last link, where index -1 finds it.
+    # Append the base as the last link, since the base has the index -1 in `arm.capsule_link`.
     rotations = jnp.concatenate([rotations, jnp.eye(3, dtype=rotations.dtype)[None]])
     positions = jnp.concatenate([positions, jnp.zeros((1, 3), positions.dtype)])
     link = np.asarray(arm.capsule_link, np.int32)
@@ -160,9 +161,9 @@ def capsules(arm: Arm, angles: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class ArmSetpoints:
-    """Samples of a plan at K equally spaced times.
+    """Samples of an arm's plan at K equally spaced times.
 
-    In a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    In a batch every array but `time` has a leading axis B. Entries after a plan's end are NaN.
     """
 
     time: np.ndarray  # (K,) [s] since the start of the plan
@@ -173,12 +174,12 @@ class ArmSetpoints:
 
 @struct.dataclass
 class ArmPlan(Plan):
-    """A plan for the joints of an arm; the motion has coefficients (M, D + 1, 6) in [rad]."""
+    """A plan of an arm: the motion of its six joints."""
 
-    motion: PiecewisePolynomial
+    motion: PiecewisePolynomial  # of the joint angles [rad]: M pieces, coefficients (M, D + 1, 6)
 
     def sample(self, rate: float) -> ArmSetpoints:
-        """Sample the plan, or the batch, at a rate [Hz] from start to end.
+        """Sample the plan, or the batch of plans, `rate` times a second from start to end.
 
         Raises:
             ValueError: the rate is not positive.
@@ -188,6 +189,6 @@ class ArmPlan(Plan):
 
 
 def _setpoint_at(motion: PiecewisePolynomial, time: Array) -> dict[str, Array]:
-    """Return the setpoint of one motion at a time () [s]."""
+    """Return the fields of `ArmSetpoints`, except `time`, of one motion at a time () [s]."""
     names = ("angles", "rates", "accelerations")
     return {name: evaluate(motion, time, order) for order, name in enumerate(names)}

@@ -1,9 +1,9 @@
-"""Inverse kinematics in closed form, for arms that are ortho-parallel with a spherical wrist.
+"""Inverse kinematics in closed form, for ortho-parallel arms with a spherical wrist.
 
-After [Brandstoetter2014]: axis 2
-is perpendicular to axis 1, axis 3 parallel to axis 2. Axes 4, 5 and 6 meet in one point, the wrist
-centre, each perpendicular to the next. The paper's seven lengths a1, a2, b, c1, c2, c3, c4 are
-computed from the frames of an `Arm`, whose origins and senses of rotation are arbitrary.
+The method is from [Brandstoetter2014]. Axis 2 must be perpendicular to axis 1, and axis 3 parallel
+to axis 2. Axes 4, 5 and 6 must meet in one point, the wrist centre, and axis 5 must be
+perpendicular to the axes 4 and 6. The paper's seven lengths a1, a2, b, c1, c2, c3, c4 are computed
+from an `Arm`, whose frames may have any origins and any senses of rotation.
 """
 
 import jax
@@ -15,21 +15,22 @@ from scipy.spatial.transform import Rotation
 
 from planner_jax.robot.arm import Arm, joint_axes, link_frames, product
 
-# Rows: whether the arm faces the wrist centre (1) or reaches it over its shoulder (-1), and on
-# which side of the line from the shoulder to the wrist centre the elbow is.
+# The four solutions for joints 1 to 3, one a column. Row 0: 1 if the arm faces the wrist centre, -1
+# if it reaches over its shoulder. Row 1: 1 or -1 for the side of the line from shoulder to wrist
+# centre on which the elbow is.
 _ARM_BRANCHES = np.array([(1, 1), (1, -1), (-1, 1), (-1, -1)]).T
-_MISFIT = 1e-5  # [m or rad], largest deviation from the geometry that the closed form assumes
+_MISFIT = 1e-5  # [m] or [rad], largest deviation from the geometry that the closed form assumes
 
 
 @struct.dataclass
 class _Geometry:
-    """Geometry of an arm at angles 0, in the axes x, y, z of its basis.
+    """Lengths and angles of an arm at joint angles 0, with the names of [Brandstoetter2014].
 
-    z is axis 1, y is axis 2, and the origin is joint 1.
+    The coordinates x, y, z have their origin at joint 1; z is along axis 1 and y along axis 2.
     """
 
-    basis: Array  # (3, 3), columns x, y, z in the base frame
-    origin: Array  # (3,) [m], in the base frame
+    basis: Array  # (3, 3), columns are the directions of x, y, z in the base frame
+    origin: Array  # (3,) [m], position of joint 1 in the base frame
     shoulder: Array  # (2,) [m], x and z of axis 2: a1 and c1
     lateral: Array  # () [m], y of the wrist centre: b
     upper_arm: Array  # () [m], length from axis 2 to axis 3: c2
@@ -73,22 +74,23 @@ def _geometry(arm: Arm) -> _Geometry:
 
 
 def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array, Array]:
-    """Return the joint angles of all eight branches that bring the shield to a pose.
+    """Return the eight solutions for the joint angles that bring the shield to a pose.
 
-    Branch 4 i + 2 j + k: i tells whether the wrist is in front of the shoulder (0) or reached over
-    it (1), j on which side the elbow is, k the sign of the wrist's bend. At a singularity, such as
-    a straight wrist, where axes 4 and 6 coincide, the joint with the lower number is set to zero.
+    Solution 4 i + 2 j + k: i = 0 if the arm faces the wrist centre, 1 if it reaches over its
+    shoulder; j = 0 or 1 for the side of the elbow; k = 0 or 1 for the sign of the wrist's bend
+    about axis 5. At a singularity, such as a straight wrist, where axes 4 and 6 coincide, one joint
+    angle is not determined. The joint with the lower number is then set to zero.
 
     Args:
         arm: one arm; `read_arm` checks its geometry, this function does not.
-        rotation: (3, 3), shield to base; its columns are the outward normal and the edges.
-        middle: (3,) [m], middle of the front face in the base frame.
+        rotation: (3, 3), from shield to base frame; columns are the outward normal and the edges.
+        middle: (3,) [m], middle of the shield's front face in the base frame.
 
     Returns:
-        angles: (8, 6) [rad]. Of angles that differ by 2 pi, the one nearest to the middle of the
-            joint's range. For a pose out of reach: angles of an arm that is stretched towards the
-            pose, or folded; finite, with finite gradients.
-        found: (8,) bool, whether the pose is reached within the position limits.
+        angles: (8, 6) [rad], each shifted by multiples of 2 pi to be nearest to the middle of the
+            joint's range. If the pose is out of reach, the arm is stretched towards it, or folded;
+            values and gradients are finite.
+        found: (8,) bool, whether the pose is reached and all joint angles are within their limits.
     """
     geometry = _geometry(arm)
     shield = jnp.asarray(arm.shield_centre)
@@ -117,11 +119,11 @@ def _arm_angles(
 ) -> tuple[Array, Array]:
     """Return angles (3,) [rad] of joints 1 to 3 that bring the wrist centre to a point (3,) [m].
 
-    Also return whether the arm reaches the point, () bool.
+    Also return whether the arm reaches the point. `_ARM_BRANCHES` explains `front` and `elbow`.
     """
     x, y, z = wrist
     lateral, upper_arm, forearm = geometry.lateral, geometry.upper_arm, geometry.forearm
-    # The slack counts points at the very end of the reach as reached in spite of rounding.
+    # The slack allows for rounding errors at points to which the arm is fully stretched.
     slack = 16.0 * jnp.finfo(wrist.dtype).eps
     radius_squared = x * x + y * y
     ahead = front * _root(radius_squared - lateral**2)
@@ -138,20 +140,21 @@ def _arm_angles(
 
 
 def _wrist_angles(turn: Array, flip: int, bend: Array) -> Array:
-    """Return joints 4 to 6 (3,) [rad] of X(j4) Y(j5 + bend) X(j6) = turn (3, 3).
+    """Return the angles j4, j5, j6 (3,) [rad] that solve X(j4) Y(j5 + bend) X(j6) = turn (3, 3).
 
-    The two solutions belong to `flip` = 1 and -1.
+    X and Y are rotations about the x and y axes. `flip`, 1 or -1, selects one of two solutions.
     """
     fourth = _angle(flip * turn[1, 0], -flip * turn[2, 0])
     sine, cosine = jnp.sin(fourth), jnp.cos(fourth)
-    # Joint 4 is undetermined at a straight wrist; joints 5 and 6, given joint 4, never are.
+    # Joint 4 is not determined if the wrist is straight, and is then zero. For a given joint 4 the
+    # joints 5 and 6 are always determined.
     fifth = _angle(sine * turn[1, 0] - cosine * turn[2, 0], turn[0, 0])
     left = cosine * turn[1] + sine * turn[2]
     return jnp.stack([fourth, fifth - bend, _angle(-left[2], left[1])])
 
 
 def _angle(y: Array, x: Array) -> Array:
-    """Return atan2(y, x); at x = y = 0 the value and its gradient are zero."""
+    """Return atan2(y, x) [rad]; at x = y = 0 the value and its gradient are zero."""
     none = x * x + y * y <= jnp.finfo(x.dtype).eps ** 2
     return jnp.arctan2(jnp.where(none, 0.0, y), jnp.where(none, 1.0, x))
 
@@ -172,7 +175,7 @@ def _turn_about(axis: int, angle: Array) -> Array:
 
 
 def explain_misfit(arm: Arm) -> str | None:
-    """Return why the closed form does not apply to an arm with NumPy leaves; None if it does."""
+    """Return why `inverse_kinematics` does not apply to an arm's geometry; None if it applies."""
     rotation, position = Rotation.identity(), np.zeros(3)
     axes, positions = np.zeros((6, 3)), np.zeros((6, 3))
     for k in range(6):

@@ -1,11 +1,12 @@
-"""Reader of arms in MuJoCo's model format, MJCF; needs the standard library only, not MuJoCo.
+"""Reader of arms in MuJoCo's model format, MJCF; it does not need MuJoCo.
 
-The file has to be built like `models/irb1600.xml`. A base body that stands still holds one box and
-a chain of six bodies. Each of these has one hinge joint, an inertial, and any capsules and spheres.
-The sixth also has a square box and a site, both named shield; the site is the middle of the face
-along +x. A key named home holds the angles at which the arm waits. Other elements inside the arm
-are refused, MuJoCo's defaults for classes of elements too. Elements around the arm (geoms of the
-world, lights, cameras, actuators, sensors, options) are ignored.
+The file must have the structure of `models/irb1600.xml`. A static base body contains one box and a
+chain of six bodies. Each of the six bodies has one hinge joint, an inertial, and any number of
+capsules and spheres. The sixth body also has a square box and a site, both named shield; the site
+is at the middle of the box's face along +x. A key named home holds the angles at which the arm
+waits. Any other element inside the arm is an error, including MuJoCo's defaults for classes of
+elements. Elements around the arm (geoms of the world, lights, cameras, actuators, sensors, options)
+are ignored.
 """
 
 import functools
@@ -25,7 +26,7 @@ from planner_jax.host.files import open_plain
 from planner_jax.robot.arm import Arm
 from planner_jax.robot.arm_ik import explain_misfit
 
-# Elements that are ignored: in the file, and in a body.
+# Elements that the reader ignores: at the top of the file (`_AROUND`) and in a body (`_IGNORED`).
 _AROUND = {"option", "visual", "statistic", "size", "asset", "actuator", "sensor", "contact"}
 _IGNORED = {"light", "camera", "site"}
 _FRAME = {"name", "pos", "quat", "euler"}
@@ -35,22 +36,22 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 @functools.cache
 def irb1600() -> Arm:
-    """Return the ABB IRB 1600-6/1.2 with a shield of 0.30 m; leaves are NumPy float32 arrays.
+    """Return the arm ABB IRB 1600-6/1.2 with a square shield of 0.30 m, NumPy float32 leaves.
 
-    `models/irb1600.xml` names the sources of its numbers.
+    The file `models/irb1600.xml` contains the numbers and names their sources.
     """
     models = importlib.resources.files("planner_jax.robot") / "models"
     return read_arm((models / "irb1600.xml").read_text("utf-8"))
 
 
 def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
-    """Return the arm of an MJCF file, or of MJCF text, with NumPy leaves.
+    """Read an arm from an MJCF file, or from MJCF text; its leaves are NumPy arrays.
 
-    The arm's base frame is the frame of the base body; its pose in the world is ignored.
+    The arm's base frame is the frame of the base body, whose pose in the world is ignored.
 
     Args:
         path_or_xml: path of a file, or text that begins with "<".
-        dtype: of every leaf.
+        dtype: type of every leaf.
 
     Raises:
         ValueError: the text is not XML, an element is not supported, the arm is not a chain of six
@@ -106,7 +107,7 @@ def read_arm(path_or_xml: str, *, dtype: DTypeLike = np.float32) -> Arm:
 
 
 class _Reader:
-    """Parser of frames, joints, inertials and capsules, in the units that the file declares."""
+    """Parser of the elements of one MJCF file, by the units and conventions that it declares."""
 
     def __init__(self, root: ET.Element) -> None:
         options: dict[str, str] = {}
@@ -121,13 +122,14 @@ class _Reader:
         self.unit = np.pi / 180.0 if angle == "degree" else 1.0
 
     def frame(self, element: ET.Element) -> tuple[np.ndarray, Rotation]:
-        """Return the position (3,) [m] and attitude of an element in the frame around it."""
+        """Return the position (3,) [m] and rotation of an element relative to its parent body."""
         position = _numbers(element, "pos", 3, _ORIGIN)
         if "quat" in element.attrib and "euler" in element.attrib:
             raise ArgumentError(_tag(element), "quat or euler, not both", verb="have", shown="")
         if "euler" in element.attrib:
             angles = self.unit * _numbers(element, "euler", 3)
-            # Lower-case letters are axes that turn with the frame in MJCF, fixed axes in SciPy.
+            # In MJCF lower-case letters are axes that rotate with the frame. In SciPy they are
+            # fixed axes, and upper-case letters are axes that rotate with the frame.
             return position, Rotation.from_euler(self.sequence.swapcase(), angles)
         quaternion = _numbers(element, "quat", 4, (1.0, 0.0, 0.0, 0.0))
         _require(np.any(quaternion), element, "other than zero", "quat")
@@ -179,7 +181,7 @@ class _Reader:
 
 
 def _chain(world: ET.Element) -> tuple[ET.Element, list[ET.Element]]:
-    """Return the base and the six links, each with one hinge joint."""
+    """Return the base body and the six bodies of the links; raise for any other structure."""
     _require_known(world, set(), {"body", "geom", *_IGNORED})
     body = base = _one(world, "body")
     _require_known(base, _FRAME, {"body", "geom", *_IGNORED})
@@ -214,7 +216,7 @@ def _shield(link: ET.Element) -> tuple[ET.Element, np.ndarray, float]:
 
 
 def _base_box(base: ET.Element) -> tuple[ET.Element, np.ndarray]:
-    """Return the geom of the base's box, and its lowest and highest corner (2, 3) [m]."""
+    """Return the box of the base body, and the box's lowest and highest corner (2, 3) [m]."""
     boxes = [geom for geom in base.findall("geom") if geom.get("type") == "box"]
     if len(boxes) != 1:
         raise ArgumentError(_tag(base), "one box", len(boxes), verb="have")
@@ -223,7 +225,7 @@ def _base_box(base: ET.Element) -> tuple[ET.Element, np.ndarray]:
 
 
 def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
-    """Return half the edges (3,) [m] and the centre (3,) [m] of a box along its body's axes."""
+    """Return half edges (3,) [m] and centre (3,) [m] of a box geom that is not rotated."""
     _require_known(geom, {"name", "type", "pos", "size", *_APPEARANCE}, ())
     _require(geom.get("type") == "box", geom, "a box")
     half = _numbers(geom, "size", 3)
@@ -232,7 +234,7 @@ def _box(geom: ET.Element) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
-    """Return the angles (6,) [rad] of the key named home, within `limits` (6, 2) [rad]."""
+    """Return the joint angles (6,) [rad] of the key named home; raise unless within the limits."""
     for key in root.iterfind("keyframe/key"):
         if key.get("name") == "home":
             home = _numbers(key, "qpos", 6)
@@ -243,18 +245,18 @@ def _home(root: ET.Element, limits: np.ndarray) -> np.ndarray:
 
 
 def _tag(element: ET.Element) -> str:
-    """Format an element without its children, for messages."""
+    """Format an element's tag and attributes, without its children, for an error message."""
     attributes = [f'{name}="{value}"' for name, value in element.items()]
     return f"<{' '.join([element.tag, *attributes])}>"
 
 
 def _require(holds: object, element: ET.Element, rule: str, attribute: str = "") -> None:
-    """Raise `ArgumentError` unless a rule on an element, or on an attribute of it, holds."""
+    """Raise `ArgumentError` that names an element, or an attribute of it, unless `holds`."""
     require(bool(holds), f"{_tag(element)}{attribute and f': {attribute}'}", rule, shown="")
 
 
 def _require_known(element: ET.Element, attributes: set[str], children: Iterable[str]) -> None:
-    """Raise `ValueError` unless all attributes and children of an element are supported."""
+    """Raise `ValueError` if an element has an attribute or a child that is not in the lists."""
     for name in element.keys():
         if name not in attributes:
             raise ValueError(f"{_tag(element)}: {name} is not supported")
@@ -264,7 +266,7 @@ def _require_known(element: ET.Element, attributes: set[str], children: Iterable
 
 
 def _one(element: ET.Element, tag: str) -> ET.Element:
-    """Return the only child of an element with a tag."""
+    """Return the child of an element with a tag; raise unless there is exactly one child."""
     children = element.findall(tag)
     if len(children) != 1:
         raise ArgumentError(_tag(element), f"one <{tag}>", len(children), verb="have")

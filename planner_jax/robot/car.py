@@ -1,8 +1,8 @@
 """A car with front steering: kinematics, limits, body, and plans.
 
-The state is [Qu2022, eq. 1]: middle of the rear axle, heading, and speed. The curvature of the rear
-axle's path is  kappa = tan(delta) / wheelbase  for a steering angle delta. World frame in the
-plane, SI units, headings counter-clockwise from the x axis.
+The state is the position of the rear axle's middle, the heading, and the speed [Qu2022, eq. 1]. The
+curvature of the rear axle's path is  kappa = tan(delta) / wheelbase  for a steering angle delta.
+World frame in the plane, SI units, headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -21,21 +21,21 @@ from planner_jax.robot.setpoints import sample_at_rate
 class CarLimits:
     """Limits of a car; infinity means no limit."""
 
-    speed: Array  # () [m/s]; the car does not reverse
-    acceleration: Array  # () [m/s^2], along the path, of either sign
-    lateral_acceleration: Array  # () [m/s^2], speed^2 * curvature of the rear axle
-    curvature: Array  # () [1/m]
-    steering_rate: Array  # () [rad/s], of the steering angle
+    speed: Array  # () [m/s], greatest speed; the least speed is 0, since the car does not reverse
+    acceleration: Array  # () [m/s^2], greatest magnitude of the acceleration along the path
+    lateral_acceleration: Array  # () [m/s^2], greatest magnitude of speed^2 * curvature
+    curvature: Array  # () [1/m], greatest magnitude of the rear axle's curvature
+    steering_rate: Array  # () [rad/s], greatest magnitude of the steering angle's rate
 
 
 @struct.dataclass
 class CarBody:
-    """A rectangle around the rear axle."""
+    """The body of a car: a rectangle that is fixed to the rear axle."""
 
-    length: Array  # () [m]
-    width: Array  # () [m]
-    wheelbase: Array  # () [m]
-    rear_overhang: Array  # () [m], from the rear axle to the rear end
+    length: Array  # () [m], of the rectangle
+    width: Array  # () [m], of the rectangle
+    wheelbase: Array  # () [m], distance between the axles
+    rear_overhang: Array  # () [m], distance of the rear end behind the rear axle
 
     @property
     def middle(self) -> Array:
@@ -45,9 +45,9 @@ class CarBody:
 
 @dataclasses.dataclass(frozen=True)
 class CarSetpoints:
-    """Samples of a plan at K equally spaced times.
+    """Samples of a car's plan at K equally spaced times.
 
-    In a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    In a batch every array but `time` has a leading axis B. Entries after a plan's end are NaN.
     """
 
     time: np.ndarray  # (K,) [s] since the start of the plan
@@ -69,7 +69,7 @@ class CarPlan(Plan):
     curvature: Array  # (K + 1,) [1/m], at the knots
 
     def sample(self, rate: float) -> CarSetpoints:
-        """Sample the plan, or the batch, at a rate [Hz] from start to end.
+        """Sample the plan, or the batch of plans, `rate` times a second from start to end.
 
         Raises:
             ValueError: the rate is not positive.
@@ -78,26 +78,27 @@ class CarPlan(Plan):
         return CarSetpoints(**sample_at_rate(rate, self.time, leaves, _setpoint_at))
 
 
-# Gauss-Legendre nodes and weights on (0, 1), exact to order 9.
+# Nodes and weights of Gauss-Legendre quadrature on (0, 1), exact for polynomials of degree 9.
 _NODES = np.polynomial.legendre.leggauss(5)
 _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 
 def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Array) -> Array:
-    """Return the rear axle's pose (3,) at a time () [s] of a plan with K + 1 knots up to `end` [s].
+    """Return the pose (3,) of the rear axle's middle at a time () [s] of a plan.
 
-    `start` (3,) is the pose at time 0.
+    The plan starts at the pose `start` (3,): x [m], y [m] and heading [rad]. Speed and curvature
+    (K + 1,) are the values at equidistant knots from time 0 to `end` () [s].
     """
     num = speed.shape[0] - 1
     step = end / num
-    # Time driven in each piece
+    # (K,) [s], how long the car has driven on each piece until `time`.
     length = jnp.clip(time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step)
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step
     v, c = speed[:-1], curvature[:-1]
 
     def turn(tau: Array) -> Array:
-        """Return the angle turned in each piece until a time `tau` since its start."""
+        """Return the change of heading (K,) [rad] on each piece in the time `tau` [s] on it."""
         return tau * (v * c + tau * ((v * bend + rise * c) / 2.0 + tau * rise * bend / 3.0))
 
     whole = turn(length)
@@ -114,7 +115,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
 
 def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Return speed [m/s], curvature [1/m] and acceleration [m/s^2] at a time () [s]."""
+    """Interpolate speed, curvature and acceleration at a time () [s] between knots up to `end`."""
     num = speed.shape[0] - 1
     position = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(position.astype(jnp.int32), 0, num - 1)
@@ -125,7 +126,7 @@ def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[A
 
 
 def _setpoint_at(leaves: tuple[Array, Array, Array, Array], time: Array) -> dict[str, Array]:
-    """Return the setpoint of one plan at a time () [s]; leaves are start, end and knots."""
+    """Return the fields of `CarSetpoints`, except `time`, of one plan at a time () [s]."""
     start, end, speed, curvature = leaves
     pose = pose_at(start, end, speed, curvature, time)
     v, c, acceleration = knots_at(end, speed, curvature, time)

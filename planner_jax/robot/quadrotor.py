@@ -1,7 +1,8 @@
 """A quadrotor: limits, differential flatness [Yu2023bat, eq. 1], bounds on reach, and plans.
 
-The body z axis is along the net thrust  tau = a + g e_3  (per unit mass). At zero heading, the Hopf
-fibration determines the body rate by tau and the jerk alone [Watterson2020].
+The body z axis is along the net thrust  tau = a + g e_3  (per unit mass), where a is the
+acceleration. The heading is zero in the sense of the Hopf fibration [Watterson2020]. Attitude and
+body rate are then functions of tau and the jerk alone.
 """
 
 import dataclasses
@@ -16,41 +17,43 @@ from planner_jax.core.arithmetic import Components, at_least, components, invers
 from planner_jax.core.protocol import Plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
-# Factor on limits in bounds on reach. Solved plans exceed their limits by far less, so that the
-# bounds hold for plans whose peaks lie between the samples of a check.
+# Factor on the limits in bounds on reach. A plan that is solved may exceed its limits slightly
+# between the samples at which they are checked, but by far less than 1 %. The bounds hold for it.
 ALLOWED = 1.01
-_SHORTEST = 1e-3  # [s]; prevents the product of an infinite limit and zero
+_SHORTEST = 1e-3  # [s], least time in bounds on reach; avoids the product of zero and infinity
 
 
 @struct.dataclass
 class RotorLimits:
-    """Bounds of thrust of the rotors, and the body that they carry."""
+    """Least and greatest thrust of each rotor, and the numbers that relate thrusts to motion."""
 
-    mass: Array  # () [kg]
-    inertia: Array  # (3,) [kg m^2], principal, about the body's axes
+    mass: Array  # () [kg], of the quadrotor
+    inertia: Array  # (3,) [kg m^2], principal moments about the body's axes
     mixer: Array  # (4, 4), from total thrust [N] and torque [N m] to the rotors' thrusts [N]
-    min_thrust: Array  # () [N], of one rotor
-    max_thrust: Array  # () [N], of one rotor
+    min_thrust: Array  # () [N], least thrust of one rotor
+    max_thrust: Array  # () [N], greatest thrust of one rotor
 
 
 @struct.dataclass
 class QuadrotorLimits:
     """Limits of a quadrotor; None means no limit.
 
-    New numbers reuse a compiled program; a number in the place of None does not.
+    Which limits are None determines the compiled program. To change a number compiles nothing, but
+    to replace None by a number compiles a new program.
     """
 
-    speed: Array  # () [m/s]
-    body_rate: Array  # () [rad/s], with the yaw part of the Hopf fibration
-    min_height: Array  # () [m], of the propeller plane
-    acceleration: Array | None = None  # () [m/s^2]
-    min_thrust: Array | None = None  # () [m/s^2], per unit mass; None if `max_thrust` is None
-    max_thrust: Array | None = None  # () [m/s^2], per unit mass
+    speed: Array  # () [m/s], greatest speed
+    body_rate: Array  # () [rad/s], greatest body rate, including its component about body z
+    min_height: Array  # () [m], least height of the propeller plane
+    acceleration: Array | None = None  # () [m/s^2], greatest acceleration
+    # () [m/s^2], least thrust per unit mass; None if `max_thrust` is None
+    min_thrust: Array | None = None
+    max_thrust: Array | None = None  # () [m/s^2], greatest thrust per unit mass
     rotors: RotorLimits | None = None
 
     @property
     def thrust_bounds(self) -> tuple[Array, Array]:
-        """Least and greatest thrust [m/s^2]; zero and infinity without limits."""
+        """Least and greatest thrust per unit mass [m/s^2]; zero and infinity if not limited."""
         none = jnp.zeros_like(self.speed)
         least = none if self.min_thrust is None else self.min_thrust
         return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
@@ -58,7 +61,7 @@ class QuadrotorLimits:
     def scale(self, factor: float, gravity: Array) -> "QuadrotorLimits":
         """Return limits with speed, acceleration, body rate and thrust scaled by a factor.
 
-        Of the thrust, the difference from `gravity` is scaled.
+        For the limits of thrust, the factor is applied to their differences from `gravity`.
         """
         limits = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
         if self.acceleration is not None:
@@ -76,7 +79,7 @@ def net_thrust(acc: Array, gravity: Array) -> Array:
 
 
 def body_z(acc: Array, gravity: Array) -> Array:
-    """Return the unit vector along the net thrust, (..., 3); zero without thrust."""
+    """Return the body z axis: the unit vector (..., 3) along the net thrust, or zero without it."""
     thrust = net_thrust(acc, gravity)
     square = jnp.sum(thrust**2, axis=-1, keepdims=True)
     has_thrust = square > 0.0
@@ -99,8 +102,8 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
         (...,). Near free fall (no thrust) and upside down, where the attitude is undefined, the
         value is large but finite.
     """
-    # By components, and each reciprocal once: sums over an axis of three and divisions cost a CPU
-    # most of a plan's time.
+    # Components are separate arrays, and every reciprocal is computed once. On a CPU, sums over an
+    # axis of length three and divisions would take most of a planner's time.
     tx, ty, az = components(acc)
     tz = az + gravity
     jx, jy, jz = components(jerk)
@@ -116,9 +119,9 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Return the components (...) of the body rate [rad/s] of the Hopf fibration, body frame.
+    """Return the three components (...) of the body rate [rad/s] in the body frame.
 
-    See `body_rate_squared` for the arguments.
+    Heading and arguments are as for `body_rate_squared`.
     """
     tx, ty, az = components(acc)
     tz = az + gravity
@@ -136,9 +139,9 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
 def rotor_thrusts(
     acc: Components, jerk: Components, snap: Components, gravity: Array, rotors: RotorLimits
 ) -> tuple[Array, ...]:
-    """Return the thrusts (...) [N] of the four rotors in a motion at zero heading.
+    """Return the thrusts (...) [N] that the four rotors need for a motion at zero heading.
 
-    The snap is (..., 3) [m/s^4]; see `body_rate_squared` for the other arguments.
+    The snap is (..., 3) [m/s^4]. See `body_rate_squared` for acc, jerk and gravity.
     """
     a, j, s = (tuple(components(each)) for each in (acc, jerk, snap))
     rate, turning = jax.jvp(lambda acc, jerk: body_rate(acc, jerk, gravity), (a, j), (j, s))
@@ -156,9 +159,9 @@ def rotor_thrusts(
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """Return the body x and y axes (3,) of the Hopf fibration at zero heading for a z axis (3,).
+    """Return the body x and y axes (3,) at zero heading for a body z axis `normal` (3,).
 
-    They are smooth in the z axis, except straight down.
+    By the Hopf fibration they are smooth functions of the z axis, unless it points straight down.
     """
     x, y, z = components(normal)
     k = reciprocal(at_least(1.0 + z, 1e-6))
@@ -169,9 +172,9 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3), body to world, and body rate (3,) [rad/s] at zero heading.
+    """Return the rotation (3, 3) from body to world frame, and the body rate (3,) [rad/s].
 
-    The Hopf fibration determines them by acceleration (3,) [m/s^2] and jerk (3,) [m/s^3].
+    Both follow from acceleration (3,) [m/s^2] and jerk (3,) [m/s^3] at zero heading, by flatness.
     """
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
@@ -183,7 +186,7 @@ def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array
 
 
 def tilt_quaternion(normal: Array) -> Array:
-    """Return the attitude (4,) w x y z of the Hopf fibration at zero heading for a z axis (3,).
+    """Return the attitude quaternion (4,) w x y z at zero heading for a body z axis (x, y, z).
 
     It is the shortest rotation from upright: (1 + z, -y, x, 0) / sqrt(2 (1 + z)).
     """
@@ -193,7 +196,7 @@ def tilt_quaternion(normal: Array) -> Array:
 
 
 def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
-    """Return the bound () [m/s] on the speed from a state (4, 3): the limit or the first speed."""
+    """Return an upper bound () [m/s] on the speed: the limit, or the speed at time 0 if greater."""
     first = jnp.sqrt(jnp.sum(head_state[1] * head_state[1]))
     return jnp.maximum(ALLOWED * limits.speed, first)
 
@@ -203,14 +206,14 @@ def beyond_reach(
 ) -> Array:
     """Return lower bounds (K,) [m] on a quadrotor's distances from positions at given times.
 
-    Zero or less means that the position may be reached. At the time t the quadrotor is in each of
+    Zero or less means that the position may be reached. At the time t the quadrotor is inside each
+    of these spheres, as far as the limits exist:
 
-    - the ball around the start whose radius is the integral of the greatest speed, which rises
-      with the greatest acceleration A up to its limit,
-    - the ball of radius A t^2 / 2 around the position that the first velocity alone leads to,
-    - the ball of radius T t^2 / 2 around the position in free fall, with the greatest thrust T,
-
-    where such limits exist: the mean of accelerations lies in every ball that contains all of them.
+    - around the start, with the integral of the greatest speed as radius; this speed rises with the
+      greatest acceleration A up to its limit;
+    - around the position that the quadrotor reaches at its initial velocity, with radius A t^2 / 2;
+    - around the position that the quadrotor reaches in free fall, with radius T t^2 / 2, where T is
+      the greatest thrust per unit mass.
 
     Args:
         positions: (K, 3) [m], one for each time.
@@ -239,7 +242,7 @@ def beyond_reach(
 
 
 def _greatest_thrust(limits: QuadrotorLimits) -> Array | None:
-    """Return the greatest total thrust per unit mass, () [m/s^2]; None without a limit."""
+    """Return an upper bound () [m/s^2] on the thrust per unit mass; None if there is no limit."""
     bounds = [] if limits.max_thrust is None else [limits.max_thrust]
     if limits.rotors is not None:
         bounds.append(4.0 * limits.rotors.max_thrust / limits.rotors.mass)
@@ -249,7 +252,7 @@ def _greatest_thrust(limits: QuadrotorLimits) -> Array | None:
 def _greatest_acceleration(
     limits: QuadrotorLimits, thrust: Array | None, gravity: Array
 ) -> Array | None:
-    """Return the greatest acceleration, () [m/s^2]; None without a limit."""
+    """Return an upper bound () [m/s^2] on the acceleration; None if there is no limit."""
     bounds = [] if limits.acceleration is None else [ALLOWED * limits.acceleration]
     if thrust is not None:
         bounds.append(thrust + gravity)
@@ -262,9 +265,9 @@ def _length(x: Array, y: Array, z: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorSetpoints:
-    """Samples of a plan at K equally spaced times; world frame, z up; body x forward, z up.
+    """Samples of a quadrotor's plan at K equally spaced times; body x forward, z along the thrust.
 
-    In a batch every array but `time` has a leading axis B, and is NaN past the end of each plan.
+    In a batch every array but `time` has a leading axis B. Entries after a plan's end are NaN.
     """
 
     time: np.ndarray  # (K,) [s] since the start of the plan
@@ -279,25 +282,25 @@ class QuadrotorSetpoints:
 
 @struct.dataclass
 class QuadrotorPlan(Plan):
-    """A plan with the trajectory of the centre of a quadrotor's propeller plane."""
+    """A quadrotor's plan: the trajectory of the centre of the propeller plane."""
 
-    trajectory: PiecewisePolynomial  # up to the last contact
+    trajectory: PiecewisePolynomial  # up to the last contact with a ball or target
     gravity: Array  # () [m/s^2], magnitude
-    # From the last contact to standstill; None if it was not requested.
+    # Trajectory from the last contact to standstill; None if none was requested.
     recovery: PiecewisePolynomial | None = struct.field(default=None, kw_only=True)
 
     @property
     def whole(self) -> PiecewisePolynomial:
-        """The trajectory and the recovery in one, of a plan or of a batch."""
+        """The trajectory and the recovery, joined to one polynomial, of a plan or of a batch."""
         return self.trajectory if self.recovery is None else join(self.trajectory, self.recovery)
 
     def sample(self, rate: float) -> QuadrotorSetpoints:
-        """Sample the plan, or the batch, at a rate [Hz] up to its end, `recovery` included.
+        """Sample the plan, or the batch, `rate` times a second, including a recovery trajectory.
 
         Raises:
             ValueError: the rate is not positive.
         """
-        from planner_jax.robot.setpoints import sample_at_rate  # few plans are sampled
+        from planner_jax.robot.setpoints import sample_at_rate  # imported here, as rarely needed
 
         path = jax.tree.map(np.asarray, self.whole)
         ends = np.sum(path.durations, axis=-1)
@@ -307,7 +310,7 @@ class QuadrotorPlan(Plan):
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
     """Return the fields of `QuadrotorSetpoints`, except `time`, of one plan at a time () [s].
 
-    The leaves are the trajectory and gravity.
+    `leaves` are the trajectory and the magnitude of gravity [m/s^2].
     """
     path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))

@@ -1,4 +1,4 @@
-"""Quadrotors from YAML files whose values have units, and back.
+"""Reading and writing of quadrotors as YAML files whose values have units, as in this example.
 
     name: mine
     mass: 800 g
@@ -7,10 +7,10 @@
     tool: {kind: racket, height: 6 cm, radius: 11 cm}
     limits: {speed: 5 m/s, body_rate: 344 deg/s, thrust: 0.2 to 1.9 g}
 
-A number without a unit is in SI units. Only an inertia must have its unit, since a bare 3 may be
-meant in g m^2. "g" is the standard gravity where an acceleration is expected.
-`model: mine.xml` reads body and rotors from MJCF; fields of the YAML file override the model's.
-Nothing here imports JAX.
+A number without a unit is in SI units. Only an inertia must have its unit, because it is often
+stated in g m^2 and the mistake would go unnoticed. In an acceleration "g" is the standard gravity,
+elsewhere the gram. `model: mine.xml` reads body and rotors from a MuJoCo model (MJCF); fields of
+the YAML file override the model's. This module imports no JAX.
 """
 
 import dataclasses
@@ -46,7 +46,7 @@ _INERTIAS = {
     for length, of_length in (("m", "1"), ("cm", "1e-2"), ("mm", "1e-3"))
 }
 _DEGREE = Fraction(math.pi) / 180
-# Units of each quantity, in SI units; the first unit of a quantity is the SI unit.
+# Kind of quantity -> unit -> factor to SI units. The first unit of each kind is the SI unit.
 UNITS: dict[str, dict[str, Fraction]] = {
     name: {unit: Fraction(value) for unit, value in units.items()}
     for name, units in {
@@ -64,34 +64,35 @@ UNITS: dict[str, dict[str, Fraction]] = {
 }
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _QUANTITY = re.compile(rf"\s*({_NUMBER}(?:(?:\s*,\s*|\s+){_NUMBER})*)\s*(\D.*?)?\s*", re.ASCII)
-_LONGEST = 200  # characters of a quantity
+_LONGEST = 200  # greatest number of characters in the text of a quantity
 
-Value = Any  # a field's value: text, a number, a list of these, fields of a part, or None
+Value = Any  # a field's value: text, number, list of texts and numbers, dictionary, or None
 ENDINGS = (".yaml", ".yml", ".xml")
-_LARGEST = 1 << 20  # bytes of a file
+_LARGEST = 1 << 20  # [B], greatest size of a file
 _PARTS: dict[str, type] = {"rotors": Rotors, "tool": Tool, "limits": FlightLimits}
 
 
 class RobotError(PlannerJaxError, ValueError):
-    """A robot's description breaks a rule; one line that names file and field."""
+    """Error: a quadrotor's description breaks a rule. The message names file and field."""
 
 
 class QuantityError(PlannerJaxError, ValueError):
-    """A value is not a quantity of the expected kind; one line, without the field's name."""
+    """Error: a value is not a quantity of the expected kind. The caller adds the field's name."""
 
 
 class _Quantity(NamedTuple):
-    """Kind and format of a field's value."""
+    """Format of a field's value: kind of quantity, and how many numbers it has."""
 
     kind: str  # a key of `UNITS`
     count: int = 1  # pyright: ignore[reportIncompatibleMethodOverride]
-    span: bool = False  # whether "to" stands between its two numbers
-    optional: bool = False  # whether it may be null, which means no limit
-    example: str = ""  # of a value that must have its unit; "" allows SI numbers without one
+    span: bool = False  # whether the word "to" stands between its two numbers
+    optional: bool = False  # whether the value may be null, which means no limit
+    example: str = ""  # value for an error message if a unit is obligatory; "": units are optional
 
 
 _LENGTH = _Quantity("length")
-# Fields of each part of the description, "" for the whole; None marks a text.
+# Part of a description -> field -> format of its value, or None for a text. The part "" holds the
+# fields outside rotors, tool and limits.
 _FIELDS: dict[str, dict[str, _Quantity | None]] = {
     "": {
         "name": None,
@@ -127,18 +128,18 @@ _FIELDS: dict[str, dict[str, _Quantity | None]] = {
 
 
 def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
-    """Return the quadrotor of a file.
+    """Read a quadrotor from a file.
 
     Args:
-        path: of YAML (.yaml, .yml), or of MJCF (.xml), which is read by MuJoCo (extra `sims`).
-            MJCF has neither tool nor limits.
-        **given: fields that override the file's: `name`, `mass`, `inertia`, `rotors`, `tool`,
-            `limits` and `source`, in the format of the YAML file, as numbers in SI units, or as
-            objects such as a `Tool`.
+        path: path of a YAML file (.yaml, .yml), or of a MuJoCo model (MJCF, .xml), which needs
+            MuJoCo (extra `sims`). MJCF describes neither tool nor limits.
+        **given: fields that override the fields in the file: `name`, `mass`, `inertia`, `rotors`,
+            `tool`, `limits` and `source`. A value has the format of the YAML file, or is a number
+            in SI units, or an object such as a `Tool`.
 
     Raises:
-        RobotError: the file or a field breaks a rule; one line.
-        MissingExtra: MuJoCo is not installed.
+        RobotError: the file or a field breaks a rule. The message is one line.
+        MissingExtra: the file is MJCF, and MuJoCo is not installed.
         OSError: the file cannot be read.
     """
     place = os.fspath(path)
@@ -150,10 +151,11 @@ def read_robot(path: str | os.PathLike, **given: Value) -> QuadrotorModel:
 
 
 def model_of(description: Mapping[str, Value], place: str = "robot") -> QuadrotorModel:
-    """Return the quadrotor of a description: the fields of a YAML file, or `dataclasses.asdict`.
+    """Make a quadrotor from a dictionary: the fields of a YAML file, or `dataclasses.asdict`.
 
     Raises:
-        RobotError: a field breaks a rule, is unknown or is missing; one line that names `place`.
+        RobotError: a field breaks a rule, is unknown or is missing. The message begins with
+            `place`, such as the name of the file.
     """
     _require_known(description, [*_FIELDS[""], *_PARTS], "", place)
     parts: dict[str, Value] = {}
@@ -186,7 +188,7 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
 
 
 def to_yaml(model: QuadrotorModel) -> str:
-    """Format a quadrotor as YAML; `read_robot` restores it to the last digit."""
+    """Format a quadrotor as the text of a YAML file; `read_robot` restores it without rounding."""
     plain: dict[str, Value] = dataclasses.asdict(model)
     rotors = plain["rotors"]
     diagonal = round(2.0 * float(max(abs(x) for x in rotors["places"][0])) * 2.0**0.5, 12)
@@ -203,7 +205,7 @@ def to_yaml(model: QuadrotorModel) -> str:
 
 
 def _add_unit(value: Value, quantity: _Quantity | None) -> Value:
-    """Return a field's value in SI units as text with its unit."""
+    """Format a field's value, which is in SI units, as text with its unit."""
     if quantity is None or value is None or quantity.kind == "share":
         return value
     if quantity.count == 8:
@@ -214,7 +216,7 @@ def _add_unit(value: Value, quantity: _Quantity | None) -> Value:
 
 
 def _read_description(path: Path) -> dict[str, Value]:
-    """Return the fields in a file."""
+    """Return the fields in a YAML or MJCF file, as a dictionary; raise `RobotError` if invalid."""
     if path.suffix.lower() not in ENDINGS:
         raise RobotError(f"path must end in {', '.join(ENDINGS)}, got {str(path)!r}")
     with open_plain(path) as file:
@@ -245,16 +247,16 @@ def _read_description(path: Path) -> dict[str, Value]:
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML loader that refuses repeated fields and references."""
+    """YAML loader that raises an error for repeated fields and for references (`*name`)."""
 
     def compose_node(self, parent: yaml.Node | None, index: Value) -> yaml.Node | None:
-        """Compose a node; refuse references, by which a short text can expand without bound."""
+        """Compose a node; raise for references, by which a short text can expand without bound."""
         if self.check_event(yaml.AliasEvent):
             raise yaml.MarkedYAMLError(None, None, "no *reference", self.peek_event().start_mark)
         return super().compose_node(parent, index)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> Value:
-        """Construct a mapping; refuse repeated fields."""
+        """Construct a dictionary; raise an error if a field is repeated."""
         names = [key.value for key, _ in node.value]
         for key, _ in node.value:
             if names.count(key.value) > 1:
@@ -277,7 +279,7 @@ def _merge(under: Mapping[str, Value], over: Mapping[str, Value]) -> dict[str, V
 
 
 def _require_units(description: Mapping[str, Value], place: str) -> None:
-    """Raise `RobotError` if a field that must have its unit has none."""
+    """Raise `RobotError` if an inertia has no unit; see the module's docstring."""
     for name, quantity in _FIELDS[""].items():
         if quantity and quantity.example and not _has_unit(value := description.get(name)):
             units = ", ".join(UNITS[quantity.kind])
@@ -286,7 +288,7 @@ def _require_units(description: Mapping[str, Value], place: str) -> None:
 
 
 def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, place: str) -> None:
-    """Raise `RobotError` for a field that is not known."""
+    """Raise `RobotError` if `given` has a field that is not in `known`, and suggest a name."""
     for name in given:
         if name not in known:
             hint = suggestion(str(name), known)
@@ -295,7 +297,7 @@ def _require_known(given: Mapping[str, Value], known: list[str], prefix: str, pl
 
 
 def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str) -> None:
-    """Raise `RobotError` if a field without a default is missing."""
+    """Raise `RobotError` if `given` lacks a field that has no default in the dataclass `kind`."""
     for field in dataclasses.fields(kind):
         if field.default is dataclasses.MISSING and field.name not in given:
             name = "places or diagonal" if field.name == "places" else field.name
@@ -303,7 +305,7 @@ def _require_all(kind: type, given: Mapping[str, Value], prefix: str, place: str
 
 
 def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value]:
-    """Return the fields of a part with their values in SI units."""
+    """Check the fields of a part of a description, and convert their values to SI units."""
     fields, prefix = _FIELDS[part], f"{part}." if part else ""
     _require_known(given, list(fields), f"{part} " if part else "", place)
     converted = dict(given)
@@ -321,7 +323,7 @@ def _to_si(given: Mapping[str, Value], part: str, place: str) -> dict[str, Value
 
 
 def _to_numbers(value: Value, quantity: _Quantity) -> Value:
-    """Return a number, a tuple of numbers, or four pairs of them, in SI units."""
+    """Convert a field's value to SI units: a number, a tuple of numbers, or four pairs (x, y)."""
     is_pairs = quantity.count == 8
     if is_pairs and isinstance(value, list | tuple):
         pairs = (pair if isinstance(pair, list | tuple) else [pair] for pair in value)
@@ -333,17 +335,17 @@ def _to_numbers(value: Value, quantity: _Quantity) -> Value:
 
 
 def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
-    """Return the numbers of a value in SI units.
+    """Parse the numbers of a value and convert them to SI units.
 
     Args:
         value: text such as "3 3 5 g m^2", whose unit applies to all its numbers; a number in SI
             units; or a list of texts and numbers.
-        kind: a key of `UNITS`.
-        count: number of numbers.
-        span: whether "to" may stand between two numbers.
+        kind: kind of quantity, a key of `UNITS`.
+        count: number of numbers that the value must have.
+        span: whether the word "to" may stand between two numbers.
 
     Raises:
-        QuantityError: another unit, another count, or no numbers.
+        QuantityError: the value has another unit or another count, or is not made of numbers.
     """
     parts = value if isinstance(value, list | tuple) else [value]
     numbers = tuple(number for part in parts for number in _parse(part, kind, span))
@@ -354,7 +356,7 @@ def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) ->
 
 
 def _parse(part: Value, kind: str, span: bool) -> list[float]:
-    """Return the numbers of one text, or of one number, in SI units."""
+    """Parse the numbers of one text, or take one number, in SI units; see `parse_numbers`."""
     rule = f"must be in {_list_units(kind)}, got {_shorten(part)}"
     if isinstance(part, int | float) and not isinstance(part, bool):
         if not math.isfinite(part):
@@ -387,7 +389,7 @@ def _has_unit(value: Value) -> bool:
 
 
 def suggestion(given: str, known: Iterable[str] | Mapping[str, Value]) -> str:
-    """Return a suggestion as the end of a message; empty if no known name is similar."""
+    """Return "; did you mean NAME?" for the most similar known name, or "" if none is similar."""
     near = difflib.get_close_matches(given, [name for name in known if name], n=1, cutoff=0.5)
     return f"; did you mean {near[0]}?" if near else ""
 

@@ -1,9 +1,9 @@
-"""Model of a quadrotor: body, rotors, tool and limits, for planner, referee and simulation.
+"""Description of a quadrotor: body, rotors, tool and limits, for planner, referee and simulation.
 
 The robots of the papers are defined here, all others in `quadrotor_models`.
 
 Body frame: x forward, y left, z along the thrust. The origin is the centre of mass, which lies in
-the plane of the propellers. SI units. Nothing here imports JAX.
+the plane of the propellers. SI units. This module imports no JAX.
 """
 
 import dataclasses
@@ -14,11 +14,11 @@ import numpy as np
 
 from planner_jax.core.errors import ArgumentError
 
-GRAVITY = 9.81  # [m/s^2], for the check that a model can hover
+GRAVITY = 9.81  # [m/s^2], used to check that the quadrotor can hover
 
 NET, RACKET = "net", "racket"
 
-# Rules of numbers, each with its text.
+# Rules of numbers: the text of an error message, and the function that tests a number.
 _FINITE = ("finite", lambda x: True)
 _POSITIVE = ("> 0", lambda x: x > 0.0)
 _NOT_NEGATIVE = (">= 0", lambda x: x >= 0.0)
@@ -30,9 +30,9 @@ class Tool:
 
     kind: str  # "net" or "racket"
     height: float  # [m], height of the disc's centre above the propeller plane
-    radius: float  # [m]
-    restitution: float = 0.7  # beta of a racket
-    # theta_safe [rad], greatest angle between a net's axis and the ball's path
+    radius: float  # [m], of the disc
+    restitution: float = 0.7  # coefficient of restitution beta of a racket
+    # theta_safe [rad], greatest angle between a net's axis and the ball's reversed velocity.
     max_angle: float = math.pi / 6.0
 
     def __post_init__(self) -> None:
@@ -48,12 +48,12 @@ class Tool:
 class Rotors:
     """Four rotors; neighbouring rotors turn in opposite directions."""
 
-    places: tuple[tuple[float, float], ...]  # (4, 2) [m], x and y, counter-clockwise
+    places: tuple[tuple[float, float], ...]  # (4, 2) [m], x and y of rotors, counter-clockwise
     max_thrust: float  # [N], of one rotor
     min_thrust: float = 0.0  # [N], of one rotor
-    torque_ratio: float = 0.016  # [m], drag torque of a rotor over its thrust
-    lag: float = 0.02  # [s], time constant of its thrust
-    radius: float = 0.06  # [m], of a propeller; only for pictures
+    torque_ratio: float = 0.016  # [m], drag torque of a rotor divided by its thrust
+    lag: float = 0.02  # [s], time constant of a rotor's thrust
+    radius: float = 0.06  # [m], of a propeller; used only for pictures
 
     def __post_init__(self) -> None:
         if np.shape(self.places) != (4, 2):
@@ -76,7 +76,7 @@ class Rotors:
 
     @property
     def torque_arms(self) -> np.ndarray:
-        """Drag torque of each rotor about body z over its thrust (4,) [m]."""
+        """Drag torque of each rotor about body z, divided by the rotor's thrust, (4,) [m]."""
         return self.torque_ratio * np.array([1.0, -1.0, 1.0, -1.0])
 
     @property
@@ -92,27 +92,27 @@ class Rotors:
 
     @property
     def shares(self) -> np.ndarray:
-        """Shares (4,) of the rotors in a total thrust without torque."""
+        """Fraction (4,) of the total thrust that each rotor produces if there is no torque."""
         return self.mixer[:, 0]
 
 
 def place_in_cross(diagonal: float) -> tuple[tuple[float, float], ...]:
-    """Return positions of four rotors at 45, 135, 225 and 315 degrees, `diagonal` [m] apart."""
+    """Return x and y [m] of four rotors on a square whose `diagonal` [m] joins opposite rotors."""
     half = 0.5 * diagonal * math.sqrt(0.5)
     return ((half, half), (-half, half), (-half, -half), (half, -half))
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightLimits:
-    """Limits of plans; None means that there is no such limit."""
+    """Limits that planned motions of a quadrotor keep; None means that there is no such limit."""
 
-    speed: float  # [m/s]
-    body_rate: float  # [rad/s], with the yaw part of the Hopf fibration
-    min_height: float = 0.25  # [m], of the propeller plane
-    acceleration: float | None = None  # [m/s^2]
-    thrust: tuple[float, float] | None = None  # [m/s^2], least and greatest, per unit mass
-    # Share of a rotor's range of thrusts that plans may use; the remainder is left for control.
-    # None: plans do not limit the rotors' thrusts.
+    speed: float  # [m/s], greatest speed
+    body_rate: float  # [rad/s], greatest body rate, including its component about body z
+    min_height: float = 0.25  # [m], least height of the propeller plane
+    acceleration: float | None = None  # [m/s^2], greatest acceleration
+    thrust: tuple[float, float] | None = None  # [m/s^2], least and greatest thrust per unit mass
+    # Fraction of the range of a rotor's thrust that plans may use. The remainder is a reserve for
+    # the controller. None: plans do not limit the thrusts of single rotors.
     rotor_share: float | None = 0.9
 
     def __post_init__(self) -> None:
@@ -131,15 +131,16 @@ class FlightLimits:
 
 @dataclasses.dataclass(frozen=True)
 class QuadrotorModel:
-    """A quadrotor; hashable, static under `jit`.
+    """Description of a quadrotor; hashable, so that it can be a static argument of `jax.jit`.
 
     Raises:
-        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover; one line.
+        ValueError: a number breaks its rule, or the rotors cannot hold the body in hover. The
+            message is one line.
     """
 
     name: str
     mass: float  # [kg]
-    inertia: tuple[float, float, float]  # [kg m^2], principal, about the body's axes
+    inertia: tuple[float, float, float]  # [kg m^2], principal moments about the body's axes
     rotors: Rotors
     tool: Tool
     limits: FlightLimits
@@ -173,7 +174,7 @@ class QuadrotorModel:
 
     @property
     def thrust_bounds(self) -> tuple[float, float]:
-        """Least and greatest thrust per unit mass [m/s^2]; by default given by the rotors."""
+        """Least and greatest thrust per unit mass [m/s^2]: `limits.thrust`, or else the rotors'."""
         if self.limits.thrust is not None:
             return self.limits.thrust
         low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)
@@ -181,7 +182,7 @@ class QuadrotorModel:
 
     @property
     def rotor_range(self) -> tuple[float, float] | None:
-        """Least and greatest thrust of a rotor [N] in plans; None means that all are allowed."""
+        """Least and greatest thrust [N] that a plan may use of a rotor; None if not limited."""
         share = self.limits.rotor_share
         if share is None:
             return None
@@ -198,11 +199,12 @@ def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]
         raise ArgumentError(name, rule, value)
 
 
-# [Yu2023catch, Fig. 6]: height l and radius of the net. The paper has no limits; these limits are
-# the protocol of this library. The papers have neither mass, inertia nor rotors. Assumptions:
-# 0.9 kg of computer, battery and frame within 5 cm of the centre, and 75 g of motor and propeller
-# at the end of each arm; the diagonal is from the papers. The greatest thrust is 4 g, which leaves
-# a margin for control above plans of 2.5 g. As in the papers, plans do not limit single rotors.
+# The quadrotor of [Yu2023catch]. Height and radius of the net are from Fig. 6 and the diagonal is
+# from the paper. The limits are this library's, since the paper states none. The papers state
+# neither mass, inertia nor rotors. Assumptions: 0.9 kg of computer, battery and frame within 5 cm
+# of the centre, and 75 g of motor and propeller at the end of each arm. The rotors' greatest thrust
+# is 4 g per unit mass; plans use up to 2.5 g, so that a reserve remains for the controller. As in
+# the papers, plans do not limit the thrusts of single rotors.
 PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
     mass=1.2,
@@ -214,7 +216,7 @@ PAPER_CATCHER = QuadrotorModel(
     ),
     source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# [Yu2023bat, Fig. 2 and Section VI-A].
+# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A], with the body and rotors assumed above.
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",

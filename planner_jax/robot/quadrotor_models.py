@@ -1,8 +1,8 @@
-"""Quadrotors by name: the robots of the papers, and three with published numbers.
+"""Quadrotors by name: the robots of the papers, and three robots with published numbers.
 
-Numbers without a source are assumptions, which `source` names. All tools are assumed to be
-massless; the tools of the published robots are assumptions. So are limits of speed, body rate and
-height, chosen within the abilities of the rotors, and the shares of the rotors' thrusts in plans.
+Numbers without a source are assumptions; the field `source` of a robot lists them. All tools are
+assumed to be massless. The tools of the three published robots are assumptions, and so are all
+limits: they are chosen such that the rotors can keep them.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ from planner_jax.robot.quadrotor_model import (
     place_in_cross,
 )
 
-# Mass and diagonal: the manufacturer's data sheet (27 g; 92 mm from motor to motor). Inertia, drag
-# torque and greatest thrust: [Foerster2015]. Lag and tool are assumptions. The tool is a net, since
-# a racket would weigh about as much as the robot.
+# Crazyflie 2.x. Mass and diagonal are from the manufacturer's data sheet (27 g, and 92 mm between
+# opposite motors). Inertia, drag torque and greatest thrust are from [Foerster2015]. Lag and tool
+# are assumptions. The tool is a net, since a racket would weigh about as much as the robot.
 CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
@@ -38,10 +38,10 @@ CRAZYFLIE = QuadrotorModel(
     "drag torque); lag, net and limits assumed",
 )
 
-# Mass and static thrust (870 g, 35 N): [Kaufmann2023], whose frame has propellers of 6 inches. The
-# diagonal is usual for such frames: 330 mm. Inertia is an assumption: 60 g of motor and propeller
-# at the end of each arm, the remainder within 4 cm of the centre. So are drag torque, lag and
-# tools.
+# A racing quadrotor. Mass and static thrust (870 g, 35 N) are from [Kaufmann2023], whose propellers
+# have 6 inches. All other numbers are assumptions. A diagonal of 330 mm is usual for such frames.
+# The inertia assumes 60 g of motor and propeller at the end of each arm, and the remainder within
+# 4 cm of the centre.
 RACER = QuadrotorModel(
     name="racer",
     mass=0.87,
@@ -55,9 +55,10 @@ RACER = QuadrotorModel(
     "tool and limits assumed",
 )
 
-# Everything but tool and limits: models x500_base and x500 of PX4's Gazebo models. Mass and inertia
-# are the sums of base and propellers; greatest thrust 8.54858e-6 N s^2 x (1000 rad/s)^2; the slower
-# of the model's two lags; propellers of 13 inches, as in its mesh.
+# The X500. All numbers but tool and limits are from the models x500_base and x500 of PX4's Gazebo
+# models. Mass and inertia are sums over base and propellers. The greatest thrust is
+# 8.54858e-6 N s^2 x (1000 rad/s)^2. The model has two time constants of the rotors, of which the
+# slower is used. The propellers' mesh has a diameter of 13 inches.
 X500 = QuadrotorModel(
     name="x500",
     mass=2.064,
@@ -96,14 +97,15 @@ MODELS = {
 
 
 def robot_named(word: str) -> QuadrotorModel:
-    """Return a quadrotor by its name, or read it from a file.
+    """Return the quadrotor of a name, or read a quadrotor from a file.
 
     The names are `paper-catcher`, `paper-hitter`, `crazyflie`, `racer`, `racer-net`, `x500` and
-    `x500-net`; `planner-jax robots` prints their main numbers.
+    `x500-net`. The command `planner-jax robots` prints their main numbers. A `word` that ends in
+    .yaml, .yml or .xml is the path of a file; see `read_robot`.
 
     Raises:
-        UnknownName: there is neither such a name nor such a file; one line that lists the names.
-        RobotError: the file breaks a rule; one line.
+        UnknownName: no quadrotor and no file has this name. The message lists the names.
+        RobotError: the file breaks a rule. The message is one line.
         MissingExtra: the file needs MuJoCo, which is not installed.
     """
     if word in MODELS:
@@ -121,7 +123,7 @@ def robot_named(word: str) -> QuadrotorModel:
 
 
 def format_models() -> str:
-    """Return a table of the quadrotors by name: a heading, and a line for each."""
+    """Format a text table with the main numbers of all named quadrotors, one line for each."""
     rows = [_summarise(model) for model in MODELS.values()]
     columns = [[heading, *(row[heading] for row in rows)] for heading in rows[0]]
     padded = [[cell.ljust(max(map(len, column))) for cell in column] for column in columns]
@@ -129,7 +131,7 @@ def format_models() -> str:
 
 
 def _summarise(model: QuadrotorModel) -> dict[str, str]:
-    """Return the main numbers of a quadrotor as text, by their headings."""
+    """Return a row of the table of quadrotors: heading of the column -> number as text."""
     rotors, limits = model.rotors, model.limits
     across = max(math.dist(a, b) for a in rotors.places for b in rotors.places)
     return {

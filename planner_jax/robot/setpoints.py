@@ -1,4 +1,4 @@
-"""Samples of plans at equally spaced times, for every robot."""
+"""Sampling of plans at equally spaced times, for the method `sample` of every robot's plans."""
 
 import functools
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from planner_jax.core.checks import require_number
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
-_MOST = 10**8  # greatest number of setpoints of a batch
+_MOST = 10**8  # greatest number of setpoints that one call may compute
 TreeT = TypeVar("TreeT")
 
 
@@ -23,17 +23,18 @@ def sample_at_rate(
     leaves: TreeT,
     setpoint_at: Callable[[TreeT, Array], dict[str, Array]],
 ) -> dict[str, np.ndarray]:
-    """Sample a plan, or a batch of plans, at a rate from start to end.
+    """Sample a plan, or a batch of plans, at equally spaced times from start to end.
 
     Args:
-        rate: [Hz].
+        rate: [Hz], number of samples in a second.
         ends: () or (B,) [s], end of each plan.
-        leaves: arrays of the plans, a pytree with their batch shape.
-        setpoint_at: pure function of (leaves of one plan, time () [s]); returns a setpoint by name.
+        leaves: pytree of the arrays that describe the plans, with their batch shape.
+        setpoint_at: pure function of (leaves of one plan, time () [s]). It returns the quantities
+            of a setpoint by name.
 
     Returns:
-        "time" (K,) [s], and setpoints by name: (K, ...) of one plan, (B, K, ...) of a batch; NaN
-        past the end of each plan.
+        "time" (K,) [s], and every quantity by name: (K, ...) for one plan, (B, K, ...) for a batch.
+        Entries after the end of a plan are NaN.
 
     Raises:
         TypeError: the rate is not a number.
@@ -59,6 +60,6 @@ def sample_at_rate(
 
 @functools.partial(jax.jit, static_argnames="setpoint_at")
 def _sample(leaves: object, times: Array, setpoint_at: Callable) -> dict[str, Array]:
-    """Return the setpoints (B, K, ...) of plans with leaves (B, ...) at times (K,)."""
+    """Evaluate `setpoint_at` for B plans with leaves (B, ...) at K times: arrays (B, K, ...)."""
     of_plan = jax.vmap(setpoint_at, in_axes=(None, 0))
     return jax.vmap(of_plan, in_axes=(0, None))(leaves, times)

@@ -1,4 +1,4 @@
-"""Hits, catches, interceptions, blocks and groups: one package a task."""
+"""The planning tasks: one subpackage each for hits, catches, interceptions, groups and blocks."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Arguments and results of the functions of a task: arrays, draws, decisions and judgements."""
+"""Checks and conversions of arguments for the functions `case`, `draw`, `planner` and `judge`."""
 
 import inspect
 import pkgutil
@@ -26,19 +26,19 @@ from planner_jax.core.protocol import Decision, Plan, take
 from planner_jax.core.registry import split_name
 from planner_jax.core.rules import NOT_NEGATIVE, Case
 
-_DRAWN_BYTES = 1_000  # estimated memory of a drawn case
+_DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 
 
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return an argument as a JAX array of shape batch + shape; errors as in `numbers_of`."""
-    with np.errstate(over="ignore"):  # numbers too large for the type become infinite
+    """Return an argument as a JAX array of shape batch + shape; see `numbers_of` for the errors."""
+    with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
-    """Return the leading axes of an argument of shape (..., *shape).
+    """Return the batch shape of an argument: its shape (..., *shape) without the trailing `shape`.
 
     Raises:
         TypeError: the argument does not hold numbers.
@@ -53,7 +53,7 @@ def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
 
 
 def require_draw(num: int, seed: int, first: int) -> None:
-    """Raise unless `num` cases of a suite can be drawn from a seed, the first at index `first`.
+    """Raise unless `num`, `seed` and `first` are valid arguments of a task's function `draw`.
 
     Raises:
         TypeError: an argument is not a whole number.
@@ -65,7 +65,10 @@ def require_draw(num: int, seed: int, first: int) -> None:
 
 
 def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
-    """Make one random generator a case, so that no case depends on others; see `require_draw`."""
+    """Make a random generator for each of `num` cases, seeded by suite, seed and the case's index.
+
+    A case therefore does not depend on other cases. `first` is the index of the first case.
+    """
     require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
@@ -74,12 +77,14 @@ def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.rand
 def find_decision(
     names: Mapping[str, str], decide: str | Decision, from_file: Collection[str] = ()
 ) -> Decision:
-    """Return a decision by its name, or the decision itself.
+    """Return the decision that `decide` names, or `decide` itself if it is a decision.
+
+    A decision is a rule that sets what a case leaves open, such as the order of its targets.
 
     Args:
         names: "module:class" of each decision, by name.
-        decide: a name or a decision. ":" and a file may follow a name in `from_file`.
-        from_file: names of decisions that are read from a file.
+        decide: a decision, its name, or "NAME:FILE" for a name in `from_file`.
+        from_file: names of the decisions that can be read from a file.
 
     Raises:
         ValueError: there is no decision of that name, or the decision takes no file.
@@ -94,7 +99,7 @@ def find_decision(
 
 
 def require_orders(orders: ArrayLike) -> None:
-    """Raise `ValueError` unless every order (..., N) is a permutation."""
+    """Raise `ValueError` unless every order (..., N) is a permutation of 0..N-1."""
     flat = np.asarray(orders).reshape(-1, np.shape(orders)[-1])
     wrong = np.flatnonzero((np.sort(flat, axis=1) != np.arange(flat.shape[1])).any(axis=1))
     if wrong.size:
@@ -112,7 +117,9 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Return the verdict on one plan, or on a batch, by a referee that judges batches.
+    """Check the arguments of a task's `judge`, and return the verdict of its referee.
+
+    The referee judges batches only, so one case and its plan are passed to it as a batch of one.
 
     Raises:
         TypeError: cases or plans are not instances of `kinds`, or `require_settings` raises.
@@ -137,9 +144,9 @@ def judge_by(
 
 
 def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:
-    """Raise unless settings are keyword arguments of a referee, each of its default's type.
+    """Raise unless a referee has a keyword argument for every setting, with a default of its type.
 
-    Where a referee accepts any keyword argument, only the named ones are checked.
+    If the referee has a parameter `**kwargs`, settings without an own parameter are not checked.
     """
     known = inspect.signature(referee).parameters
     accepts_any = any(each.kind is each.VAR_KEYWORD for each in known.values())

@@ -1,4 +1,4 @@
-"""The quadrotor in cases: rules of its limits, and quantities that cases take from the robot."""
+"""Functions that make and check the quadrotor's part of a case, for the tasks `hit` and `catch`."""
 
 from collections.abc import Callable
 
@@ -23,7 +23,7 @@ from planner_jax.core.rules import (
 from planner_jax.robot.quadrotor import QuadrotorLimits, RotorLimits
 from planner_jax.robot.quadrotor_model import NET, QuadrotorModel, Tool
 
-# Rules of the limits in cases of all quadrotor tasks.
+# Shapes and ranges of the quadrotor's limits, for the cases of hits and of catches.
 FLIGHT_RULES: Table = (
     Field("limits.speed", (), POSITIVE),
     Field("limits.body_rate", (), POSITIVE),
@@ -39,7 +39,7 @@ FLIGHT_RULES: Table = (
     Field("limits.rotors.max_thrust", ()),
 )
 
-# Fields of a case -> arguments of the function that makes the case, for error messages.
+# Field of a case -> argument of the function `case` that sets it. Error messages name the argument.
 ARGUMENTS = {
     "head_state": "start",
     **{
@@ -50,11 +50,11 @@ ARGUMENTS = {
 
 
 def require_tool(robot: object, kind: str) -> Tool:
-    """Return the tool of a robot.
+    """Return the racket or net of a robot; raise unless the tool is of the kind that a task needs.
 
     Raises:
         TypeError: the robot is not a `QuadrotorModel`.
-        ValueError: the robot carries a tool of another kind.
+        ValueError: the robot's tool is not of the kind `kind`, "racket" or "net".
     """
     if not isinstance(robot, QuadrotorModel):
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
@@ -67,16 +67,16 @@ def require_tool(robot: object, kind: str) -> Tool:
 
 
 def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return states (..., 4, 3), position to jerk, of hover at positions (3,) or (..., 3) [m]."""
+    """Return states (..., 4, 3) of hover: position `start`, zero velocity, acceleration, jerk."""
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
     return jnp.asarray(head, dtype)
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` if a quadrotor starts below its least height.
+    """Raise `CaseError` if a quadrotor starts below its limit `min_height`.
 
-    Traced arrays have no values yet and are not checked.
+    Nothing is checked inside a JAX transformation, where arrays have no values yet.
     """
     heights = cases.head_state[..., 0, 2], cases.limits.min_height
     if any(isinstance(each, Tracer) for each in heights):
@@ -86,7 +86,7 @@ def require_start(cases: PyTree) -> None:
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise `ValueError` unless the robot is the default one, for suites with their own robot."""
+    """Raise unless `robot` is the default `usual`, for suites that define the robot themselves."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
@@ -94,12 +94,13 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
 def limits_of(
     robot: QuadrotorModel, leaf: Callable[..., Array], **given: object
 ) -> QuadrotorLimits:
-    """Return the limits of a case: the given ones that are not None, else the robot's.
+    """Return the limits of a case: the arguments that are not None, and else the robot's limits.
 
     Args:
-        robot: quadrotor with its tool. With a net its thrust is bounded, by default by its rotors.
-        leaf: `leaf(name, value, *shape)` makes an array of the batch.
-        **given: limits by name.
+        robot: quadrotor with its tool. Thrust is limited if the robot carries a net, or if
+            `robot.limits.thrust` is not None.
+        leaf: `leaf(name, value, *shape)` broadcasts a value to an array with the batch's shape.
+        **given: limits by name, such as `speed` [m/s]; None stands for the robot's limit.
     """
     own = robot.limits
     least, most = own.thrust or (None, None)
@@ -114,7 +115,7 @@ def limits_of(
         "max_thrust": most,
     }
     values = {**known, **{name: value for name, value in given.items() if value is not None}}
-    # A single thrust bound needs its counterpart: 0 below, infinity above.
+    # If only one bound of the thrust is specified, the other bound is 0 or infinite.
     if values["max_thrust"] is None and values["min_thrust"] is not None:
         values["max_thrust"] = np.inf
     if values["min_thrust"] is None and values["max_thrust"] is not None:

@@ -1,4 +1,4 @@
-"""Task block: an arm with a shield protects a box from thrown balls [Natarajan2024]."""
+"""The task `block`: an arm with a shield protects a box from thrown balls [Natarajan2024]."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The functions `pj.block.planner` and `judge`; `case` and `draw` are in modules of their own."""
+"""The public functions `planner` and `judge` of the task `pj.block`."""
 
 from planner_jax.core.planner import Planner
 from planner_jax.referee.block import BlockVerdict, referee_blocks
@@ -9,29 +9,33 @@ from planner_jax.task.block.spec import TASK
 
 
 def planner(name: str = "online", **options: object) -> Planner[BlockCase, BlockPlan]:
-    """Return a block planner by its name.
+    """Make a planner of blocks by its name.
 
-    * `library:FILE`: the motion that a file of `planner-jax library build` has for the two cells
-      through which the ball enters the boxes.
-    * `adapt:FILE`: motions of that file, warped to the ball, then refined by least squares.
-    * `online`: a straight motion of the joints if one is free of collisions, else least squares
-      for end pose, time of contact and motion together, from several starts.
-    * `brisk`: the motions of `online` from rest to rest, as fast as limits allow; the arm waits for
-      the ball at standstill. Needs more torque.
-    * `direct`: each joint as fast as its limits allow, to the end pose that is reached soonest
+    * `online`: a straight motion in joint space if one is free of collisions. Otherwise least
+      squares find end pose, time of contact and motion together, from several starts.
+    * `brisk`: the paths of `online` from rest to rest, as fast as the limits allow. The arm then
+      waits for the ball at standstill. These motions need more torque.
+    * `library:FILE`: a motion that is stored in a file of `planner-jax library build`. The faces of
+      the inner and outer box are divided into cells, and the file has a motion for each pair of
+      cells through which a ball can enter.
+    * `adapt:FILE`: motions of such a file, changed to meet the ball and refined by least squares.
+    * `direct`: each joint moves as fast as its limits allow, to the end pose that is reached first
       without a collision.
-    * `rrt-connect`, `epase`: paths by OMPL's RRT-Connect, or by a weighted A* over steps of the
-      joints, to one end pose after another, timed by TOPP-RA; on the host, extra `arm-peers`.
-    * `insat`: that A* interleaved with B-splines [Natarajan2024, Algorithm 2]; on the host.
+    * `rrt-connect`, `epase`: a path by OMPL's RRT-Connect, or by a weighted A* over steps of the
+      joints, to one end pose after another. TOPP-RA sets the speed along the path. Both run on the
+      host and need the extra `arm-peers`.
+    * `insat`: the A* of `epase` interleaved with the optimisation of B-splines [Natarajan2024,
+      Algorithm 2]; runs on the host.
 
-    See `pj.hit.planner` for arguments and errors. The options are fields of `OnlineBlock`,
-    `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or `InsatBlock`.
+    Arguments and errors are as for `pj.hit.planner`. The options are fields of the planner's class:
+    `OnlineBlock`, `LibraryBlock`, `AdaptBlock`, `DirectBlock`, `RrtConnectBlock`, `EpaseBlock` or
+    `InsatBlock`.
     """
     return TASK.make_planner(name, options)
 
 
 def judge(cases: BlockCase, plans: BlockPlan, **settings: object) -> BlockVerdict:
-    """Judge one plan, or a batch, by kinematics and geometry alone.
+    """Judge one plan, or a batch of plans, by the arm's kinematics and collisions and the ball.
 
     See `pj.hit.judge` for arguments, result and errors, and `referee_blocks` for the settings.
     """

@@ -1,4 +1,4 @@
-"""Cases: one thrown ball, and the arm that has to block it."""
+"""Cases of the task `block`: a thrown ball, and an arm that has to block it with its shield."""
 
 from typing import ClassVar, TypeVar
 
@@ -27,7 +27,7 @@ from planner_jax.task.arguments import array_of, batch_of
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene, paper_scene
 
-# Rules on the numbers of a case.
+# Shapes and ranges that `pj.require_sound` checks for the arrays of a `BlockCase`.
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
@@ -60,26 +60,27 @@ RULES: Table = (
 
 TreeT = TypeVar("TreeT")
 # Tolerances of a contact: greatest distance [m] of the ball from the shield's middle, and greatest
-# angle [rad] between the shield's normal and the direction against the ball's velocity.
+# angle [rad] between the shield's normal and the reversed velocity of the ball.
 STRICT = (0.002, np.deg2rad(0.5))
 WIDE = (0.1, np.deg2rad(30.0))
-ANYWHERE = (0.25, np.deg2rad(90.0))  # everywhere on the face: its corners are nearer than 0.25 m
+ANYWHERE = (0.25, np.deg2rad(90.0))  # the shield's corners are less than 0.25 m from its middle
 
 
 @struct.dataclass
 class BlockCase:
-    """One case, or a batch; every number is a leaf and may be differentiated by.
+    """One case, or a batch: an arm has to block a thrown ball with its shield.
 
-    Robot base frame, z up, SI units. Times count from the first observation of the ball.
+    Every number is a leaf of the pytree; plans can be differentiated by it. Robot base frame, z up,
+    SI units. Time 0 is the first observation of the ball.
     """
 
     rules: ClassVar[Table] = RULES
 
-    ball: BallState  # at time 0; it falls freely
+    ball: BallState  # position and velocity at time 0; the ball flies without drag
     gravity: Array  # () [m/s^2], magnitude
-    delay: Array  # () [s], time at which the arm may start
-    angles: Array  # (6,) [rad], joint angles up to then
-    rates: Array  # (6,) [rad/s], joint rates at the start
+    delay: Array  # () [s], time at which the arm may start to move
+    angles: Array  # (6,) [rad], joint angles at the time `delay`
+    rates: Array  # (6,) [rad/s], joint rates at the time `delay`
     arm: Arm
     limits: ArmLimits
     ends_at_rest: Array  # () bool, whether the arm must be at rest at the contact
@@ -90,11 +91,11 @@ class BlockCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return np.shape(self.gravity)
 
     def clearances(self, angles: Array) -> Array:
-        """Return the least distances (N,) [m] of the arm at angles (N, 6) from its obstacles."""
+        """Return the arm's least distances (N,) [m] from obstacles in N poses at angles (N, 6)."""
         return least_clearances(self.arm, self.scene, angles)
 
 
@@ -113,29 +114,30 @@ def case(
     gravity: ArrayLike = 9.81,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Return a case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
+    """Make one case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
 
     Args:
         ball_pos: (3,) or (B, 3) [m], position of the ball at time 0.
-        ball_vel: (3,) or (B, 3) [m/s].
-        delay: () or (B,) [s], time at which the arm may start, >= 0. Delay, angles, rates and
-            gravity are one value for all cases, or one value per case.
-        regime: a key of `planner_jax.robot.arm.REGIMES`. "R1": limits in the code of
-            [Natarajan2024], end velocity free. "R2": speeds of the data sheet and 30 rad/s^2, from
-            rest to rest. "R3": limits of R1, from rest to rest.
-        wide: whether a contact may be 0.1 m off the shield's middle and tilted by 30 degrees,
-            instead of 2 mm and half a degree.
-        anywhere: whether a contact may be everywhere on the shield, at any angle, as for motions
+        ball_vel: (3,) or (B, 3) [m/s], velocity of the ball at time 0.
+        delay: () or (B,) [s], time at which the arm may start to move, >= 0. Delay, angles, rates
+            and gravity are one value for all cases, or one value for each case.
+        regime: joint limits, and whether the motion ends at rest; a key of
+            `planner_jax.robot.arm.REGIMES`. "R1": limits in the code of [Natarajan2024], any
+            velocity at the end. "R2": speeds of the robot's data sheet and 30 rad/s^2, at rest at
+            the end. "R3": limits of "R1", at rest at the end.
+        wide: whether the ball may meet the shield up to 0.1 m from its middle and tilted by up to
+            30 degrees, instead of 2 mm and half a degree.
+        anywhere: whether the ball may meet the shield anywhere and at any angle. This suits motions
             that were planned for another ball.
-        scene: without batch axes; by default the paper's scene.
+        scene: obstacles, without batch axes; by default the paper's scene.
         arm: without batch axes; by default an IRB 1600 with a shield.
-        angles: (6,) [rad], at the start; by default the arm's home.
-        rates: (6,) [rad/s], at the start.
-        gravity: [m/s^2], > 0.
-        dtype: of every floating leaf.
+        angles: (6,) [rad], joint angles at the start; by default the arm's home angles.
+        rates: (6,) [rad/s], joint rates at the start.
+        gravity: [m/s^2], magnitude, > 0.
+        dtype: type of every floating leaf.
 
     Raises:
-        ValueError: there is no such regime; see `pj.hit.case` for all other errors.
+        ValueError: no regime has the requested name. All other errors are as for `pj.hit.case`.
     """
     require_name(REGIMES, "regime", regime)
     require_switch("wide", wide)

@@ -1,10 +1,10 @@
-"""Distances of an arm and its shield from obstacles, and between its own links.
+"""Distances of an arm and its shield from obstacles, and between the arm's own links.
 
-The bodies are capsules and the shield's face; the obstacles are a pole, the floor, beams, the base
-and other links. Neighbouring links are left out, and so are links 5 and 6 against the shield that
-they carry. The shield is a plate of 0.01 m with rounded edges, whose front side is the face.
+The links are represented by capsules, and the shield by a plate of 0.01 m with rounded edges. The
+obstacles are a pole, the floor, beams, the base and other links. Distances between neighbouring
+links are not computed, nor distances of the links 5 and 6 from the shield, which they carry.
 
-Functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
+The functions process N poses of the arm at once. N is the last axis of arrays, so that a processor
 works on several poses with one instruction.
 """
 
@@ -31,9 +31,10 @@ from planner_jax.space.distances import (
 )
 from planner_jax.task.block.scene import Scene
 
-FAR = 10.0  # [m], added to the distances from the pole in a scene without one
-# The forearm ends in a fork around the wrist, and its capsule reaches beyond the fork. Against the
-# shield, its radius is at most this share of the distance from the wrist to the shield's face.
+FAR = 10.0  # [m], added to the distances from the pole if the scene has no pole
+# The forearm ends in a fork around the wrist, and the forearm's capsule extends beyond the fork.
+# For the distance of this capsule from the shield, its radius is therefore reduced to at most 0.71
+# times the distance of the wrist from the shield's face.
 _FORK = 0.71
 _HALF_THICKNESS = 0.005  # [m], of the shield
 _SHIELD_LINK = 5
@@ -50,37 +51,39 @@ class _Poses(NamedTuple):
 
 
 class _Pairs(NamedTuple):
-    """P pairs of a moving body and a body that it must not touch."""
+    """P pairs of a moving body and a body that it must not touch, all of the same two shapes."""
 
-    measure: Callable  # function of `space.distances`
-    bodies: tuple[Array, ...]  # its arguments; their last axes are (P or 1, N)
+    measure: Callable  # function of `space.distances` that returns the distance of two shapes
+    bodies: tuple[Array, ...]  # arguments of `measure`; their last axes are (P or 1, N)
     thick: Array | float  # (P, 1) or () [m], sum of the radii around both bodies
     link: np.ndarray | int  # (P,) or (), 0 to 5, link of the moving body
     fixed: np.ndarray | int = -1  # link of the other body; -1 if it does not move
-    first: bool = True  # whether the moving body is the first argument of the measure
+    first: bool = True  # whether the moving body is the first argument of `measure`
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return distances (R, N) [m] of all pairs at angles (N, 6); negative if capsules overlap.
+    """Return the distances (R, N) [m] of all R pairs of bodies in N poses at angles (N, 6) [rad].
 
-    The first `num_of_pole(arm)` rows are distances from the pole.
+    A distance is negative if the bodies overlap. The first `num_of_pole(arm)` rows are the
+    distances from the pole.
     """
     every = _pairs(arm, scene, _poses(arm, angles))
     return jnp.concatenate([pairs.measure(*pairs.bodies) - pairs.thick for pairs in every])
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least of the `clearances` at each of N poses, (N,) [m]."""
+    """Return the least distance (N,) [m] of any two bodies in each of N poses at angles (N, 6)."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
 def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the derivatives of `clearances` by the joint angles, (R, 6, N) [m/rad].
+    """Return the derivatives of the distances `clearances` by the joint angles, (R, 6, N) [m/rad].
 
-    A joint that moves both bodies of a pair does not change their distance.
+    The derivative by a joint that moves both bodies of a pair as one is zero.
     """
     poses = _poses(arm, angles)
-    # A joint turns about an axis a through a point o, and  a . (o x n) = (a x o) . n.
+    # A joint turns about the axis a through the point o. The derivative of a distance along the
+    # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
     axes, origins = (tuple(jnp.moveaxis(each, 1, 0)) for each in poses[3:])  # 3 times (6, N)
     arms = cross(axes, origins)
     joint = np.arange(6)[:, None]
@@ -96,7 +99,7 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def num_of_pole(arm: Arm) -> int:
-    """Return the number of pairs with the pole: the moving capsules and the shield."""
+    """Return the number of pairs with the pole: all capsules that move, and the shield."""
     return len(_from_link(arm, 1)) + 1
 
 
@@ -107,7 +110,8 @@ def _from_link(arm: Arm, first: int) -> np.ndarray:
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
     """Return the positions of the arm's parts at angles (N, 6)."""
-    # Barriers: without them the compiler repeats this computation in the loop of every distance.
+    # Without the barriers XLA fuses these computations into the loop of every distance, which
+    # repeats them.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
     )
@@ -117,7 +121,7 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
         x, y, z = (rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
         return x + y + z
 
-    # The base is the last link, where index -1 finds it.
+    # Append the base as the last link, since the base has the index -1 in `arm.capsule_link`.
     num = angles.shape[0]
     fixed = jnp.broadcast_to(jnp.eye(3, dtype=rotations.dtype)[None, :, :, None], (1, 3, 3, num))
     link = np.asarray(arm.capsule_link, np.int32)
@@ -138,7 +142,7 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """Return all pairs, pairs with the pole first."""
+    """List all pairs of bodies, grouped by their shapes; the pairs with the pole come first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)
@@ -153,13 +157,14 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     num_beams = beams.shape[2]
 
     def with_beams(index: np.ndarray) -> Array:
-        """Return the axes (2, 3, K, N) of some capsules and of all beams."""
+        """Return the ends (2, 3, K, N) of the axes of some capsules and of all beams."""
         return jnp.concatenate([poses.ends[:, :, index], beams], axis=2)
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))
     thin = jnp.where(link[before] == 3, jnp.minimum(radius[before], _FORK * wrist), radius[before])
     near_radius = jnp.concatenate([thin, scene.beam_radius])[:, None] + _HALF_THICKNESS
-    # Links against link 1 (the trunk) and beams; link 2 turns on the trunk and is left out there.
+    # Pairs of links 3 to 6 with link 1, the trunk, and of links 1 to 6 with the beams. Link 2 is
+    # not paired with the trunk, because a joint connects both.
     fixed = with_beams(trunk)
     every = ((k, j) for k in turning for j in range(fixed.shape[2]))
     moving, fixture = np.array([(k, j) for k, j in every if j >= len(trunk) or k in far]).T

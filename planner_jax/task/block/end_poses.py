@@ -1,4 +1,4 @@
-"""End poses at which the shield meets a ball, their straight motions, and residuals of contacts."""
+"""Arm poses in which the shield meets a ball, and residuals of this contact for least squares."""
 
 import jax
 import jax.numpy as jnp
@@ -14,31 +14,36 @@ from planner_jax.task.block.motion import Weights, profiles, step_weights
 from planner_jax.task.block.scene import entry_time
 
 _PLANE = 1e-3  # [m], greatest distance of the ball from the shield's plane at the contact
-# Offsets of the ball from the shield's middle along the two edges, over the greatest offset.
+# Offsets of the ball from the shield's middle along the two edges, divided by the case's `offset`.
 _OFFSETS = np.array([(0.0, 0.0), (0.8, 0.0), (0.0, 0.8), (-0.8, 0.0), (0.0, -0.8)])
 
 
 @struct.dataclass
 class EndPoses:
-    """C poses, and the effort of the straight motion to each."""
+    """C arm poses in which the shield meets the ball, and the straight motions to them.
+
+    A straight motion turns all joints in proportion from the start to the pose.
+    """
 
     angles: Array  # (C, 6) [rad]
     time: Array  # (C,) [s], time of the contact
-    effort: Array  # (C,), greatest share of a limit that the motion uses; infinite without a pose
-    profile: Array  # (C,) int32, index in `all_profiles`
+    # (C,), greatest ratio of a joint's rate or acceleration to its limit in the straight motion;
+    # infinite if the arm cannot reach the pose.
+    effort: Array
+    profile: Array  # (C,) int32, speed profile of the straight motion, index in `all_profiles`
 
 
 @struct.dataclass
 class Flight:
-    """Times at which a ball can be met."""
+    """Interval of time in which a ball must be met: between the outer and the inner box."""
 
-    earliest: Array  # () [s], entry of the ball into the outer box
-    latest: Array  # () [s], entry into the inner box
-    comes: Array  # () bool, whether the ball enters both
+    earliest: Array  # () [s], time at which the ball enters the outer box
+    latest: Array  # () [s], time at which the ball enters the inner, protected box
+    comes: Array  # () bool, whether the ball enters both boxes
 
 
 def flight_of(case: BlockCase) -> Flight:
-    """Return the times at which the ball of a case can be met."""
+    """Compute when the ball of a case enters the outer box and the inner box."""
     scene = case.scene
     earliest, enters = entry_time(scene.outer, case.ball, case.gravity)
     latest, hits = entry_time(scene.inner, case.ball, case.gravity)
@@ -46,15 +51,15 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all profiles (P, K) of `motion.profiles`, and whether each ends at rest, (P,) bool."""
+    """Return all speed profiles (P, K) of `motion.profiles`, and which end at rest, (P,) bool."""
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 
 
 def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return peak rates and peak accelerations (P,) of all profiles, and which end at rest.
+    """Return the greatest rates and accelerations (P,) of all profiles, and which end at rest.
 
-    The profiles turn a joint by 1 rad in 1 s.
+    They are in rad/s and rad/s^2 for profiles that turn a joint by 1 rad in 1 s.
     """
     shapes, rests = all_profiles(pieces)
     rises = np.diff(shapes, axis=1, prepend=0.0) * pieces
@@ -64,11 +69,12 @@ def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def end_poses(
     case: BlockCase, flight: Flight, points: int, pieces: int, *, quickest: bool = False
 ) -> EndPoses:
-    """Return eight end poses for each of `points` points of the ball's path between the boxes.
+    """Return the eight arm poses that meet the ball at each of `points` points between the boxes.
 
-    Joint 6 turns the shield in its own plane and keeps its angle. The straight motion to a pose has
-    `pieces` pieces and the profile of least effort; with `quickest`, motions from rest to rest have
-    the profile of least time.
+    The eight poses are the branches of the inverse kinematics. Joint 6 keeps its angle, because it
+    only turns the shield in its own plane. The straight motion to a pose has `pieces` pieces and
+    the speed profile of least effort. With `quickest`, motions that end at rest have the profile
+    of least time.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)
@@ -106,20 +112,20 @@ def end_poses(
 
 
 def coast(case: BlockCase, duration: Array, pieces: int) -> Array:
-    """Return the angles (..., 6) [rad] at which joints stop if they brake evenly in piece 1."""
+    """Return the angles (..., 6) [rad] at which joints stop if they brake in the first piece."""
     of_first = step_weights(pieces, (1.0,))[0][0]
     angles, rates = (jnp.broadcast_to(x, (*duration.shape, 6)) for x in (case.angles, case.rates))
     return angles + of_first * duration[..., None] * rates
 
 
 def face_ball(velocity: Array) -> Array:
-    """Return the unit vector (3,) against a ball's velocity (3,)."""
+    """Return the shield's normal (3,) that faces a ball: the reversed direction of its velocity."""
     square = jnp.maximum(jnp.sum(velocity**2), 1e-12)
     return -velocity / jnp.sqrt(square)
 
 
 def frame_of(normal: Array) -> Array:
-    """Return a rotation (3, 3) whose first column is `normal` (3,) and second is horizontal."""
+    """Return a rotation (3, 3) with the first column `normal` (3,) and a horizontal second one."""
     flat = jnp.sqrt(jnp.maximum(normal[0] ** 2 + normal[1] ** 2, 1e-12))
     side = jnp.stack([-normal[1], normal[0], jnp.zeros_like(flat)]) / flat
     return jnp.stack([normal, side, jnp.cross(normal, side)], axis=1)
@@ -128,13 +134,15 @@ def frame_of(normal: Array) -> Array:
 def contact_terms(
     case: BlockCase, flight: Flight, angles: Array, time: Array, weights: Weights
 ) -> tuple[Array, Array, Array]:
-    """Return the residuals of a contact at angles (6,) [rad] and a time () [s].
+    """Return the residuals of the contact of shield and ball at angles (6,) [rad] and a time [s].
 
     Returns:
-        rows: (6,), weighted residuals: distance from the shield's plane, offset from its middle
-            (2), tilt (2), and time too early or too late.
+        rows: (6,), weighted residuals: the ball's distance from the shield's plane; its offset from
+            the shield's middle in the plane (2); the shield's tilt (2); the time before the ball is
+            in the outer box or after it is in the inner box. Offset and tilt count only beyond the
+            tolerances of the case.
         slopes: (6, 7), derivatives of the rows by the angles and the time.
-        excess: (), largest relative excess over a limit, without weights.
+        excess: (), largest relative excess over a tolerance, without weights.
     """
     rotation, middle = shield_pose(case.arm, angles)
     jacobian = shield_jacobian(case.arm, angles)
@@ -145,19 +153,19 @@ def contact_terms(
     turns = jacobian[3:].T  # (6, 3), joint axes
     moves = jacobian[:3].T
     by_normal = jnp.cross(turns, normal)
-    # Distance from the plane of the shield.
+    # Distance of the ball from the plane of the shield.
     off = jnp.sum(away * normal)
     off_slope = jnp.append(
         product(by_normal, away) - product(moves, normal), jnp.sum(velocity * normal)
     )
-    # Offset from its middle, within the plane.
+    # Offset of the ball from the shield's middle, within the plane of the shield.
     beside = away - off * normal
     beside_slope = jnp.concatenate([-moves, velocity[None]])
     beside_slope -= jnp.sum(beside_slope * normal[None], axis=1)[:, None] * normal[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(beside**2), 1e-12))
     spare = jnp.maximum(0.95 * case.offset - 0.002, 0.0)
     beside_share = jnp.maximum(1.0 - spare / distance, 0.0)
-    # Tilt against the ball's path.
+    # Tilt of the shield's normal against the reversed velocity of the ball.
     facing = face_ball(velocity)
     tilt = jnp.cross(facing, normal)
     tilt_slope = jnp.cross(facing, by_normal)
@@ -169,10 +177,11 @@ def contact_terms(
     early = jnp.maximum(flight.earliest + 2e-3 - time, 0.0)
     late = jnp.maximum(time - flight.latest + 2e-3, 0.0)
     edge = jnp.where(early > 0.0, -1.0, jnp.where(late > 0.0, 1.0, 0.0))
-    # 1 ms weighs as much as 1 cm.
+    # A contact 1 ms too early or too late weighs as much as a distance of 1 cm.
     pace = 10.0 * weights.meeting
     across = rotation[:, 1:]
-    # The direction of flight turns with the component of gravity perpendicular to it.
+    # Derivative of the direction of flight by time: the component of gravity that is perpendicular
+    # to the velocity, divided by the speed.
     speed_squared = jnp.maximum(jnp.sum(velocity**2), 1e-12)
     pull = jnp.zeros(3, angles.dtype).at[2].set(case.gravity)
     turning = (pull - facing * jnp.sum(facing * pull)) / jnp.sqrt(speed_squared)

@@ -1,9 +1,9 @@
-"""Motions of joints whose rates are linear between equidistant knots.
+"""Joint motions of an arm whose rates are linear in time between equidistant knots.
 
-The parameters of a motion are its steps (K, 6) [rad]: the rates at the knots 1 to K times the
-duration T, so that the turned angles do not depend on T. Angles are quadratic between knots. Rates
-have their peaks at knots and accelerations are constant in between, so that checks at knots are
-exact.
+The parameters of a motion are its steps (K, 6) [rad]: the joint rates at the knots 1 to K,
+multiplied by the duration T. For given steps the angles therefore do not depend on T. Angles are
+quadratic in time between knots. Rates have their extremes at knots, and accelerations are constant
+between knots, so that checks at the knots suffice for the limits of both.
 """
 
 import dataclasses
@@ -22,19 +22,21 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 class Weights:
     """Weights of the residuals of least squares; static."""
 
-    meeting: float = 100.0  # [1/m]
-    tilt: float = 30.0  # [1/rad]
-    limits: float = 30.0  # of relative excesses over limits
-    clearance: float = 100.0  # [1/m]
-    effort: float = 0.1  # of accelerations over their limits
+    meeting: float = 100.0  # [1/m], of the ball's distances from the shield's plane and middle
+    tilt: float = 30.0  # [1/rad], of the shield's tilt against the ball's path
+    limits: float = 30.0  # of relative excesses over the joints' limits
+    clearance: float = 100.0  # [1/m], of distances below the required distance from obstacles
+    effort: float = 0.1  # of joint accelerations divided by their limits
 
 
 @functools.cache
 def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the weights with which steps sum up to angles at shares of the duration.
+    """Return weights of a motion's parameters whose weighted sum is the angle turned so far.
+
+    The angle is evaluated at N times, which are `shares` in [0, 1] of the duration.
 
     Returns:
-        first: (N,), weights of the rates at the start times the duration.
+        first: (N,), weights of the initial rate multiplied by the duration.
         steps: (N, K), weights of the steps.
     """
     position = np.asarray(shares)[:, None] * pieces
@@ -48,9 +50,10 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
 
 
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
-    """Return the angles (N, 6) [rad] at N shares of the duration, in [0, 1].
+    """Return the joint angles (N, 6) [rad] of a motion at N times: `shares` of its duration.
 
-    The motion has steps (K, 6) [rad]; `first` (6,) [rad] are the first rates times the duration.
+    The motion has the steps (K, 6) [rad] and the initial angles `start` (6,) [rad]. `first` (6,)
+    [rad] are the initial rates multiplied by the duration.
     """
     of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
@@ -58,12 +61,12 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 
 
 class JointTerms(NamedTuple):
-    """Cost r . r of the joints' limits and effort; J derives the residuals r of each joint.
+    """Cost r . r of the joints' limits and effort, and its derivatives for each joint.
 
-    The unknowns are the K steps of the joint and the time of contact.
+    J is the Jacobian of the residuals r by the K steps of the joint and the time of contact.
     """
 
-    cost: Array  # (), r . r
+    cost: Array  # (), r . r, summed over the joints
     gradient: Array  # (6, K + 1), J^T r
     curvature: Array  # (6, K + 1, K + 1), J^T J
     excess: Array  # (), largest relative excess over a limit
@@ -72,9 +75,10 @@ class JointTerms(NamedTuple):
 def joint_terms(
     case: BlockCase, steps: Array, first: Array, duration: Array, weights: Weights, most: float
 ) -> JointTerms:
-    """Return the cost of the joints' limits and effort, with its derivatives.
+    """Compute the cost of the joints' limits and accelerations, with its derivatives.
 
-    See `angles_at` for `steps` and `first`; `most` is the share of every limit that may be used.
+    See `angles_at` for `steps` and `first`. `duration` () [s] is the time of the motion. A value is
+    penalised above `most` times its limit.
     """
     pieces, dtype = steps.shape[0], steps.dtype
     knots = tuple(np.arange(1, pieces + 1) / pieces)
@@ -90,12 +94,12 @@ def joint_terms(
     def row(
         value: Array, by_steps: Array, by_time: Array, slope: float | Array
     ) -> tuple[Array, Array]:
-        """Return residuals (6, K) and their derivatives (6, K, K + 1)."""
+        """Return residuals (6, K) and their derivatives (6, K, K + 1), with the joints first."""
         slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 
     def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
-        """Return the residuals of shares above `most`, and their derivatives."""
+        """Return penalties on values / limits, `share`, above `most`, and their derivatives."""
         over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
         sign = weights.limits * jnp.sign(share) * (over > 0.0).astype(over.dtype)
         return row(over, by_steps, by_time, sign)
@@ -104,7 +108,7 @@ def joint_terms(
     rate_shares = rates / case.limits.velocity[None]
     of_rise = rise[None] * (pieces / duration**2 / case.limits.acceleration[:, None, None])
     rise_shares = accelerations / case.limits.acceleration[None]
-    # The first rise contains `first`, which grows in proportion to the duration.
+    # The first difference of rates contains `first`, which is proportional to the duration.
     of_start = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
     by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration[None]) / duration
     angle_shares = (angles - middle[None]) / half[None]
@@ -128,13 +132,13 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return steps (K, 6) of a squared sine that turns joints by `height` (6,) [rad] and back."""
+    """Return the steps (K, 6) of a bump: joints turn by `height` (6,) [rad] and back, as sin^2."""
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 
 
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
-    """Return a motion as a piecewise polynomial with K pieces of degree 2."""
+    """Convert a motion, given as for `angles_at`, to a polynomial with K pieces of degree 2."""
     pieces = steps.shape[0]
     step = duration / pieces
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)
@@ -150,11 +154,13 @@ def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> Pie
 def speed_up(
     motion: PiecewisePolynomial, velocity: Array, acceleration: Array
 ) -> tuple[PiecewisePolynomial, Array]:
-    """Accelerate a motion of degree 2 from rest to rest along its path as far as limits (6,) allow.
+    """Shorten the duration of a motion along its path until a joint reaches one of its limits.
+
+    The motion is piecewise quadratic, from rest to rest; the limits are (6,) [rad/s], [rad/s^2].
 
     Returns:
-        motion: as fast as the given one, or faster.
-        pace: () in (0, 1], new duration over the old one.
+        motion: the motion with the same path and the shorter duration.
+        pace: () in (0, 1], new duration divided by the old duration.
     """
     rates = motion.coeffs[:, 1] / velocity
     rises = 2.0 * motion.coeffs[:, 2] / acceleration
@@ -167,9 +173,9 @@ def speed_up(
 
 
 def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Append a piece in which all joints brake evenly and stop at the same time.
+    """Append a piece in which all joints brake uniformly and stop at the same time.
 
-    The piece lasts 0 s if the case requires that the motion ends at rest.
+    The piece lasts 0 s if the case requires that the motion itself ends at rest.
     """
     end = jnp.sum(motion.durations)
     angles, rates = evaluate(motion, end), evaluate(motion, end, 1)
@@ -185,9 +191,10 @@ def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePol
 
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Return steps (P, K) that turn a joint by 1 rad from rest, with linear ramps of the rate.
+    """Return the steps (P, K) of P speed profiles, each of which turns a joint by 1 rad from rest.
 
-    The ramps last 1 to K / 2 pieces, or 1 to K pieces if the motion need not end at rest.
+    The rate rises linearly, is then constant and, if the motion ends at rest, falls linearly. The
+    ramps last 1 to K / 2 pieces, or 1 to K pieces if the motion need not end at rest.
     """
     knots = np.arange(1, pieces + 1)
     shapes = []

@@ -1,4 +1,4 @@
-"""The plan that a block planner returns."""
+"""Plans of the task `block`: the motion of the arm and the time of contact with the ball."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -14,16 +14,17 @@ from planner_jax.task.block.motion import polynomial
 
 @struct.dataclass
 class BlockPlan(ArmPlan):
-    """One plan, or a batch with a leading axis on every leaf.
+    """The plan of a block, or a batch of plans with a leading axis on every leaf.
 
-    The motion starts at the case's `delay`. If it must end at rest, the arm stays at its end.
+    The motion starts at the case's `delay`. If the motion must end at rest, the arm then stays in
+    the end pose and waits for the ball.
     """
 
-    contact_time: Array  # () [s], contact of shield and ball, since the ball was first seen
+    contact_time: Array  # () [s], of shield and ball; time 0 is the ball's first observation
 
 
 def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
-    """Return an unsolved plan in which the arm stands for a second."""
+    """Return the plan of a case without a solution: INFEASIBLE, the arm stands still for 1 s."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
     still = jnp.zeros((pieces, 6), case.angles.dtype)
     second = jnp.ones((), case.angles.dtype)
@@ -38,10 +39,10 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
 
 
 def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
-    """Return the status () int32 of a plan; of an unsolved plan the status that explains why.
+    """Return the status () int32 of a plan, replaced by the reason if the plan is not solved.
 
-    OUT_OF_REACH: the ball does not enter both boxes, or the shield reaches it nowhere. BLOCKED: the
-    arm touches something at the start.
+    The reason is OUT_OF_REACH if the ball does not enter both boxes, or the shield cannot reach it
+    between them; BLOCKED if the arm touches an obstacle at the start; else the status is unchanged.
     """
 
     def explain() -> Array:
@@ -50,5 +51,5 @@ def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
         is_reached = jnp.any(jnp.isfinite(poses.effort))
         return jnp.where(is_reached, why, Status.OUT_OF_REACH).astype(jnp.int32)
 
-    # `cond` skips the check of a single case that is solved.
+    # If only one case is planned, `cond` skips the check of obstacles when the case is solved.
     return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), explain)

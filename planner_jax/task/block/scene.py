@@ -1,6 +1,6 @@
-"""The box that an arm protects, and the obstacles [Natarajan2024, Sections IV-C and V-A].
+"""The box that the arm protects, and the obstacles [Natarajan2024, Sections IV-C and V-A].
 
-Robot base frame, z up, SI units.
+Positions are in the robot's base frame, z up, SI units.
 """
 
 import jax.numpy as jnp
@@ -12,17 +12,18 @@ from numpy.typing import ArrayLike
 from planner_jax.ball.flight import BallState, drag_free_fall_time
 from planner_jax.core.arithmetic import host_leaf
 
-INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], protected box
-OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], box in which a ball may be met
-POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m]
-FLOOR = -0.4826  # [m]
-RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], square of beams around the pedestal
-RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m]; the radius contains a beam of 0.025 x 0.076 m
+INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protected box
+OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
+POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m], x and y of a vertical pole, and its radius
+FLOOR = -0.4826  # [m], height of the floor
+RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half side and beam length of a square round the pedestal
+# [m], height of the beams, and radius of the capsule around a beam of 0.025 x 0.076 m.
+RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401
 
 
 @struct.dataclass
 class Box:
-    """A box whose edges are parallel to the axes."""
+    """A box whose edges are parallel to the axes of the robot's base frame."""
 
     lower: Array  # (3,) [m]
     upper: Array  # (3,) [m]
@@ -30,23 +31,23 @@ class Box:
 
 @struct.dataclass
 class Scene:
-    """Two boxes, which the paper calls domes, and obstacles."""
+    """Surroundings of the arm: two boxes, which the paper calls domes, and the obstacles."""
 
     inner: Box  # protected box
     outer: Box  # box in which the shield may meet a ball
-    pole: Array  # (2,) [m], axis of a vertical pole without ends
+    pole: Array  # (2,) [m], x and y of a vertical pole of infinite length
     pole_radius: Array  # () [m]
-    has_pole: Array  # () bool
-    floor: Array  # () [m], height
+    has_pole: Array  # () bool, whether the pole exists
+    floor: Array  # () [m], height of the floor
     beam_ends: Array  # (N, 2, 3) [m], ends of the axes of capsules around beams
     beam_radius: Array  # (N,) [m]
 
 
 def paper_scene(*, has_pole: bool = True) -> Scene:
-    """Return the scene of the paper's simulation [Natarajan2024, Fig. 5], NumPy float32 leaves.
+    """Return the scene of the simulations in [Natarajan2024, Fig. 5], with NumPy float32 leaves.
 
-    The sizes are from the model in the authors' repository. Its box around the camera is left out,
-    since the authors' own home pose reaches into it.
+    The sizes are from the model in the authors' repository. The model's box around the camera is
+    left out, since the arm touches this box in the authors' home pose.
     """
 
     def leaf(value: ArrayLike) -> Array:
@@ -75,13 +76,13 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
 
 
 def entry_time(box: Box, ball: BallState, gravity: Array) -> tuple[Array, Array]:
-    """Return the time at which a ball enters a box through a side or the top.
+    """Return the time at which a ball without drag enters a box through a side or the top.
 
-    The computation is by components, so that the compiled program of one ball has few loops.
+    The coordinates are processed one by one, so that the compiled program has few loops.
 
     Returns:
         time: () [s].
-        enters: () bool; false for a ball that starts inside, or comes through the bottom.
+        enters: () bool; false for a ball that misses the box, starts inside, or enters from below.
     """
     between = []
     for axis in range(2):

@@ -1,4 +1,4 @@
-"""Task specification of block for the registry; imports no JAX."""
+"""Registry entry of the task `block`: names of planners and suites. The module imports no JAX."""
 
 import dataclasses
 
@@ -7,14 +7,14 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """One kind of throw."""
+    """A family of random throws: distance of the thrower, and whether the pole exists."""
 
     description: str
-    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's axis to the launch
+    distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's first axis to the launch
     has_pole: bool = True
 
 
-# `planner_jax.task.block.suites` has all other ranges.
+# `planner_jax.task.block.suites` defines all ranges that are not fields of `Suite`.
 SUITES = {
     "pole": Suite("Throws from 6 to 12 m, a pole in front of the arm."),
     "open": Suite("Throws from 6 to 12 m, without a pole.", has_pole=False),

@@ -1,16 +1,17 @@
-"""Named, seeded suites of thrown balls.
+"""Named, seeded suites of thrown balls for the task `block`.
 
-The 200 throws of [Natarajan2024, Section V-A] start at 6 to 12 m and cross both boxes; the paper
-gives no other range. The ranges here and in `planner_jax.task.block.spec` belong to this library
-and to the suite's name: another range needs another name. All draws are uniform.
+The 200 throws of [Natarajan2024, Section V-A] start at 6 to 12 m and enter both boxes of the scene,
+the outer and the protected inner box. The paper states no other range. This library defines the
+ranges, here and in `planner_jax.task.block.spec`. The ranges of a suite never change; other ranges
+need another name. All distributions are uniform.
 
 | quantity | range |
 |---|---|
-| launch | -60 to 60 degrees about the x axis, at the suite's distance, -0.48 to 1 m high |
+| launch | azimuth -60 to 60 degrees from the x axis, the suite's distance, height -0.48 to 1 m |
 | aim | a point on a side +x, +y or -y of the inner box that faces the launch |
-| flight time to the aim | distance over 7 to 10 m/s |
+| flight time to the aim | distance divided by 7 to 10 m/s |
 
-A throw is repeated until the ball, of 0.05 m radius, enters the outer box through a side or the
+A throw is drawn again until the ball, of 0.05 m radius, enters the outer box through a side or the
 top, and then the inner box, without touching the pole. Robot base frame, z up, SI units.
 """
 
@@ -34,10 +35,10 @@ from planner_jax.task.block.spec import SUITES, TASK, Suite
 
 GRAVITY = 9.81  # [m/s^2]
 BALL_RADIUS = 0.05  # [m]
-AZIMUTH = np.deg2rad(60.0)  # [rad], greatest magnitude
-HEIGHT = (-0.48, 1.0)  # [m], of the launch
-SPEED = (7.0, 10.0)  # [m/s], distance over flight time
-_STEP = 0.002  # [s], between two samples of a flight
+AZIMUTH = np.deg2rad(60.0)  # [rad], greatest magnitude of the launch's azimuth from the x axis
+HEIGHT = (-0.48, 1.0)  # [m], range of the launch's height
+SPEED = (7.0, 10.0)  # [m/s], range of the horizontal distance divided by the flight time
+_STEP = 0.002  # [s], time between two samples of a flight that are checked
 
 
 def draw(
@@ -52,11 +53,11 @@ def draw(
     delay: float = 0.0,
     dtype: DTypeLike = jnp.float32,
 ) -> BlockCase:
-    """Draw a batch of throws in float64, cast to `dtype`.
+    """Draw a batch of cases with random throws in float64, and cast them to `dtype`.
 
-    The suite is "pole" (default), "open", "short", or a suite of another package. See `case` for
-    `regime`, `wide`, `anywhere` and `delay` [s], and `pj.hit.draw` for the other arguments and the
-    errors.
+    The suite is "pole" (default), "open", "short", or a suite of another package. See
+    `pj.block.case` for `regime`, `wide`, `anywhere` and `delay` [s], and `pj.hit.draw` for the
+    other arguments and the errors.
     """
     suite = suite_named(suite, "pole")
     if suite not in SUITES:
@@ -76,7 +77,7 @@ def draw(
 
 
 def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
-    """Draw until a throw is valid; return its launch position [m] and velocity [m/s], (2, 3)."""
+    """Draw throws until one is valid; return its launch position [m] and velocity [m/s], (2, 3)."""
     while True:
         azimuth, distance = random.uniform(-AZIMUTH, AZIMUTH), random.uniform(*suite.distance)
         pos = np.array(
@@ -96,7 +97,7 @@ def _draw_throw(suite: Suite, random: np.random.Generator) -> np.ndarray:
 
 
 def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -> bool:
-    """Return whether a ball that reaches the inner box after `duration` [s] makes a valid throw."""
+    """Return whether a throw of `duration` [s] keeps the conditions of the module's docstring."""
     times = np.linspace(0.0, duration, int(np.ceil(duration / _STEP)) + 1)[:-1]
     path = pos + vel * times[:, None]
     path[:, 2] -= 0.5 * GRAVITY * times**2
@@ -113,6 +114,6 @@ def _is_valid(suite: Suite, pos: np.ndarray, vel: np.ndarray, duration: float) -
     if not outer.any() or within(INNER_HALF, INNER_HEIGHT).any():
         return False
     entered = int(outer.argmax())
-    # The ball has to stay inside after its entry. If it came from below, the sample before the
-    # entry has a negative height.
+    # The ball has to stay in the outer box after its entry, and must not enter from below: the
+    # sample before the entry must have a positive height.
     return bool(outer[entered:].all()) and entered > 0 and path[entered - 1, 2] > 0.0

@@ -1,4 +1,4 @@
-"""Catches: a quadrotor catches one or more flying targets in a net [Yu2023catch]."""
+"""The task `catch`: a quadrotor catches one or more flying targets in a net [Yu2023catch]."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The functions `pj.catch.planner` and `pj.catch.judge`."""
+"""The public functions `planner` and `judge` of the task `pj.catch`."""
 
 import jax
 import numpy as np
@@ -16,7 +16,7 @@ from planner_jax.task.catch.case import CatchCase
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.spec import DECISIONS, TASK, TRAINED
 
-_HALF_STEP = 1e-4  # [s], of central differences
+_HALF_STEP = 1e-4  # [s], half the interval of the central differences that estimate velocities
 
 
 def planner(
@@ -27,31 +27,32 @@ def planner(
     recovery: str | None = None,
     **options: object,
 ) -> Planner[CatchCase, CatchPlan]:
-    """Make the catch planner of a name, with a decision on the order and times of catches.
+    """Make a planner of catches by its name, with a decision on the order and times of catches.
 
-    * `exact`: recommended; every plan has the balls in the net.
+    * `exact`: recommended; its unknowns are such that every plan has each ball within the net.
     * `catch`: the planner of [Yu2023catch], which moves the net to the balls by penalties.
-    * `mpp`: the baseline of [Yu2023catch], sampled motion primitives without optimisation.
+    * `mpp`: the baseline of [Yu2023catch]: sampled motion primitives without optimisation.
 
     Args:
-        name: one of these, or a planner of another package.
-        decide: "best" plans the most promising orders and selects the earliest last catch.
-            "greedy" catches next the target that it can reach first. "given" takes order and times
-            from the cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is your
-            own. Or a decision with settings, such as `Best(finalists=3)`.
+        name: one of these names, or the name of a planner of another package.
+        decide: how the order and first times of the catches are found. "best" plans the orders with
+            the best estimates and selects the plan with the earliest last catch. "greedy" always
+            catches next the target that can be caught first. "given" uses order and times in the
+            cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is a network of
+            yours. A decision with settings, such as `Best(finalists=3)`, is also accepted.
         recovery: as in `pj.hit.planner`.
         effort: as in `pj.hit.planner`.
         **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:
         A planner for `pj.plan`, whose field `planner` is an `ExactCatch`, `PaperCatch` or
-        `MppCatch`, or with a recovery a planner with such a field. Its plans contain the decided
-        order and times.
+        `MppCatch`. With a `recovery` this planner is the field `planner` of the result. Plans
+        contain the decided order and times.
 
     Raises:
-        ValueError: there is no planner or decision of that name, the planner has no such effort,
-            or a file cannot be read.
-        TypeError: the planner has no such field.
+        ValueError: no planner or decision has the requested name, the planner does not support the
+            effort, or a file cannot be read.
+        TypeError: the planner's dataclass has no field of the name of an option.
     """
     decision = find_decision(DECISIONS, decide, TRAINED)
     own = TASK.make_planner(name, options).with_effort(effort)
@@ -64,13 +65,13 @@ def planner(
 
 
 def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdict:
-    """Judge one plan, or a batch of plans, by physics independent of the planners.
+    """Judge one plan, or a batch of plans, by physics that is independent of the planners.
 
     The referee computes positions of targets of the library's classes itself. For other classes it
     calls their method `at` in float64 and takes velocities by central differences over 2e-4 s.
     Arguments, result and errors are as in `pj.hit.judge`, with the settings of `referee_catches`.
     """
-    known = (BallPath, HarmonicPath, PathTable)  # classes that the referee computes itself
+    known = (BallPath, HarmonicPath, PathTable)  # classes of targets that the referee computes
     if isinstance(cases, CatchCase) and type(cases.targets) not in known:
         settings = {"target_states": _states_by_class, **settings}
     return judge_by(referee_catches, cases, plans, (CatchCase, CatchPlan), settings)
@@ -79,7 +80,7 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
 def _states_by_class(
     targets: TargetPath, order: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of the targets `order` at `times`, both (B, N)."""
+    """Return positions and velocities (B, N, 3) of the targets `order` (B, N) at `times` (B, N)."""
     lanes = np.arange(len(order))[:, None]
     with jax.enable_x64(True):
         ordered = jax.tree.map(lambda leaf: _double(leaf)[lanes, order], targets)

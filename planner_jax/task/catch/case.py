@@ -1,4 +1,4 @@
-"""One catch to plan: up to N targets, the quadrotor, its net and its limits."""
+"""Cases of the task `catch`: up to N flying targets, the quadrotor, its net and its limits."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ def _is_ahead(horizon: Numbers, case: PyTree) -> Numbers:
     return (horizon > 0.0) | ~case.present
 
 
-# Shapes and rules of the numbers of a case.
+# Shapes and ranges that `pj.require_sound` checks for the arrays of a `CatchCase`.
 RULES: Table = (
     Field("present", ("N",), kind=np.bool_),
     Field("horizon", ("N",), Rule("> 0 of a target that is present", _is_ahead)),
@@ -67,28 +67,29 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class Net:
-    """A hoop above the propellers, normal to the thrust [Yu2023catch, eqs 22 and 25]."""
+    """A net in a hoop above the propellers, normal to the thrust [Yu2023catch, eqs 22 and 25]."""
 
-    height: Array  # () l [m], of the hoop's centre above the propeller plane
-    radius: Array  # () [m]
-    # () theta_safe [rad], between the net's axis and the reversed velocity of the ball
+    height: Array  # () l [m], height of the hoop's centre above the propeller plane
+    radius: Array  # () [m], of the hoop
+    # () theta_safe [rad], greatest angle between the net's axis and the ball's reversed velocity
     max_angle: Array
 
 
 @struct.dataclass
 class CatchChoice:
-    """A decision's choice for one case, or for a batch."""
+    """Which targets of a case to catch, in which order and about when; or a batch of choices."""
 
-    order: Array  # (N,) int32, permutation: the caught targets in their order, then the others
-    times: Array  # (N,) [s], rising, of catches in that order, before the optimisation
-    taken: Array  # (N,) bool, whether to catch each target, in the order of the case
+    order: Array  # (N,) int32, permutation: targets to catch in their order, then the others
+    times: Array  # (N,) [s], ascending, first guess of the times of catches in that order
+    taken: Array  # (N,) bool, whether to catch each target; indices as in the case
 
 
 @struct.dataclass
 class CatchCase:
-    """One catch to plan, or a batch of catches. Every number is a leaf of the pytree.
+    """One case, or a batch: a quadrotor has to catch up to N flying targets in its net.
 
-    Time 0 is when planning starts. A decision sets `order` and `times`.
+    Every number is a leaf of the pytree. Time 0 is when planning starts. Before a case is planned,
+    a decision sets `order` and `times`.
     """
 
     rules: ClassVar[Table] = RULES
@@ -97,7 +98,7 @@ class CatchCase:
     present: Array  # (N,) bool, whether each target exists; absent targets fill up the shape
     horizon: Array  # (N,) [s], latest time at which each target may be caught
     order: Array  # (N,) int32, permutation: indices of the targets in the order of catching
-    times: Array  # (N,) [s], first guess of the times of catches in that order, rising
+    times: Array  # (N,) [s], ascending, first guess of the times of catches in that order
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
     gravity: Array  # () [m/s^2], magnitude
     net: Net
@@ -108,16 +109,16 @@ class CatchCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return np.shape(self.gravity)
 
     @property
     def num_targets(self) -> int:
-        """N, the number of targets, present or absent."""
+        """Number N of targets, including absent targets, which only pad the arrays."""
         return np.shape(self.present)[-1]
 
     def with_choice(self, choice: CatchChoice) -> "CatchCase":
-        """Return the case, or the batch, with the order, times and targets of a choice."""
+        """Return the case with a choice's order and times; targets not to catch become absent."""
         present = self.present & choice.taken
         return dataclasses.replace(self, order=choice.order, times=choice.times, present=present)
 
@@ -142,21 +143,22 @@ def case(
     optional: bool = False,
     dtype=jnp.float32,
 ) -> CatchCase:
-    """Make a catch, or a batch of catches, by default for the robot of [Yu2023catch].
+    """Make one case with N targets to catch, or a batch, by default for the robot of [Yu2023catch].
 
-    The paper gives no limits. The defaults are |v| <= 5 m/s, |omega| <= 5 rad/s, thrust from 0.3 g
-    to 2.5 g, height >= 0.25 m and theta_safe = 30 degrees. Until a decision sets them, `order` is
-    0, 1, ..., N - 1 and the times are equally spaced up to the first horizon.
+    The paper states no limits of the robot. The defaults are |v| <= 5 m/s, |omega| <= 5 rad/s,
+    thrust from 0.3 g to 2.5 g, height >= 0.25 m and theta_safe = 30 degrees. `order` is
+    0, 1, ..., N - 1, and `times` are equally spaced up to the first target's horizon; the decision
+    of the planner replaces both.
 
-    Further arguments and the errors are as in `pj.hit.case`.
+    The arguments that are not in this list, and the errors, are as in `pj.hit.case`.
 
-    * `targets`: path pytree whose leaves have leading axes (..., N).
+    * `targets`: paths of the targets, such as a `BallPath`; leaves have leading axes (..., N).
     * `horizon`: (..., N) [s], latest time at which each target may be caught.
     * `present`: (..., N) bool, whether each target exists.
-    * `robot`: quadrotor with a net. Arguments that are None take the robot's numbers.
+    * `robot`: quadrotor with a net. It supplies the numbers of arguments that are None.
     * `net_height`, `net_radius`: height l above the propeller plane and radius of the net [m].
-    * `max_angle`: theta_safe [rad].
-    * `optional`: whether targets may be left out; the number of caught ones is then maximised.
+    * `max_angle`: theta_safe [rad], greatest angle between net's axis and ball's reversed velocity.
+    * `optional`: whether targets may be left out. The number of caught targets is then maximised.
     """
     dtype, shape = floating(dtype), shape_of("horizon", horizon)
     if not shape or not shape[-1]:
@@ -202,7 +204,7 @@ def case(
 
 
 def _broadcast_present(present: ArrayLike, shape: tuple[int, ...]) -> Array:
-    """Return the argument `present` in the shape (..., N) of the horizon."""
+    """Check the argument `present` of `case`, and broadcast it to the shape (..., N)."""
     array = np.asarray(present)
     if array.dtype != np.bool_:
         raise ArgumentTypeError("present", "True or False of each target", present)

@@ -1,4 +1,4 @@
-"""Functions that all catch planners share: ordered targets, the net's axis, a bound on reach."""
+"""Functions of all catch planners: order the targets, orient the net, and bound the reach."""
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,11 @@ from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath, state_at
 from planner_jax.robot.quadrotor import beyond_reach, greatest_speed
 from planner_jax.task.catch.case import CatchCase
 
-_RESTING = 1e-3  # [m/s], added upwards: much slower targets have no direction
-_TIMES = 32  # times up to the horizon at which the bound on the reach is evaluated
-_SLACK = 0.02  # [m], far more than the contact error that the referee accepts
+# [m/s], added to the upward component of the reversed velocity of a target, so that the net is
+# upright for a target at rest.
+_RESTING = 1e-3
+_TIMES = 32  # number of times up to the horizon at which `is_too_far` evaluates its bound
+_SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of catches that the referee accepts
 
 
 @struct.dataclass
@@ -21,14 +23,14 @@ class CatchContext:
     """One case with its targets in the order of catching."""
 
     case: CatchCase
-    targets: TargetPath  # the path pytree, leaves (N, ...)
+    targets: TargetPath  # paths of the targets, leaves (N, ...)
     active: Array  # (N,) bool, False for absent targets
-    horizon: Array  # (N,) [s]
-    times: Array  # (N,) [s], first guess
+    horizon: Array  # (N,) [s], latest time of each catch
+    times: Array  # (N,) [s], first guess of the time of each catch
 
 
 def order_targets(case: CatchCase) -> CatchContext:
-    """Return a case with its targets in the order of catching."""
+    """Sort the targets of a case by `case.order`, the order in which they are caught."""
     return CatchContext(
         case=case,
         targets=jax.tree.map(lambda leaf: leaf[case.order], case.targets),
@@ -39,12 +41,15 @@ def order_targets(case: CatchCase) -> CatchContext:
 
 
 def targets_at(targets: TargetPath, times: Array) -> BallState:
-    """Return the states of N targets, each at its own time (N,), leaves (N, 3)."""
+    """Return positions and velocities (N, 3) of N targets, each at its own time (N,) [s]."""
     return jax.vmap(state_at)(targets, times)
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) between unit axes of the net and -vel (N, 3), and which targets move."""
+    """Return cosines (N,) of the angles between the net's axis and the reversed velocities (N, 3).
+
+    Also return whether each target moves, (N,) bool; for others the cosine has no meaning.
+    """
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
@@ -52,16 +57,17 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 
 
 def nearest_upright(vel: Array, lean: Array) -> Array:
-    """Return the axes (N, 3) nearest to upright at an angle of at most `lean` from -vel (N, 3).
+    """Return the axes (N, 3) of the net that are nearest to upright and still face the targets.
 
-    Targets that rise are taken to fly level. For targets at rest the axis is upright. The lean
-    () [rad] is from 0 to pi / 2.
+    An axis faces a target if its angle from the reversed velocity -vel (N, 3) is at most `lean`
+    () [rad], from 0 to pi / 2. Targets that rise are treated as if they flew level. For targets at
+    rest the axis is upright.
     """
     back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0) + _RESTING], axis=1)
     back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))
     level = jnp.sqrt(jnp.maximum(jnp.sum(back[:, :2] ** 2, axis=1, keepdims=True), 1e-6))
     cosine, sine, rise = jnp.cos(lean), jnp.sin(lean), back[:, 2:]
-    # The direction back along the target's path, turned by the lean towards upright.
+    # The reversed direction of flight, rotated by the angle `lean` towards the vertical.
     turned = jnp.concatenate(
         [(cosine - sine * rise / level) * back[:, :2], cosine * rise + sine * level], axis=1
     )
@@ -69,14 +75,15 @@ def nearest_upright(vel: Array, lean: Array) -> Array:
 
 
 def is_too_far(context: CatchContext) -> Array:
-    """Return whether a bound proves that the quadrotor cannot reach some target, () bool.
+    """Return true only if the quadrotor provably cannot catch some target at any time, () bool.
 
-    At a catch the quadrotor is within height plus radius of the net from the target, and above its
-    least height. The bound is evaluated at `_TIMES` times. A catch is within half a step of one of
-    them, so the bound adds the distances that target and quadrotor move in half a step.
+    At a catch the quadrotor's distance from the target is at most height plus radius of the net,
+    and the quadrotor is above its least height. These conditions are tested at `_TIMES` times. A
+    catch is within half a step of such a time, so the distances that target and quadrotor can move
+    in half a step are added.
 
-    False proves nothing. The result is false for optional targets, for targets that are neither
-    `BallPath` nor `HarmonicPath`, and where a number is not finite.
+    The result false means that catches may or may not exist. It is false for optional targets, for
+    targets that are neither `BallPath` nor `HarmonicPath`, and if a number is not finite.
     """
     case, targets = context.case, context.targets
     if case.optional or not isinstance(targets, BallPath | HarmonicPath):
@@ -99,7 +106,7 @@ def is_too_far(context: CatchContext) -> Array:
 
 
 def _greatest_acceleration(target: BallPath | HarmonicPath, horizon: Array) -> Array:
-    """Return a bound () [m/s^2] on a target's acceleration up to its horizon () [s]."""
+    """Return an upper bound () [m/s^2] on a target's acceleration up to its horizon () [s]."""
     if isinstance(target, HarmonicPath):
         return jnp.sqrt(jnp.sum(target.amplitude**2)) * target.rate**2
     fastest = jnp.sqrt(jnp.sum(target.ball.vel**2)) + target.gravity * horizon

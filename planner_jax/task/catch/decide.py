@@ -1,7 +1,7 @@
-"""Decisions on the order and the times of catches, by the rough estimate in `estimate`.
+"""Decisions on the order and the times of catches, by the estimate of the module `estimate`.
 
-If targets are optional, a decision also chooses which to catch. Every order is then proposed in
-several lengths, and the plan that catches most targets is selected.
+If targets are optional, a decision also selects which targets to catch. Every order is then also
+proposed with fewer catches, and the plan that catches most targets is selected.
 """
 
 import dataclasses
@@ -22,18 +22,18 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.estimate import Timetable, timetable
 from planner_jax.task.catch.plan import CatchPlan
 
-LENGTHS = 3  # proposals for each order of optional targets
+LENGTHS = 3  # number of proposals for each order of optional targets, by number of catches
 MOST_PERMUTED = 6  # greatest number of targets for which all orders are estimated
 MOST_SEARCHED = 100  # greatest number of targets for the beam search
-_WORD = 24  # bits in each integer of the set of taken targets
+_WORD = 24  # number of targets in each integer of the bit set of caught targets
 
 
 def closest_approach(cases: CatchCase) -> Array:
-    """Return the least distance (N,) or (B, N) [m] between each target and the net's reach.
+    """Return by how much the net misses each target at least, (N,) or (B, N) [m].
 
-    It is a lower bound, and zero where a target may be within reach. The quadrotor is taken to fly
-    at its greatest speed in any direction, above its least height. The bound is evaluated at 64
-    times up to the horizon.
+    The result is a lower bound over all motions and times; zero means that the target may be within
+    reach. The quadrotor is assumed to fly at its greatest speed in any direction, above its least
+    height. The bound is evaluated at 64 times up to the target's horizon.
     """
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
@@ -42,7 +42,7 @@ def _closest_approach(case: CatchCase) -> Array:
     net, limits = case.net, case.limits
     times, states, speed = estimate.sample_targets(case)
     distance = estimate.length(states.pos - case.head_state[0][None, :, None])
-    # Target and quadrotor move between two of the times.
+    # `slack` includes the distance that target and quadrotor can move between two of the times.
     step = case.horizon[:, None] / estimate.GRID
     slack = net.height + net.radius + (speed + limits.speed) * step
     far = distance - limits.speed * times - slack
@@ -55,10 +55,10 @@ _closest_approaches = jax.jit(jax.vmap(_closest_approach))
 
 
 def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
-    """Return choices (K, N) unchanged, or (K * LENGTHS, N) for optional targets.
+    """Return choices (K, N) unchanged, or choices (K * LENGTHS, N) if targets are optional.
 
-    Each choice is then also proposed without its last catch, without its last two and so on,
-    because the estimate is least certain for the last catches.
+    Each choice is then also proposed without its last catch, without its last two catches and so
+    on, because the estimate is least certain for the last catches.
     """
     if not case.optional:
         return choices
@@ -76,22 +76,26 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 @struct.dataclass
 class _Partial:
-    """W partial orders in a beam search."""
+    """State of a beam search: W sequences of catches, each of the same length so far.
 
-    rank: Array  # (W,) [s], infinite in empty rows
+    The shortfall of a catch is the distance [m] by which the quadrotor is estimated to miss.
+    """
+
+    rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
     short: Array  # (W,) [m], sum of the shortfalls
     time: Array  # (W,) [s], of the last catch
-    place: Array  # (W, 3) [m], of the quadrotor at the last catch
-    position: Array  # (W, N), of each target in the order; N for targets that are not in it
-    times: Array  # (W, N) [s], of each target
+    place: Array  # (W, 3) [m], position of the quadrotor at the last catch
+    position: Array  # (W, N) int32, index of each target in the sequence; N if it is not in it
+    times: Array  # (W, N) [s], of the catch of each target in the sequence
 
 
 def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
-    """Return the best orders of one case: with the most targets, then the earliest; leaves (W, N).
+    """Search for the orders of one case that catch most targets, earliest; leaves (W, N).
 
-    After each catch the W best partial orders continue, of those with the same set of targets and
-    the same last target only the best. The search may miss the best order. Where fewer than W
-    orders are found, the first one is repeated.
+    It is a beam search of width W. After each catch the W sequences of catches with the best ranks
+    continue. Among sequences with the same set of targets and the same last target only the best
+    continues. The search may miss the best order. If fewer than W orders are found, the first order
+    is repeated.
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -100,8 +104,8 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     if num > MOST_SEARCHED:
         raise ArgumentError("targets", f"at most {MOST_SEARCHED} of a case", num)
     from_all = jax.vmap(estimate.arrivals, (None, 0, 0, None))
-    # The set of taken targets as bits of a few integers. The last integer, of 32 bits, also has
-    # room for the index of the last target.
+    # The set of caught targets is stored as bits of a few 32-bit integers. The last integer also
+    # holds the index of the last target.
     words = np.arange(0, num, _WORD)
     place = np.arange(num) - words[:, None]
     inside = (place >= 0) & (place < _WORD)
@@ -153,7 +157,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the choice for positions in the order and times of the targets (N,)."""
+    """Return the choice with N targets at positions (N,) of the sequence, at times (N,) [s]."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -166,7 +170,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
     """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
 
-    T_p are the decided times of the catches, T_o the optimised ones.
+    T_p are the decided times of the catches, T_o the times in the optimised plans.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)
@@ -177,21 +181,21 @@ def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
 
 
 class CatchDecision:
-    """Base class of decisions about catches."""
+    """Base class of decisions on the order and times of catches."""
 
     def check(self, cases: CatchCase) -> None:
-        """Accept any batch."""
+        """Accept every batch of cases; a subclass may raise an error for unsupported cases."""
 
     def rank(self, plans: CatchPlan) -> Array:
-        """Return the time of the last catch of each plan [s], plus 100 s for each target left."""
+        """Return each plan's rank, the least is best: last catch [s] plus 100 s a missed target."""
         left = plans.times.shape[-1] - plans.num_taken
         dtype = plans.times.dtype if isinstance(left, jax.Array) else np.float64
         return plans.times[..., -1] + 100.0 * left.astype(dtype)
 
     def explain(self, case: CatchCase, status: Array) -> Array:
-        """Return OUT_OF_REACH for unsolved cases with a target that `closest_approach` rules out.
+        """Return OUT_OF_REACH if a case is unsolved and a target is provably out of reach.
 
-        Other statuses are returned unchanged.
+        `closest_approach` gives the proof. Every other status is returned unchanged.
         """
         away = jnp.max(_closest_approach(case)) > 0.0
         unsolved = is_unsolved(status) | (status == Status.OUT_OF_TIME)
@@ -201,15 +205,16 @@ class CatchDecision:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(CatchDecision):
-    """Plans the orders with the best estimates; the plan with the earliest last catch is selected.
+    """Decision that proposes the orders with the best estimates; all of them are then planned.
 
-    The finalists are the orders of least time of the last catch plus 10 s for each metre of
-    shortfall. All N! orders of up to six targets are estimated. For more targets (at most 100), and
-    for optional ones, a beam search finds the orders, which may miss the best one.
+    The estimate of an order is the time of its last catch plus 10 s for each metre of shortfall,
+    the distance by which the quadrotor would miss its targets. All N! orders of up to six targets
+    are estimated. For more targets (at most 100), and for optional targets, a beam search finds the
+    orders and may miss the best order. The plan with the earliest last catch is selected.
     """
 
-    finalists: int = 6  # orders that are planned
-    width: int = 64  # of the beam search
+    finalists: int = 6  # number of orders that are planned
+    width: int = 64  # number of partial orders that the beam search continues
 
     def __post_init__(self) -> None:
         require_settings(self)
@@ -217,7 +222,7 @@ class Best(CatchDecision):
             raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the finalists of one case, leaves (F, N)."""
+        """Return the F orders of one case with the best estimates, best first, leaves (F, N)."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)
@@ -232,25 +237,25 @@ class Best(CatchDecision):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Greedy(CatchDecision):
-    """Catches next the target that can be caught earliest."""
+    """Decision that always catches next the target with the earliest estimated catch."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return one choice for one case, leaves (1, N); LENGTHS choices for optional targets."""
+        """Return the greedy order of one case, leaves (1, N); LENGTHS of them if optional."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
 
     def _handicap(self, case: CatchCase, table: Timetable) -> Array:
-        """Return times (N,) [s] that are added to the targets' times in comparisons."""
+        """Return times (N,) [s] that are added to the targets' times before they are compared."""
         return jnp.zeros_like(case.horizon)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Random(Greedy):
-    """Catches next a random target; equal cases have equal choices."""
+    """Decision that always catches next a random target, the same target for equal cases."""
 
-    seed: int = 0
+    seed: int = 0  # seed of the random numbers
 
     def _handicap(self, case: CatchCase, table: Timetable) -> Array:
         own = lax.bitcast_convert_type(jnp.sum(table.places).astype(jnp.float32), jnp.uint32)
@@ -261,12 +266,12 @@ class Random(Greedy):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Given(CatchDecision):
-    """Takes order and times from the cases."""
+    """Decision that uses the order and the times that are stored in each case."""
 
     def check(self, cases: CatchCase) -> None:
-        """Raise `ValueError` unless every order is a permutation."""
+        """Raise `ValueError` unless the order in every case is a permutation of its targets."""
         require_orders(cases.order)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return one choice for one case, leaves (1, N)."""
+        """Return the order and times stored in one case as the only proposal, leaves (1, N)."""
         return CatchChoice(order=case.order[None], times=case.times[None], taken=case.present[None])

@@ -1,8 +1,8 @@
-"""A rough estimate of when the quadrotor can catch targets, to rank orders and to guess times.
+"""Estimates of when the quadrotor can catch targets, for decisions on the order of catches.
 
-The quadrotor is modelled as a point with constant acceleration up to its greatest speed. A target
-can be caught where it is high enough and does not rise too steeply. The planner later optimises the
-times together with the trajectory.
+The quadrotor is modelled as a point that accelerates at a constant rate up to its greatest speed. A
+target can be caught where it is high enough and does not rise too steeply. The estimated times are
+first guesses, which the planner optimises together with the trajectory.
 """
 
 import functools
@@ -19,27 +19,29 @@ from planner_jax.lanes import over_lanes
 from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.context import targets_at
 
-GRID = 64  # times at which every target is sampled
+GRID = 64  # number of times up to its horizon at which every target is sampled
 INSTANT = 0.05  # [s], least time between two catches
-_ACCELERATION = 7.0  # [m/s^2], of the point
-_TURNING = 0.2  # [s], before the point starts to move
+_ACCELERATION = 7.0  # [m/s^2], of the point that models the quadrotor
+_TURNING = 0.2  # [s], time to tilt before the point starts to move
 _STEEPEST = 0.2  # greatest sine of a target's angle of ascent at a catch
-_MARGIN = 0.8  # [m], greatest shortfall of an optional target that is tried: plans reach farther
+# [m], greatest shortfall of an optional target that is tried. It is positive, because plans reach
+# farther than the estimate.
+_MARGIN = 0.8
 
 
 @struct.dataclass
 class Timetable:
-    """Possible catches of one target; of N targets, leaves have a leading axis N."""
+    """Possible catches of one target at K times; for N targets, leaves have a leading axis N."""
 
-    times: Array  # (K,) [s]
-    places: Array  # (3, K) [m], positions of the quadrotor
+    times: Array  # (K,) [s], of the catches
+    places: Array  # (3, K) [m], positions of the quadrotor at the catches
     penalty: Array  # (K,) [m], positive where the target is too low or rises too steeply
 
 
 def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Return times (N, K) up to the horizon, and states (N, 3, K) and speeds (N, K) of the targets.
+    """Return K times (N, K) [s] up to the horizons of N targets, and states and speeds then.
 
-    Times are the last axis because CPUs vectorise along it.
+    The states are (N, 3, K), with the times on the last axis, because CPUs vectorise along it.
     """
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares[None]
@@ -49,14 +51,14 @@ def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
 
 
 def timetable(case: CatchCase) -> Timetable:
-    """Return the possible catches of the N targets of one case."""
+    """Return the possible catches of the N targets of one case, at K times for each target."""
     times, states, speed = sample_targets(case)
     places, penalty = _to_catch(case, states, speed)
     return Timetable(times=times, places=places, penalty=penalty)
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Return positions (N, 3, K) of the quadrotor at catches of N targets, and penalties (N, K)."""
+    """Return where the quadrotor catches N targets, (N, 3, K), and `Timetable.penalty` (N, K)."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)
@@ -65,7 +67,7 @@ def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, 
 
 
 def length(vectors: Array) -> Array:
-    """Return lengths (..., K) of vectors (..., 3, K), at least 1e-6."""
+    """Return the Euclidean norms (..., K) of vectors (..., 3, K), but at least 1e-6."""
     x, y, z = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 2, :]
     return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, 1e-12))
 
@@ -75,8 +77,9 @@ def arrival(
 ) -> tuple[Array, Array, Array]:
     """Return time () [s], position (3,) [m] and shortfall () [m] of a target's earliest catch.
 
-    The shortfall is the missing distance plus the penalty, and 0 where the catch is possible. The
-    quadrotor leaves `place` (3,) [m] at `begin` () [s] with greatest speed `speed` () [m/s].
+    The quadrotor leaves the position `place` (3,) [m] at `begin` () [s]; `speed` () [m/s] is its
+    greatest speed. The shortfall is 0 if a catch is possible, and else the distance that the
+    quadrotor lacks plus the penalty, at the time at which this sum is least.
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
@@ -86,11 +89,11 @@ def arrival(
     return times[first], places[:, first], short[first]
 
 
-arrivals = jax.vmap(arrival, (0, None, None, None))  # of N targets
+arrivals = jax.vmap(arrival, (0, None, None, None))  # the same for N targets
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return the distance (..., K) [m] that is missing to offsets (..., 3, K) after spans [s]."""
+    """Return by how much (..., K) [m] the point misses `offset` (..., 3, K) [m] in `span` [s]."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
@@ -98,9 +101,9 @@ def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """Return the sum () [m] of the shortfalls of a choice.
+    """Return the sum () [m] of the shortfalls of a choice at its times; see `arrival`.
 
-    Absent targets do not count. Optional targets count with the part that exceeds `_MARGIN`.
+    Absent targets do not count. Shortfalls of optional targets are reduced by `_MARGIN`.
     """
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
@@ -114,9 +117,9 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
 
 
 def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice, Array]:
-    """Return one order (N,) with its earliest times, and the sum () [m] of the shortfalls.
+    """Return an order (N,) with its earliest times of catches, and the sum () [m] of shortfalls.
 
-    Absent targets are moved to the end of the order.
+    Absent targets are moved to the end of the order. See `arrival` for the shortfall.
     """
     order = order[jnp.argsort(~case.present[order], stable=True)]
 
@@ -133,10 +136,10 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
 
 
 def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
-    """Return the choice in which the next target is always the one with the earliest catch.
+    """Return the order in which the next target is always the target with the earliest catch.
 
-    A handicap (N,) [s] of each target is added to its time for the comparison. Optional targets out
-    of reach are left. They and absent targets come last.
+    Before the times are compared, a handicap (N,) [s] is added to each target's time. Optional
+    targets that are out of reach are not caught; they and absent targets come last.
     """
     speed = top_speed(case)
 
@@ -156,23 +159,23 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
 
 
 def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
-    """Return times [s] for a ranking of catches, 10 s later for each metre of shortfall."""
+    """Return the ranks of catches, time plus 10 s for each metre of shortfall; least is best."""
     return times + 10.0 * shortfalls
 
 
 def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
-    """Return which targets (N,) with shortfalls (N,) [m] may be caught next."""
+    """Return which targets may be caught next, (N,) bool, by their shortfalls (N,) [m]."""
     return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
 
 
 def top_speed(case: CatchCase) -> Array:
-    """Return the greatest speed () [m/s] of the point."""
+    """Return the greatest speed () [m/s] of the point: 0.9 times the quadrotor's limit."""
     return 0.9 * case.limits.speed
 
 
 def _leave_from(
     taken: Array, begin: Array, place: Array, time: Array, there: Array
 ) -> tuple[Array, Array]:
-    """Return when () [s] and where (3,) the quadrotor continues after a target, taken or not."""
+    """Return when () [s] and where (3,) the quadrotor leaves after it catches or skips a target."""
     soonest = begin + INSTANT
     return jnp.where(taken, jnp.maximum(time, soonest), soonest), jnp.where(taken, there, place)

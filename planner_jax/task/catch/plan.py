@@ -1,4 +1,4 @@
-"""Plans of catches."""
+"""Plans of catches: the quadrotor's trajectory, and the order and times of the catches."""
 
 import jax.numpy as jnp
 from flax import struct
@@ -10,15 +10,15 @@ from planner_jax.task.catch.case import CatchChoice
 
 @struct.dataclass
 class CatchPlan(QuadrotorPlan):
-    """One plan, or a batch with a leading axis on every leaf.
+    """The plan of up to N catches, or a batch of plans with a leading axis on every leaf.
 
     The trajectory has M pieces to each of N catches. If fewer than N targets are caught, the last
-    pieces have no duration and stay at the position of the last catch.
+    pieces have zero duration and stay at the position of the last catch.
     """
 
     order: Array  # (N,) int32, indices of the targets in the order of catching
     decided_times: Array  # (N,) [s], of the catches in that order, before the optimisation
-    times: Array  # (N,) [s], of the catches in that order; repeated where there is no catch
+    times: Array  # (N,) [s], of the catches in that order; a time is repeated if nothing is caught
 
     @property
     def num_taken(self) -> Array:
@@ -27,13 +27,13 @@ class CatchPlan(QuadrotorPlan):
 
     @property
     def _is_catch(self) -> Array:
-        """Which entries of `order` are caught, (..., N) bool."""
+        """Whether the target at each position of `order` is caught, (..., N) bool."""
         times = jnp.asarray(self.times)
         return jnp.diff(times, prepend=jnp.zeros_like(times[..., :1]), axis=-1) > 0.0
 
     @property
     def choice(self) -> CatchChoice:
-        """Order, decided times, and which targets are caught."""
+        """Order, decided times, and which targets are caught, for `CatchCase.with_choice`."""
         order = jnp.asarray(self.order)
         taken = jnp.take_along_axis(self._is_catch, jnp.argsort(order, axis=-1), axis=-1)
         return CatchChoice(order=self.order, times=self.decided_times, taken=taken)

@@ -1,4 +1,4 @@
-"""Specification of the task of catches for the registry; imports no JAX."""
+"""Registry entry of the task `catch`: names of planners and suites. The module imports no JAX."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """Properties of one suite."""
+    """A family of random catch cases: number of targets, and the latest time of a catch."""
 
     num_targets: int
     horizon: float  # [s], latest time at which a target of the suite may be caught

@@ -3,12 +3,12 @@
 The paper names its cases (Sections VII-A and VII-B, Table III) without the ranges from which it
 draws them. The ranges below are chosen such that no case is easier than the paper reports.
 
-All quantities are uniform. World frame, z up, SI units. At time 0 the quadrotor is in hover at
-(0, 0, 1).
+All quantities are uniformly distributed. World frame, z up, SI units. At time 0 the quadrotor
+hovers at (0, 0, 1).
 
-Throws: a ball leaves a machine at (4, 0, 0.8) and lands in a rectangle around the origin. Landing
-point and flight time determine its velocity. It may be caught until it falls through 0.45 m, the
-height of the net of an upright quadrotor at its least height of 0.25 m.
+Throws: a machine at (4, 0, 0.8) throws a ball, which lands in a rectangle around the origin.
+Landing point and flight time determine the ball's velocity. The ball may be caught until it falls
+below 0.45 m. This is the height of the net if an upright quadrotor is at its least height, 0.25 m.
 
 | suite | drag [1/s] | landing [m x m] | flight [s] | launch before time 0 [s] |
 |---|---|---|---|---|
@@ -18,11 +18,13 @@ height of the net of an upright quadrotor at its least height of 0.25 m.
 | parabola2, ball 1 | 0 | 2 x 0.8 | 1.4 to 1.6 | 0.3 |
 | parabola2, ball 2 | 0 | 2 x 0.8 | 1.7 to 2 | 0 |
 
-With drag, a flight of 1.78 s has its apex at 4.2 m, the height of the paper's hall; the paper
-allows 1.9 s. The shortest flight has its apex at 2.7 m; the paper first detects balls above 2.8 m.
-At most 1.48 s are left for a catch, in the paper 1.6 s. Without drag the paper allows any height.
+With drag, the longest flight, 1.78 s, has its apex at 4.2 m, the height of the paper's hall; the
+paper allows 1.9 s. The shortest flight has its apex at 2.7 m; the paper first detects balls above
+2.8 m. From time 0, at most 1.48 s remain for a catch, and 1.6 s in the paper. For balls without
+drag the paper allows any height.
 
-Other targets come near the vertical axis through the origin and stay within a cylinder around it.
+All other targets pass near the vertical axis through the origin and stay within a cylinder around
+this axis until their horizon, the latest time of a catch. The radius of the cylinder is given.
 
 | suite | horizontal speed [m/s] | height [m] | horizon [s] | radius [m] |
 |---|---|---|---|---|
@@ -39,22 +41,23 @@ Other targets come near the vertical axis through the origin and stay within a c
   centre, all with the same velocity. The centre is within 0.5 m of the axis in x and in y after 4
   to 6 s.
 
-These polygons fly horizontally. The net must then lean by at least 60 degrees, 90 degrees less
-theta_safe, at every catch.
+The targets of triangles and polygons fly horizontally. At every catch the net must therefore lean
+by at least 90 degrees less theta_safe, that is 60 degrees.
 
-Rushes: targets of `triangle3` and `hexagon6` with different horizons. In a random order, the first
-horizon is `first`, and each further one is `after` later. A uniform number from -spread / 2 to
-spread / 2 is added to each. The target that can be caught first is often not the most urgent one.
+Rushes: targets of `triangle3` and `hexagon6` with different horizons. The targets are put into a
+random order. The first horizon is `first`, and each following horizon is `after` later. A uniform
+random number from -spread / 2 to spread / 2 is added to every horizon. The target that can be
+caught first is often not the most urgent target.
 
 | suite | targets of | first [s] | after [s] | spread [s] |
 |---|---|---|---|---|
 | rush3 | triangle3 | 2.35 | 0.9 | 0.5 |
 | rush6 | hexagon6 | 3.8 | 0.9 | 0.6 |
 
-Swarms (`swarm8`, `swarm12`): balls that sink at constant speed, more than can be caught. They are
-optional, and the score is the number of caught balls. Each starts within 6 m of the axis at a
-height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts at up to 0.3 m/s, and may be caught until it falls
-through 0.45 m.
+Swarms (`swarm8`, `swarm12`): balls that sink at constant speed, more than can be caught. A plan may
+leave balls out, and the score is the number of caught balls. Each ball starts within 6 m of the
+axis at a height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts horizontally at up to 0.3 m/s, and may
+be caught until it falls below 0.45 m.
 """
 
 import dataclasses
@@ -85,13 +88,13 @@ from planner_jax.task.quadrotor import require_own_robot
 
 LAUNCH = (4.0, 0.0, 0.8)  # [m], launch point of every throw
 CATCH_HEIGHT = 0.45  # [m], least height of a thrown ball at its catch
-_BISECTIONS = 60
-_PARALLEL = SUITES["hexagon6"].horizon  # [s], of the suites with parallel targets
+_BISECTIONS = 60  # iterations of the bisection for the time at which a ball is at `CATCH_HEIGHT`
+_PARALLEL = SUITES["hexagon6"].horizon  # [s], latest time of a catch of targets on polygons
 
 
 @dataclasses.dataclass(frozen=True)
 class _Throw:
-    """Ranges of a thrown ball."""
+    """Distribution of a thrown ball; the table of the module's docstring lists the values."""
 
     land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground
@@ -121,15 +124,15 @@ def draw(
     num_targets: int | None = None,
     dtype: DTypeLike = jnp.float32,
 ) -> CatchCase:
-    """Draw a batch of cases in float64, and cast it to a type.
+    """Draw a batch of random catch cases in float64, and cast them to `dtype`.
 
-    Further arguments and the errors are as in `pj.hit.draw`.
+    The arguments that are not in this list, and the errors, are as in `pj.hit.draw`.
 
     * `suite`: a key of `SUITES`, "throws" by default, or a suite of another package.
     * `limit_scale`: factor on the limits of speed and body rate, and on the differences between
       the limits of the thrust and the thrust of hover.
-    * `robot`: quadrotor with a net; suites of other packages have their own.
-    * `num_targets`: N, at least the suite's number; further targets are absent copies of the first.
+    * `robot`: quadrotor with a net. Suites of other packages define their own robot.
+    * `num_targets`: number N of targets, at least the suite's. Additional targets are absent.
     """
     suite = suite_named(suite, "throws")
     require_draw(num, seed, first)
@@ -144,7 +147,7 @@ def draw(
     if size < own:
         raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
-    # One row of random numbers a case: skip the rows of earlier cases.
+    # The random numbers of a case are one row of a long table: skip the rows of earlier cases.
     columns, make_targets = _PATHS[suite]
     random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
     targets, horizon = make_targets(random.random((num, columns)))
@@ -162,7 +165,7 @@ def draw(
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """Draw `num` cases of a suite of `SUITES` by a key of `jax.random`, as a pure function."""
+    """Draw `num` cases of a suite of `SUITES` with a key of `jax.random`, inside `jax.jit` too."""
     columns, make_targets = _PATHS[suite]
     paths = make_targets(jax.random.uniform(key, (num, columns)))
     targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), paths)
@@ -173,12 +176,12 @@ def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
 
 
 def _module(array: PyTree) -> ModuleType:
-    """Return jax.numpy or NumPy, whichever an array is of."""
+    """Return the module `jax.numpy` for a JAX array, and `numpy` for a NumPy array."""
     return jnp if isinstance(array, jax.Array) else np
 
 
 def _between(uniform: PyTree, low: float, high: float) -> PyTree:
-    """Return uniform numbers of [0, 1) scaled to an interval."""
+    """Map uniform random numbers of [0, 1) to the interval from `low` to `high`."""
     return low + uniform * (high - low)
 
 
@@ -192,7 +195,7 @@ def _unit(angle: PyTree) -> PyTree:
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Return thrown balls from three numbers each, and horizons at `CATCH_HEIGHT`."""
+    """Return thrown balls, from three random numbers each, and when they fall to `CATCH_HEIGHT`."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -203,18 +206,18 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return position (B, 3) and velocity (B, 3) at time 0 and horizon (B,) of one ball a row."""
+    """Return position and velocity (B, 3) at time 0 and horizon (B,) of B balls, one a row."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
     flight = _between(uniform[:, 2], *throw.flight)
     launch = np.broadcast_to(LAUNCH, land.shape)
-    # The landing point is affine in the launch velocity.
+    # The landing point is an affine function of the launch velocity: solve for the velocity.
     without, _ = _fly(launch, xp.zeros_like(land), flight, throw.drag)
     share, _ = _fly(xp.zeros_like(land), xp.ones_like(land), flight, throw.drag, gravity=0.0)
     delay = np.full(len(land), throw.delay)
     pos, vel = _fly(launch, (land - without) / share, delay, throw.drag)
-    # Bisection: at `early` the ball has not yet fallen through the height.
+    # Bisection for the horizon: at `early` the ball has not yet fallen below `CATCH_HEIGHT`.
     rise = xp.maximum(vel[:, 2], 0.0) / GRAVITY
     early, late = xp.minimum(0.5 * rise, flight - delay), flight - delay
     for _ in range(_BISECTIONS):
@@ -225,12 +228,12 @@ def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
 
 
 def earliest_throw(name: str) -> tuple[BallState, float]:
-    """Return the ball at time 0 and the horizon [s] of a suite's shortest throw to its centre.
+    """Return the shortest throw of a suite to the centre of its landing rectangle.
 
-    Leaves of the ball are NumPy arrays (3,) in float32.
+    The result is the ball at time 0, with NumPy arrays (3,) in float32, and the horizon [s].
 
     Raises:
-        ValueError: the suite is not one of single throws.
+        ValueError: the suite does not have exactly one thrown ball a case.
     """
     if name not in _THROWS or len(_THROWS[name]) > 1:
         raise ArgumentError("suite", "one of single throws", name)
@@ -241,7 +244,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Return balls (B, 3) after `time` (B,) [s] with linear drag [1/s] [Yu2023catch, eq. 9]."""
+    """Return position and velocity (B, 3) after a flight with linear drag [Yu2023catch, eq. 9]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:
@@ -263,7 +266,7 @@ def _lines(pos: PyTree, vel: PyTree) -> BallPath:
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
-    """Return two oscillating targets from nine numbers each."""
+    """Return two oscillating targets, from nine random numbers each, and their horizons [s]."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
@@ -276,7 +279,7 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Return three targets on the sides of an equilateral triangle, from seven numbers."""
+    """Return three targets along a triangle's sides, from seven random numbers, and horizons."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
@@ -287,7 +290,7 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Return parallel targets at the corners of a regular polygon, from eight numbers."""
+    """Return parallel targets on a regular polygon, from eight random numbers, and horizons."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -302,14 +305,14 @@ def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 def _rush(
     uniform: PyTree, *, of: Callable, num: int, first: float, after: float, spread: float
 ) -> tuple[BallPath, PyTree]:
-    """Return targets of another suite with different horizons, from two further numbers each."""
+    """Return targets of the function `of`, with horizons from two more random numbers for each."""
     xp, own = _module(uniform), uniform[:, : -2 * num]
     order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
     return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Return sinking balls, from six numbers each."""
+    """Return `num` sinking balls, from six random numbers each, and their horizons [s]."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])
@@ -321,8 +324,8 @@ def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 
 _hexagon = functools.partial(_polygon, num=6)
 
-# Suite -> the number C of random numbers of a case, and the function from numbers (B, C) in [0, 1),
-# NumPy or JAX, to targets, leaves (B, N, ...), and horizons (B, N) [s].
+# Suite -> (C, function). A case takes C random numbers. The function maps uniform random numbers
+# (B, C) of [0, 1), NumPy or JAX, to targets, leaves (B, N, ...), and horizons (B, N) [s].
 _PATHS: dict[str, tuple[int, Callable[[PyTree], tuple[TargetPath, PyTree]]]] = {
     **{
         name: (3 * len(throws), functools.partial(_throws, throws=throws))

@@ -1,4 +1,4 @@
-"""Groups: a car meets several moving targets, one after another."""
+"""The task `group`: one car meets several moving targets among obstacles, one after another."""
 
 import lazy_loader
 

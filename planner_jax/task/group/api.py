@@ -1,4 +1,4 @@
-"""The functions `pj.group.planner` and `pj.group.judge`."""
+"""The public functions `pj.group.planner` and `pj.group.judge` of the task `group`."""
 
 from planner_jax.core.protocol import Decision
 from planner_jax.planning.decided import DecidedPlanner
@@ -14,34 +14,34 @@ from planner_jax.task.intercept.api import position_setting
 def planner(
     name: str = "spacetime", *, decide: str | Decision = "best", **options: object
 ) -> DecidedPlanner[InterceptGroup, GroupPlan]:
-    """Make a planner of groups that first decides the order of the targets.
+    """Make a planner for groups: cases in which one car has to meet several targets.
 
-    The planner `spacetime` meets one target after another, each as early as possible, by the
-    intercept planner `spacetime`.
+    The planner first decides in which order to meet the targets. Then it plans the drive to one
+    target after another with the intercept planner `spacetime`, each meeting as early as possible.
 
     Args:
         name: `spacetime`, or a planner of another package.
-        decide: "best" plans the most promising of all orders and selects the earliest last meeting,
-            "greedy" meets next the target with the earliest estimated meeting, "given" takes the
-            order of the cases. A decision with settings, such as `Best(finalists=3)`, is also
-            accepted.
-        **options: fields of that planner's dataclass.
+        decide: how to find the order. "best" plans the orders with the best estimates and selects
+            the plan that ends first. "greedy" always meets next the target with the earliest
+            estimated meeting. "given" uses the orders in the cases. A decision with settings, such
+            as `Best(finalists=3)`, is also accepted.
+        **options: fields of the planner's dataclass.
 
     Returns:
-        A planner for `pj.plan`; its `planner` is a `GroupIntercept`.
+        A planner for `pj.plan`; its field `planner` is a `GroupIntercept`.
 
     Raises:
-        ValueError: there is no planner or decision of that name.
-        TypeError: the planner has no such field.
+        ValueError: no planner or no decision has the requested name.
+        TypeError: the planner's dataclass has no field of the name of an option.
     """
     return DecidedPlanner(TASK.make_planner(name, options), find_decision(DECISIONS, decide))
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
-    """Judge every leg of one plan, or of a batch of plans; see `referee_groups`.
+    """Judge plans of groups: the referee `referee_groups` checks the drive to every target.
 
     Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
-    `referee_intercepts`.
+    `referee_intercepts`, which judges each drive as one interception.
     """
     require_settings(referee_intercepts, settings)
     if isinstance(cases, InterceptGroup):

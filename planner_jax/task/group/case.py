@@ -1,6 +1,6 @@
-"""The case of a group: one car meets several targets in an order that a decision selects.
+"""Cases of the task `group`: one car has to meet several moving targets, in any order.
 
-[Qu2022] meets one target and names groups as future work; groups are this library's extension.
+[Qu2022] plans the interception of one target. Several targets are an extension of this library.
 """
 
 import dataclasses
@@ -20,7 +20,7 @@ from planner_jax.plane.target import LaterPath, PlanePath
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.case import case as single_case
 
-# Shapes, types and ranges of the leaves of a case.
+# Shapes, types and ranges that `pj.require_sound` checks for the arrays of an `InterceptGroup`.
 RULES: Table = (
     Field("present", ("N",), kind=np.bool_),
     Field("order", ("N",), PERMUTATION, kind=np.integer),
@@ -29,54 +29,55 @@ RULES: Table = (
 
 @struct.dataclass
 class GroupChoice:
-    """The decision about one group, or about a batch."""
+    """The order in which one car meets its N targets, or a batch of orders."""
 
-    order: Array  # (N,) int32, a permutation, present targets first
+    order: Array  # (N,) int32, permutation of target indices; targets that exist come first
 
 
 @struct.dataclass
 class CarState:
-    """Pose, speed and curvature of a car."""
+    """State of a car: pose, speed, and curvature of its path."""
 
     pose: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
-    speed: Array  # () [m/s]
-    curvature: Array  # () [1/m]
+    speed: Array  # () [m/s], of the rear axle's middle
+    curvature: Array  # () [1/m], of the path of the rear axle's middle
 
 
 @struct.dataclass
 class InterceptGroup:
-    """The case of one group, or a batch; every number is a leaf of the pytree.
+    """One case: a car and the group of N targets that it has to meet; or a batch of cases.
 
-    The body's middle has to meet every target as in an `InterceptCase`, with the same tolerance
-    and, if it is not free, the same heading.
+    Every number is a leaf of the pytree. The middle of the car's body must come within
+    `shared.tolerance` of every target. If `shared` restricts the heading at a meeting, the
+    restriction applies to every meeting.
     """
 
     rules: ClassVar[Table] = RULES
 
-    # Car, obstacles and map. The leaves of `shared.target` have a leading axis N. All targets must
-    # be met before `shared.time`.
+    # Car, obstacles, map and the targets' paths. The leaves of `shared.target` have a leading axis
+    # N. All targets must be met before `shared.time` [s].
     shared: InterceptCase
-    present: Array  # (N,) bool, whether each of the N targets exists
+    present: Array  # (N,) bool, whether each target exists; absent targets only pad the arrays
     order: Array  # (N,) int32, a permutation: index of the first target to meet, the second, ...
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one group, (B,) for a batch."""
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return self.shared.batch_shape
 
     @property
     def num_targets(self) -> int:
-        """N, the number of present and absent targets."""
+        """Number N of targets, including absent targets, which only pad the arrays."""
         return np.shape(self.present)[-1]
 
     def with_choice(self, choice: GroupChoice) -> "InterceptGroup":
-        """Return the group, or the batch, with the order of a choice."""
+        """Return the case, or the batch, with its order of targets replaced by a choice's order."""
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """Return the interception of the target with an index () int that starts at a time () [s].
+        """Return the interception of the target of an index () int, from the car's state `car`.
 
-        The times of the interception count from `begin`; `car` is the car's state at `begin`.
+        The car is in this state at the time `begin` () [s], which is time 0 of the returned case.
         """
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)
@@ -87,7 +88,7 @@ class InterceptGroup:
             speed=car.speed,
             curvature=car.curvature,
             target=LaterPath(path=path, begin=begin),
-            # Positive even if no time is left.
+            # [s], at least 1 ms, because the time of a case must be positive.
             time=jnp.maximum(shared.time - begin, 1e-3),
             movers=dataclasses.replace(movers, centre=movers.centre + begin * movers.velocity),
         )
@@ -96,13 +97,15 @@ class InterceptGroup:
 def case(
     targets: PlanePath, time: ArrayLike = 15.0, *, present: ArrayLike = True, **settings: Any
 ) -> InterceptGroup:
-    """Make a group, or a batch, by default with the car and the map of `pj.intercept.case`.
+    """Make a case with a group of N targets, or a batch of cases.
 
-    The order is 0, 1, ..., N - 1 until a decision sets it.
+    Car and map are by default as in `pj.intercept.case`. The order is 0, 1, ..., N - 1; a planner
+    replaces it by the order that it decides.
 
     Args:
-        targets: a path pytree such as `TurningPath`, leaves with axes (..., N) first.
-        time: () or (B,) [s], by which all targets must be met.
+        targets: paths of the targets, such as a `TurningPath`, whose leaves have leading axes (N,),
+            or (B, N) for a batch.
+        time: () or (B,) [s], time before which all targets must be met.
         present: () or (N,) or (B, N) bool, whether each target exists.
         **settings: arguments of `pj.intercept.case`, such as `start` and `walls`.
 

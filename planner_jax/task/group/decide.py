@@ -1,7 +1,8 @@
-"""Decisions about the order in which to meet the targets of a group.
+"""Decisions about the order in which a car meets the targets of a group.
 
-Orders are ranked by an estimate: the car turns towards the meeting point and then drives straight
-on, without regard to obstacles. Legs are planned for the most promising orders only.
+Orders are ranked by the estimated time of their last meeting. The estimate ignores obstacles: the
+car turns towards the next meeting point and then drives straight to it. Motions are planned only
+for the orders of the best ranks.
 """
 
 import dataclasses
@@ -19,23 +20,23 @@ from planner_jax.core.protocol import Decision, require_settings
 from planner_jax.task.arguments import require_orders
 from planner_jax.task.group.case import GroupChoice, InterceptGroup
 
-_GRID = 128  # times at which every target is evaluated
-_PACE = 0.8  # assumed mean speed over the greatest speed
-_TURNING = 0.6  # assumed mean turn rate over the greatest turn rate
+_GRID = 128  # number of times at which the position of every target is evaluated
+_PACE = 0.8  # assumed mean speed of the car, divided by its greatest speed
+_TURNING = 0.6  # assumed mean turn rate of the car, divided by its greatest turn rate
 
 
 @struct.dataclass
 class _Meeting:
-    """The estimated state of the car at a meeting."""
+    """Estimated state of the car at the moment at which it meets a target."""
 
     time: Array  # () [s]
     position: Array  # (2,) [m]
     heading: Array  # () [rad]
-    delay: Array  # () [s], time that is missing for this and the previous meetings
+    delay: Array  # () [s], sum over the meetings so far of the times by which the car is too late
 
 
 def _start(group: InterceptGroup) -> _Meeting:
-    """Return the car at time 0 as if it met a target there."""
+    """Return the car's initial state in the form of a meeting at time 0."""
     shared = group.shared
     heading = shared.start[2]
     ahead = shared.body.middle * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
@@ -54,7 +55,10 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Return the earliest estimated meeting with a target after another meeting."""
+    """Estimate the earliest meeting with a target, an index, after the meeting `last`.
+
+    If the target cannot be met in time, the meeting is where the car is least too late.
+    """
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]
@@ -75,7 +79,7 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return the estimated time () [s] of the last meeting in an order (N,), plus ten delays."""
+    """Return an order's rank () [s]: time of its last meeting plus ten times its `delay`."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None
@@ -88,24 +92,25 @@ def _select(condition: Array, meeting: _Meeting, other: _Meeting) -> _Meeting:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), meeting, other)
 
 
-MOST_PERMUTED = 8  # targets of a group
+MOST_PERMUTED = 8  # greatest number N of targets for which all N! orders are estimated
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(Decision):
-    """Plans the orders with the earliest estimated last meeting, and selects the best plan.
+    """Decision that proposes the orders whose last meeting is estimated to be earliest.
 
-    All N! orders of at most 8 targets are estimated. The best of them are the finalists.
+    All N! orders of the N <= 8 targets are estimated. The planner plans each of the best orders,
+    the finalists, and selects the plan whose last meeting is earliest.
     """
 
-    finalists: int = 6  # number of orders that are planned
+    finalists: int = 6  # number of orders that are proposed and then planned
 
     def __post_init__(self) -> None:
         require_settings(self)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the finalists of one group, leaves (F, N)."""
+        """Return the F orders of one group with the best estimates, best first, leaves (F, N)."""
         num = case.num_targets
         if num > MOST_PERMUTED:
             rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
@@ -113,15 +118,16 @@ class Best(Decision):
         orders = jnp.asarray(list(itertools.permutations(range(num))), jnp.int32)
         table = _timetable(case)
         rank = jax.vmap(functools.partial(_rank, case, table))(orders)
-        # One of several orders that differ in absent targets alone is enough: absent targets last,
-        # in ascending order.
+        # Orders that differ only in the positions of absent targets are equivalent. Only the order
+        # that ends with the absent targets, in ascending order, is proposed.
         exists = case.present[orders]
         is_last = jnp.all(exists[:, 1:] <= exists[:, :-1], axis=1)
         falls = (orders[:, 1:] < orders[:, :-1]) & ~exists[:, :-1]
         is_proposed = is_last & ~jnp.any(falls, axis=1)
         ranking = jnp.argsort(jnp.where(is_proposed, rank, jnp.inf))
         chosen = ranking[: min(self.finalists, len(orders))]
-        # Repeat the best order if there are fewer orders; equal legs are planned once.
+        # Repeat the best order if there are fewer than F orders. Repetitions cost little, because
+        # `GroupIntercept` plans equal legs only once.
         chosen = jnp.where(is_proposed[chosen], chosen, chosen[0])
         return GroupChoice(order=orders[chosen])
 
@@ -129,15 +135,15 @@ class Best(Decision):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Greedy(Decision):
-    """Meets next the target with the earliest estimated meeting."""
+    """Decision that always meets next the target with the earliest estimated meeting."""
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the one choice for one group, leaves (1, N)."""
+        """Return the greedy order of one group as the only proposal, leaves (1, N)."""
         table, num = _timetable(case), case.num_targets
         last, is_open, order = _start(case), jnp.ones(num, bool), []
         for _ in range(num):
             meetings = jax.vmap(functools.partial(_next, case, table, last))(jnp.arange(num))
-            # Absent targets come last, in any order.
+            # A rank of 1e9 puts absent targets behind all targets that exist.
             rank = jnp.where(case.present, meetings.time + 10.0 * meetings.delay, 1e9)
             target = jnp.argmin(jnp.where(is_open, rank, jnp.inf))
             chosen = jax.tree.map(lambda leaf, at=target: leaf[at], meetings)
@@ -150,13 +156,13 @@ class Greedy(Decision):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Given(Decision):
-    """Takes the order of the cases, with absent targets last."""
+    """Decision that uses the order stored in each case, with absent targets moved to the end."""
 
     def check(self, cases: InterceptGroup) -> None:
-        """Raise `ValueError` unless every order is a permutation."""
+        """Raise `ValueError` unless the order in every case is a permutation of its targets."""
         require_orders(cases.order)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the one choice for one group, leaves (1, N)."""
+        """Return the order stored in one case as the only proposal, leaves (1, N)."""
         present_first = jnp.argsort(~case.present[case.order], stable=True)
         return GroupChoice(order=case.order[present_first][None])

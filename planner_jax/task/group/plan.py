@@ -1,4 +1,4 @@
-"""The plan of a group."""
+"""The plan in which a car meets a group of targets: one interception after another."""
 
 from flax import struct
 from jax import Array
@@ -10,18 +10,18 @@ from planner_jax.task.intercept.plan import InterceptPlan
 
 @struct.dataclass
 class GroupPlan(Plan):
-    """One plan with a leg to each target, or a batch with a leading axis on every leaf.
+    """One plan with a leg, that is a drive, to each of N targets; or a batch of plans.
 
     Every leg starts at the state and the time at which the previous leg ends. Legs to absent
-    targets come last and take no time. Legs after an unsolved leg take no time either. The cost is
-    the time [s] at which the last target is met.
+    targets come last and have zero duration. So have the legs after a leg that could not be solved.
+    The cost is the time [s] at which the last target is met.
     """
 
     order: Array  # (N,) int32, index of the target that is met first, second, ...
-    begins: Array  # (N,) [s], start of each leg
-    legs: InterceptPlan  # leaves with a leading axis N, in the order of `order`
+    begins: Array  # (N,) [s], start time of each leg, in the sequence of `order`
+    legs: InterceptPlan  # the N legs in the sequence of `order`; leaves have a leading axis N
 
     @property
     def choice(self) -> GroupChoice:
-        """The order as a choice."""
+        """The order of the plan, in the form that `InterceptGroup.with_choice` accepts."""
         return GroupChoice(order=self.order)

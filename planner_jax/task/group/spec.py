@@ -1,4 +1,4 @@
-"""Specification of the task `group` for the registry; imports no JAX."""
+"""Registry entry of the task `group`: names of planners and suites. The module imports no JAX."""
 
 from planner_jax.core.registry import Task
 from planner_jax.task.intercept.spec import Suite

@@ -1,10 +1,10 @@
 """Named, seeded suites of groups: several targets for one car among walls and movers.
 
-The suites are this library's. Start, walls, movers and one target are drawn as in
-`planner_jax.task.intercept.suites`, for the time by which all targets must be met. Then the number
-of targets and the other targets are drawn, each target again until no cause of rejection applies.
-All targets therefore stay on the map and off the walls up to that time. World frame in the plane,
-SI units.
+No paper defines these suites. Start, walls, movers and one target are drawn as in
+`planner_jax.task.intercept.suites`, for the time before which all targets must be met. Then the
+number of targets and the further targets are drawn. A target is drawn again as long as a cause of
+rejection in that module applies. All targets therefore stay on the map and off the walls up to that
+time. World frame in the plane, SI units.
 """
 
 import dataclasses
@@ -39,10 +39,10 @@ def draw(
     first: int = 0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptGroup:
-    """Draw a batch of groups of a suite in float64, and cast it.
+    """Draw a batch of cases with groups of targets in float64, and cast them to `dtype`.
 
-    Arguments and errors are as for `pj.hit.draw`. The suite is "group" by default, or a suite of
-    another package.
+    The suite is "group" by default, or a suite of another package. See `pj.hit.draw` for the other
+    arguments and the errors.
     """
     suite = suite_named(suite, "group")
     if suite not in SUITES:
@@ -64,7 +64,7 @@ def draw(
 def _draw_target(
     suite: str, randoms: list[np.random.Generator], draws: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Draw one more target for each of B draws, to which no cause of rejection applies."""
+    """Draw one more target for each of B cases, again until no cause of rejection applies to it."""
     spec, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
     targets = {name: np.zeros_like(draws[name]) for name in _TARGET}

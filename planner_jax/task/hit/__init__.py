@@ -1,4 +1,4 @@
-"""Hits: a quadrotor volleys a flying ball to a target with a racket [Yu2023bat]."""
+"""The task `hit`: a quadrotor hits a flying ball to a target with a racket [Yu2023bat]."""
 
 import lazy_loader
 

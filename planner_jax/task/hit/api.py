@@ -1,4 +1,4 @@
-"""The functions `pj.hit.draw`, `pj.hit.planner` and `pj.hit.judge`."""
+"""The public functions `draw`, `planner` and `judge` of the task `pj.hit`."""
 
 from collections.abc import Sequence
 
@@ -29,22 +29,22 @@ def draw(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype: DTypeLike = jnp.float32,
 ) -> HitCase:
-    """Draw serves as a batch of cases.
+    """Draw a batch of random cases: serves that a hovering quadrotor has to return.
 
     Args:
         num: number of cases, >= 1.
-        suite: "court" (default), a real scenario of [Yu2023bat], "S.1" to "S.6", or a suite of
-            another package.
+        suite: name of a family of random cases: "court" (default), a real scenario of [Yu2023bat],
+            "S.1" to "S.6", or a suite of another package.
         seed: seed of the suite, >= 0. Case k of a suite and seed is always the same case.
-        first: index of the first case, >= 0.
-        start: (3,) [m], hover position of the quadrotor; or "uniform" over the half court.
-        delay: [s], flight of the ball before planning starts.
+        first: index k of the first case of the batch, >= 0.
+        start: (3,) [m], hover position of the quadrotor; or "uniform": random in its half court.
+        delay: [s], time for which the ball has flown when planning starts.
         limit_scale: factor on the limits of speed, acceleration and body rate.
-        robot: quadrotor with a racket; suites of other packages have their own.
+        robot: quadrotor with a racket. Suites of other packages define their own robot.
         dtype: type of every floating leaf.
 
     Raises:
-        ValueError: an argument is out of its range, or there is no such suite.
+        ValueError: an argument is out of its range, or no suite has the requested name.
     """
     suite = suite_named(suite, "court")
     if suite not in TASK.suites:
@@ -65,29 +65,30 @@ def draw(
 def planner(
     name: str = "exact", *, effort: str = "feasible", recovery: str | None = None, **options: object
 ) -> Planner[HitCase, HitPlan]:
-    """Make the hit planner of a name.
+    """Make a planner of hits by its name.
 
     * `exact`: recommended; every plan satisfies the equations of contact, impact and landing.
     * `bat`: the planner of [Yu2023bat], which optimises impact and trajectory together.
     * `bat-lite`: `bat` without the transition point before the impact.
-    * `juggle`: the baseline of [Yu2023bat], a primitive to a fixed stroke without optimisation.
+    * `juggle`: the baseline of [Yu2023bat]: a motion primitive to a fixed impact, not optimised.
 
     Args:
-        name: one of these, or a planner of another package.
-        recovery: trajectory after the last contact, within all limits: "brake" to the cheapest
-            standstill, "home" back to the start. By default the plan ends at the contact.
-        effort: "feasible" stops as soon as every limit holds. "good" and "best" continue to lower
-            the cost.
+        name: one of these names, or the name of a planner of another package.
+        recovery: kind of the trajectory after the impact, which keeps all limits: "brake" ends at
+            standstill wherever this costs least, "home" ends at the start position. By default the
+            plan ends at the impact.
+        effort: "feasible" stops the search as soon as every limit holds. "good" and "best" continue
+            it to lower the cost.
         **options: fields of the planner's dataclass, for example `rounds`.
 
     Returns:
-        `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`. With a recovery
-        it is the field `planner` of the planner that is returned.
+        An `ExactHit`, `BatHit` (`bat` and `bat-lite`) or `JuggleHit`, for `pj.plan`. With a
+        `recovery` the result is a planner whose field `planner` holds this object.
 
     Raises:
-        ValueError: there is no planner of that name, or it has no such effort.
-        TypeError: the planner has no such field.
-        ModuleNotFoundError: the planner needs an extra that is not installed.
+        ValueError: no planner has the requested name, or it does not support the effort.
+        TypeError: the planner's dataclass has no field of the name of an option.
+        ModuleNotFoundError: the planner needs an optional dependency that is not installed.
     """
     own = TASK.make_planner(name, options).with_effort(effort)
     if recovery is None:
@@ -98,7 +99,7 @@ def planner(
 
 
 def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
-    """Judge one plan, or a batch of plans, by physics independent of the planners.
+    """Judge one plan, or a batch of plans, by physics that is independent of the planners.
 
     Args:
         cases: one case, or a batch.
@@ -106,11 +107,11 @@ def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
         **settings: settings of `referee_hits`, such as `drag_after_impact` and `tolerance`.
 
     Returns:
-        A verdict with the batch shape of the cases: `success`, `sentence(k)`, and measured
-        quantities.
+        A verdict with the batch shape of the cases: whether each plan is a `success`, the reason
+        as text by `sentence(k)`, and the measured quantities.
 
     Raises:
-        TypeError: the cases or plans are of another task.
+        TypeError: the cases or plans belong to another task.
         ValueError: cases and plans differ in batch shape, or a setting is out of its range.
     """
     return judge_by(referee_hits, cases, plans, (HitCase, HitPlan), settings)

@@ -1,4 +1,4 @@
-"""One hit to plan: the incoming ball, the hovering quadrotor, the target and the limits."""
+"""Cases of the task `hit`: the incoming ball, the hovering quadrotor, the target and the limits."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -34,7 +34,7 @@ from planner_jax.task.quadrotor import (
     require_tool,
 )
 
-# Shapes and rules of the numbers of a case.
+# Shapes and ranges that `pj.require_sound` checks for the arrays of a `HitCase`.
 RULES: Table = (
     Field("ball.pos", (3,)),
     Field("ball.vel", (3,)),
@@ -62,18 +62,18 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class HitLimits:
-    """Limits of the stroke [Yu2023bat, eqs 18f and 18g]."""
+    """Limits on the impact and on the returned ball's flight [Yu2023bat, eqs 18f and 18g]."""
 
-    hitting_speed: Array  # (3,) [m/s], of the quadrotor at the impact on each world axis
-    min_apex: Array  # () [m], of the ball after the impact
-    max_apex: Array  # () [m]
+    hitting_speed: Array  # (3,) [m/s], greatest speed of the quadrotor at the impact, world axes
+    min_apex: Array  # () [m], least height of the apex of the returned ball
+    max_apex: Array  # () [m], greatest height of the apex of the returned ball
 
 
 @struct.dataclass
 class HitCase:
-    """One hit to plan, or a batch of hits. Every number is a leaf of the pytree.
+    """One hit to plan, or a batch: a quadrotor has to hit a flying ball to a target with a racket.
 
-    Time 0 is when planning starts.
+    Every number is a leaf of the pytree. Time 0 is when planning starts.
     """
 
     rules: ClassVar[Table] = RULES
@@ -88,11 +88,11 @@ class HitCase:
     limits: QuadrotorLimits
     hit_limits: HitLimits
     extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
-    racket_radius: Array | None = None  # () [m]; None: not checked
+    racket_radius: Array | None = None  # () [m]; None: the contact may be anywhere on the racket
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return np.shape(self.drag)
 
 
@@ -120,19 +120,20 @@ def case(
     extras: Sequence[Extra] = (),
     dtype=jnp.float32,
 ) -> HitCase:
-    """Make a hit, or a batch of hits, by default with the numbers of [Yu2023bat, Section VI-A].
+    """Make one case of a hit, or a batch; defaults are the numbers of [Yu2023bat, Section VI-A].
 
     Args:
-        ball_pos: (..., 3) [m], of the ball at time 0, above the ground at z = 0.
-        ball_vel: (..., 3) [m/s], of the ball at time 0.
+        ball_pos: (..., 3) [m], position of the ball at time 0, above the ground at z = 0.
+        ball_vel: (..., 3) [m/s], velocity of the ball at time 0.
         target: (..., 3) [m], required landing point of the returned ball.
-        robot: quadrotor with a racket. Arguments that are None take the robot's numbers.
+        robot: quadrotor with a racket. It supplies the numbers of arguments that are None.
         start: (3,) or (..., 3) [m], hover position of the quadrotor.
-        drag: K_D [1/m]. The drag and all later numbers are one value, or one value a case.
+        drag: [1/m], coefficient K_D of quadratic drag. The drag and every following number is one
+            value for all cases, or one value for each case.
         gravity: [m/s^2], magnitude.
-        restitution: coefficient beta of the racket.
-        racket_height: [m], of the racket's centre above the propeller plane.
-        racket_radius: [m]. A valid contact is within 0.9 of it around the racket's centre.
+        restitution: coefficient of restitution beta of the racket.
+        racket_height: [m], height of the racket's centre above the propeller plane.
+        racket_radius: [m]. The ball must meet the racket within 0.9 times this radius.
         speed: [m/s], greatest speed of the quadrotor.
         acceleration: [m/s^2], greatest acceleration.
         min_thrust: [m/s^2], least thrust per unit mass.
@@ -142,12 +143,12 @@ def case(
         hitting_speed: (3,) [m/s], greatest speed of the quadrotor at the impact on each axis.
         min_apex: [m], least apex of the returned ball.
         max_apex: [m], greatest apex of the returned ball.
-        extras: constraints and costs such as `pj.KeepOut`, without batch axes to share them, or
-            with the batch's axes on every leaf.
+        extras: further constraints and costs such as `pj.KeepOut`. Their leaves have the batch's
+            axes, or no batch axes if all cases share them.
         dtype: type of every floating leaf.
 
     Returns:
-        Case whose leaves have the batch shape of `ball_pos`.
+        A case whose leaves have the batch shape of `ball_pos`.
 
     Raises:
         CaseError: a number breaks a rule, such as a limit that is not positive.

@@ -1,4 +1,4 @@
-"""Functions that all hit planners share: the ball's table, the impact, a bound on the reach."""
+"""Functions of all hit planners: tabulate the ball's flight, limit the impact, bound the reach."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,25 +12,26 @@ from planner_jax.robot.quadrotor import ALLOWED, beyond_reach, greatest_speed
 from planner_jax.task.hit.case import HitCase
 from planner_jax.task.hit.plan import Stroke
 
-_SLACK = 0.02  # [m], far more than the contact error that the referee accepts
+_SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of contacts that the referee accepts
 
 
 @struct.dataclass
 class HitContext:
-    """One case with the quantities that every evaluation of the objective reads."""
+    """One case with quantities that are computed once and used by every evaluation of the cost."""
 
     case: HitCase
-    path: PathTable  # of the incoming ball
-    landing_time: Array  # () [s], of the ball without a hit
+    path: PathTable  # positions and velocities of the incoming ball at equally spaced times
+    landing_time: Array  # () [s], at which the incoming ball would land without a hit
 
 
 def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
-    """Tabulate the incoming ball's flight, up to 1.1 times the duration of its drag-free fall."""
+    """Tabulate the incoming ball's flight up to 1.1 times the duration of its drag-free flight."""
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
     horizon = lax.stop_gradient(1.1 * fall)
     path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
     node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
-    # Below the last node above the ground the ball is taken to sink at the speed of that node.
+    # After the table's last time at which the ball is above the ground, the ball is assumed to sink
+    # at the constant speed that it has then.
     sinking = jnp.maximum(-path.vel[node, 2], 0.1)
     landing = (node - 1).astype(sinking.dtype) * path.resolution + path.pos[node, 2] / sinking
     return HitContext(case=case, path=path, landing_time=lax.stop_gradient(landing))
@@ -38,29 +39,29 @@ def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
 
 @struct.dataclass
 class Impact:
-    """A stroke with the state of the quadrotor at the impact."""
+    """The impact of ball and racket, with the quadrotor's state and the returned ball's apex."""
 
-    stroke: Stroke
-    tail_state: Array  # (4, 3) position to jerk of the quadrotor at the impact
-    apex: Array  # () [m], of the returned ball
+    stroke: Stroke  # impact, and the ball's flight to the landing point
+    tail_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at impact
+    apex: Array  # () [m], greatest height of the returned ball
 
 
 def is_too_far(context: HitContext) -> Array:
-    """Return whether a bound proves that the quadrotor cannot reach the ball, () bool.
+    """Return true only if the quadrotor provably cannot hit the ball at any time, () bool.
 
-    At an impact the quadrotor is the racket's height away from the ball and above its least
-    height, and the ball is above the ground and not above the greatest apex. The bound is evaluated
-    at the nodes of the ball's table. An impact is within half a step of a node, so the bound adds
-    the distances that ball and quadrotor move in half a step.
+    At an impact the quadrotor's distance from the ball is the racket's height. The quadrotor is
+    above its least height, and the ball is above the ground and not above the greatest apex. These
+    conditions are tested at the times of the ball's table. An impact is within half a step of such
+    a time, so the distances that ball and quadrotor can move in half a step are added.
 
-    False proves nothing. The result is false where a number is not finite.
+    The result false means that a hit may or may not exist. It is false if a number is not finite.
     """
     case, path = context.case, context.path
     limits, ball = case.limits, case.ball
     pos, vel = path.pos[1:-1], path.vel[1:-1]
     half_step = 0.5 * path.resolution
     times = path.resolution * jnp.asarray(np.arange(pos.shape[0]), pos.dtype)
-    # The ball is fastest at the ground if drag takes nothing away.
+    # A bound on the ball's squared speed: without drag the ball would be fastest at the ground.
     fastest_squared = jnp.sum(ball.vel * ball.vel) + 2.0 * case.gravity * jnp.abs(ball.pos[2])
     bend = 0.5 * (case.gravity + case.drag * fastest_squared) * half_step**2
     speed = jnp.sqrt(jnp.sum(vel * vel, axis=1))
@@ -71,7 +72,8 @@ def is_too_far(context: HitContext) -> Array:
     low = lowest - pos[:, 2] - _SLACK
     high = pos[:, 2] - ALLOWED * case.hit_limits.max_apex - _SLACK
     apart = jnp.maximum(far - arm, jnp.maximum(low, high))
-    # At the end of the table the ball must be below every possible impact, and sinking.
+    # The proof covers the table's times only. It is complete if at the last time the ball is below
+    # the height of every possible impact, and sinks.
     is_down = (pos[-1, 2] < lowest) & (vel[-1, 2] < 0.0)
     return jnp.all(apart > moved) & is_down
 

@@ -1,14 +1,15 @@
 """The court of [Yu2023bat, Section VI-B]: regions, targets, 36 scenarios, and flights of serves.
 
 World frame: z up, x towards the opponent, y to the left, net at x = 0. The opponent's half has
-x > 0 and the hitting half x < 0. Both halves are divided into the same regions, mirrored in x.
+x > 0; the quadrotor hits in the half with x < 0. Both halves are divided into regions, which are
+mirror images in x: near and far from the net in a middle strip, and a strip at the left and right.
 
-The paper gives the size of the court. The lines between regions are measured from the published
-serves, landing points and targets: in y, the middle lane extends to 0.8395 m at least and the side
-lanes start at 0.8418 m at most.
+The paper states the size of the court but not the lines between regions. They are estimated from
+the published serves, landing points and targets: in y the middle strip extends to at least
+0.8395 m, and the side strips start at 0.8418 m or less.
 
-Flights are computed by NumPy in float64, so that a bad serve is reported before anything is
-compiled.
+Flights are computed by NumPy in float64, so that an invalid serve raises an error before a planner
+is compiled.
 """
 
 import numpy as np
@@ -17,26 +18,26 @@ from numpy.typing import ArrayLike
 from planner_jax.core.rules import require_rule, require_sound
 from planner_jax.task.hit.case import HitCase
 
-HALF_LENGTH = 5.0  # [m], net to back line
-HALF_WIDTH = 2.5  # [m], middle line to side line
-DEAD_ZONE = 0.5  # [m], from the net
-NEAR_LINE = 3.0  # [m], from the net; between the near and the far region, in the middle lane
-LANE_LINE = 0.84  # [m], from the middle line; between the middle lane and a side lane
+HALF_LENGTH = 5.0  # [m], from the net to a back line
+HALF_WIDTH = 2.5  # [m], from the middle line y = 0 to a side line
+DEAD_ZONE = 0.5  # [m], distance from the net within which no region extends
+NEAR_LINE = 3.0  # [m], distance from the net of the line between near and far region
+LANE_LINE = 0.84  # [m], |y| of the lines between the middle strip and the side strips
 
-_FLIGHT_STEPS = 16  # landing points of serves are then exact to 0.1 mm
-_NEWTON_STEPS = 5
+_FLIGHT_STEPS = 16  # Runge-Kutta steps of a flight; landing points are then exact to 0.1 mm
+_NEWTON_STEPS = 5  # iterations that refine the time of a landing
 
-REGIONS = "NFLR"  # near, far, left, right; the published files number them from 1
-# Targets of the regions in the opponent's half. Left is y > 0 in both halves.
-TARGETS = ((1.75, 0.0, 0.0), (4.0, 0.0, 0.0), (3.0, 1.67, 0.0), (3.0, -1.67, 0.0))  # [m]
+REGIONS = "NFLR"  # near, far, left, right; the published files number the regions from 1
+# [m], target of each region of `REGIONS` in the opponent's half. Left is y > 0 in both halves.
+TARGETS = ((1.75, 0.0, 0.0), (4.0, 0.0, 0.0), (3.0, 1.67, 0.0), (3.0, -1.67, 0.0))
 
 PLANNERS = ("juggle", "bat-lite", "bat")
 
 
 def _scenario_names() -> tuple[str, ...]:
-    """Return serve, landing and target region of the 36 scenarios, as in "NFL".
+    """Return the names of the 36 scenarios: serve, landing and target region, as in "NFL".
 
-    Of two scenarios that mirror each other in y only one is listed: R follows only after an L.
+    Of two scenarios that are mirror images in y only one is listed, where the first L or R is an L.
     """
     return tuple(
         serve + landing + target
@@ -50,9 +51,10 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return bounds (4, 2, 2) [m] of the regions, by region, axis (|x|, y), and lower or upper.
+    """Return the bounds (4, 2, 2) [m] of the regions.
 
-    The far and side regions end at |x| = depth.
+    The axes are: region in the order of `REGIONS`; coordinate |x| or y; lower or upper bound. The
+    far and side regions end at |x| = depth.
     """
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
@@ -61,24 +63,24 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Return codes (..., 3), 1 to 4, of the serve, landing and target region.
+    """Return serve, landing and target region (..., 3) of scenarios (...), indices in SCENARIOS.
 
-    Scenarios (...) are indices into SCENARIOS.
+    Regions are numbered from 1 to 4 in the order of REGIONS.
     """
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 
 
 def target_of(scenario) -> np.ndarray:
-    """Return targets (..., 3) [m] of scenarios (...), which are indices into SCENARIOS."""
+    """Return the targets (..., 3) [m] of scenarios (...), which are indices in SCENARIOS."""
     return np.array(TARGETS)[scenario_regions(scenario)[..., 2] - 1]
 
 
-# The following vectors are (3, ...), because NumPy is fastest along the last axis.
+# In the functions below vectors are (3, ...): NumPy is fastest if the long axes come last.
 
 
 def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return g - K_D |v| v, (3, ...) [Yu2023bat, eq. 2]."""
+    """Return the ball's acceleration g - K_D |v| v, (3, ...) [m/s^2] [Yu2023bat, eq. 2]."""
     x, y, z = velocity
     acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
     acceleration[2] -= gravity
@@ -86,7 +88,7 @@ def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -
 
 
 def _rk4_step(position, velocity, step, drag, gravity):
-    """Return position and velocity (3, ...) after one Runge-Kutta step (...) [s] of order 4."""
+    """Advance position and velocity (3, ...) by a Runge-Kutta step of order 4, `step` (...) [s]."""
     half = 0.5 * step
     a1 = _acceleration(velocity, drag, gravity)
     a2 = _acceleration(velocity + half * a1, drag, gravity)
@@ -121,10 +123,11 @@ def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT
 
 
 def landing(position, velocity, drag, gravity):
-    """Return times and points of landing on the floor z = 0.
+    """Return when and where balls with quadratic drag land on the floor z = 0.
 
-    The flight is integrated in equal Runge-Kutta steps until the ball is below the floor. Newton's
-    method on the height, whose steps are Runge-Kutta steps too, then finds the landing point.
+    The flight is integrated in equal Runge-Kutta steps until the ball is below the floor. Then
+    Newton's method finds the time at which the height is zero; each iteration integrates by a
+    Runge-Kutta step.
 
     Args:
         position: (..., 3) [m], with z > 0.
@@ -142,7 +145,7 @@ def landing(position, velocity, drag, gravity):
     rise = velocity[2]
     with np.errstate(all="ignore"):
         drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * gravity * point[2])) / gravity
-        # Drag slows a ball down within 1 / (drag * speed), so a step must be shorter.
+        # Drag changes the velocity within the time 1 / (drag * speed), so a step must be shorter.
         stiffness = drag * np.linalg.norm(velocity, axis=0) * drag_free_time
         num_steps = int(np.clip(8.0 * np.nanmax(stiffness, initial=0.0), _FLIGHT_STEPS, 1024))
         step = drag_free_time / num_steps
@@ -163,10 +166,11 @@ def landing(position, velocity, drag, gravity):
 
 
 def check_cases(cases: HitCase) -> None:
-    """Raise `CaseError` for the first rule that a case of a batch breaks.
+    """Raise `CaseError` unless every case of a batch is valid and its ball lands at x < 0.
 
-    Numbers must keep the rules of `HitCase`. The ball must be above the floor and land in the
-    hitting half, x < 0. The leaves must not be traced.
+    Numbers must keep the rules of `HitCase`. The ball must start above the floor and land in the
+    half of the court in which the quadrotor hits. The arrays must have values, so that the
+    function cannot be called inside `jax.jit`.
     """
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball

@@ -1,15 +1,17 @@
-"""Specification of the task of hits for the registry; imports no JAX."""
+"""Registry entry of the task `hit`: names of planners and suites. The module imports no JAX."""
 
 from planner_jax.core.registry import Task
 
-# Drag of the ball, a fit to the published landing points; the residual is 1 cm.
-DRAG = 0.0616  # K_D [1/m]
-# Hover position of the quadrotor. An assumption: the paper draws it at the line between the near
-# and the far region.
-START = (-3.0, 0.0, 1.5)  # [m]
+# [1/m], coefficient K_D of the ball's quadratic drag, fitted to the published landing points. The
+# residual of the fit is 1 cm.
+DRAG = 0.0616
+# [m], hover position of the quadrotor at time 0. The paper gives no numbers; its figure shows the
+# quadrotor at the line between the near and the far region.
+START = (-3.0, 0.0, 1.5)
 
-# Names in `court.SCENARIOS` for the six real scenarios of [Yu2023bat, Section VI-C]. An
-# assumption: the paper describes these scenarios in words alone.
+# The six scenarios of the real experiments of [Yu2023bat, Section VI-C], as names in
+# `court.SCENARIOS`: region of serve, landing and target. The names are an assumption, because the
+# paper describes these scenarios only in words.
 REAL_SCENARIOS = {
     "S.1": ("FNN", "FFN"),  # from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions

@@ -1,4 +1,4 @@
-"""Serves: read from the published trial files, or drawn from the distribution fitted to them."""
+"""Serves: read from the trial files of [Yu2023bat], or drawn from a distribution fitted to them."""
 
 import dataclasses
 import functools
@@ -22,31 +22,31 @@ from planner_jax.task.hit.case import GRAVITY, HitCase, case
 from planner_jax.task.hit.court import fly, landing
 from planner_jax.task.hit.spec import DRAG, START
 
-# The distribution fitted to the published serves: position and velocity are uniform under the
-# following conditions and the condition that the ball lands in the region of the scenario.
-SERVE_HEIGHT = 2.0  # [m]
+# The distribution of serves, fitted to the published serves: position and velocity are uniform
+# under the conditions below, and the ball must land in the landing region of its scenario.
+SERVE_HEIGHT = 2.0  # [m], height of the ball at the serve
 DEPTH = 4.5  # [m] from the net, end of the far and side regions for serves and landing points
-RISE_SPEED = (6.5, 8.73)  # [m/s], vertical speed of the serve
-MIN_APPROACH_SPEED = 2.0  # [m/s], speed of the serve towards the net
-MAX_FLIGHT_TIME = 1.8214  # [s], from the serve to the floor
+RISE_SPEED = (6.5, 8.73)  # [m/s], range of the vertical speed of a serve
+MIN_APPROACH_SPEED = 2.0  # [m/s], least speed of a serve towards the net
+MAX_FLIGHT_TIME = 1.8214  # [s], greatest time from the serve to the floor
 ONE_SIDED = ("FN", "FF")  # serve and landing regions of serves that never fly to the right
 
-START_HEIGHT = 1.5  # [m], of uniform starts
-_ROUNDS = 128  # repetitions of the list of scenarios in a block of serves
-_STARTS = 1024  # uniform starts of one random stream
-_AIM_STEPS = 4
-_SERVE_STREAM, _START_STREAM = 0, 1
+START_HEIGHT = 1.5  # [m], height of random hover positions
+_ROUNDS = 128  # number of serves of each scenario in a block, which has its own random generator
+_STARTS = 1024  # number of random hover positions that one random generator draws
+_AIM_STEPS = 4  # iterations of Newton's method for the speed of a serve
+_SERVE_STREAM, _START_STREAM = 0, 1  # keys of independent random generators for a seed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Serves:
-    """Balls served to the hitting half, world frame. `serves[rows]` selects rows as in NumPy."""
+    """N balls served to the quadrotor, in the world frame. `serves[rows]` selects some of them."""
 
     position: np.ndarray  # (N, 3) [m]
     velocity: np.ndarray  # (N, 3) [m/s]
     target: np.ndarray  # (N, 3) [m], required landing point of the returned ball
-    scenario: np.ndarray  # (N,) int, index into court.SCENARIOS
-    index: np.ndarray  # (N,) int, of the serve in the suite or the trial files
+    scenario: np.ndarray  # (N,) int, index in court.SCENARIOS
+    index: np.ndarray  # (N,) int, number of the serve in its suite or in the trial files
     # (N, 3) published result of each of court.PLANNERS: 1 solved, 0 failed, NaN not published.
     published: np.ndarray | None = None
     file: np.ndarray | None = None  # (N,) str, the first file that holds the serve
@@ -61,11 +61,12 @@ class Serves:
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """Read the serves of published trial files "S_L_T_M.csv".
+    """Read the serves of the published trial files in a folder.
 
-    S, L and T are serve, landing and target region (1 N, 2 F, 3 L, 4 R), and M is the planner
-    (p Bat, l Bat-Lite, b Juggle). Files of the same S_L_T contain the same serves in the same
-    order. Some of them may be missing. Other files of the folder are ignored.
+    A file is named "S_L_T_M.csv". S, L and T are serve, landing and target region (1 near, 2 far,
+    3 left, 4 right), and M is the planner (p Bat, l Bat-Lite, b Juggle). Files with equal S_L_T
+    contain the same serves in the same order; some of these files may be missing. Files with other
+    names are ignored.
 
     Returns:
         Row 1 of every scenario, then row 2 of every scenario and so on, so that the first rows
@@ -83,18 +84,19 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 def generate_serves(
     num: int, seed: int, scenarios: Sequence[str] | None = None, *, first: int = 0
 ) -> Serves:
-    """Draw serves from the distribution of the published ones, each scenario equally often.
+    """Draw random serves with the distribution of the published serves, equally many per scenario.
 
-    Every S consecutive serves of S scenarios contain each scenario once, in random order. Serve k
-    of a seed and list of scenarios is always the same serve.
+    Serves come in groups that contain each scenario once, in random order. Serve k of a seed and a
+    list of scenarios is always the same serve.
 
-    Position and velocity are uniform under the conditions at the head of this module. Sampling them
-    directly would reject 97 % of the draws for their landing region. Instead, the landing point and
-    the vertical speed are uniform and determine the horizontal velocity, and a draw is accepted
-    with a probability proportional to |d horizontal velocity / d landing point|.
+    Position and velocity are uniform under the conditions at the top of this module. If they were
+    drawn directly, 97 % of the draws would miss their landing region. Instead a landing point in
+    the region and a vertical speed are drawn, and determine the horizontal velocity. To make the
+    velocity uniform nevertheless, a draw is accepted with a probability proportional to
+    |d horizontal velocity / d landing point|.
 
-    The `scenarios` are names in court.SCENARIOS, by default all of them. Further arguments and the
-    errors are as in `pj.hit.draw`.
+    The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
+    arguments and the errors.
     """
     names = court.SCENARIOS if scenarios is None else tuple(scenarios)
     require_draw(num, seed, first)
@@ -117,13 +119,13 @@ def generate_serves(
 
 
 def _random(seed: int, stream: int, block: int) -> np.random.Generator:
-    """Return the random generator of one block, independent of other blocks."""
+    """Return a random generator that is independent of the generators of other arguments."""
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, block))
     return np.random.Generator(np.random.Philox(sequence))
 
 
 def _draw_block(chosen: np.ndarray, seed: int, block: int):
-    """Return scenario, position and velocity of a block: each chosen scenario _ROUNDS times."""
+    """Draw the serves of a block, _ROUNDS of each scenario: scenario (N,), pos and vel (N, 3)."""
     random = _random(seed, _SERVE_STREAM, block)
     scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
     states = np.zeros((2, len(scenario), 3))
@@ -136,7 +138,7 @@ def _draw_block(chosen: np.ndarray, seed: int, block: int):
 
 
 def _draw(scenario: np.ndarray, random: np.random.Generator):
-    """Draw position and velocity (2, N, 3) for N scenarios, and whether to accept them (N,)."""
+    """Draw position and velocity (2, N, 3) of serves, and whether each is accepted, (N,) bool."""
     regions = court.scenario_regions(scenario)
     bounds = court.region_bounds(DEPTH)
     uniform = random.random((len(scenario), 6))
@@ -164,35 +166,39 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
 
 
 class _AimTable(NamedTuple):
-    """Properties of serves by their horizontal distance [m] and vertical speed [m/s]."""
+    """Splines of a serve's properties over its horizontal distance [m] and vertical speed [m/s]."""
 
-    speed: RectBivariateSpline  # [m/s], horizontal
+    speed: RectBivariateSpline  # [m/s], horizontal speed that reaches the distance
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|
     time: RectBivariateSpline  # [s], from the serve to the floor
-    max_density: float
+    max_density: float  # [1/s^2], greatest density in the table
 
 
 @functools.cache
 def _aim_table() -> _AimTable:
-    """Return splines over the whole range of distances and vertical speeds."""
+    """Compute the splines for all distances on the court and all vertical speeds of serves."""
     shortest, longest = 2.0 * court.DEAD_ZONE, math.hypot(2.0 * DEPTH, 2.0 * court.HALF_WIDTH)
     axes = np.linspace(shortest, longest, 40), np.linspace(*RISE_SPEED, 12)
     distance, rise = np.meshgrid(*axes, indexing="ij")
     speed, slope, time = _aim(distance, rise)
-    # Determinant: slope along the line to the landing point, speed / distance across it.
+    # The determinant of d velocity / d landing point is the product of two derivatives: `slope`
+    # along the line to the landing point, and speed / distance across the line.
     density = slope * speed / distance
     tables = (RectBivariateSpline(*axes, values) for values in (speed, density, time))
     return _AimTable(*tables, max_density=float(density.max()))
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return horizontal speed [m/s], its derivative by the distance [1/s], and flight time [s]."""
+    """Return the horizontal speeds [m/s] of serves that land at distances [m], by Newton's method.
+
+    Also return the derivatives of the speeds by the distances [1/s], and the flight times [s].
+    """
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
     slope, time = np.zeros_like(speed), np.zeros((2, *speed.shape))
     for _ in range(_AIM_STEPS):
-        # A second, slightly faster ball yields the derivative by a difference.
+        # A second, slightly faster ball yields the derivative by a finite difference.
         pair = np.stack([speed, speed * (1.0 + 1e-5)])
         velocity = np.stack([pair, np.zeros_like(pair), np.broadcast_to(rise, pair.shape)], axis=-1)
         time, point = landing(position, velocity, DRAG, GRAVITY)
@@ -203,7 +209,7 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
 
 
 def advance(serves: Serves, delay: float) -> Serves:
-    """Return the serves after `delay` [s] of flight.
+    """Return serves with the balls' positions and velocities after `delay` [s] of flight.
 
     Raises:
         ArgumentError: the delay is negative or not finite, or a ball lands earlier.
@@ -222,9 +228,9 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Return hover positions (N, 3) [m], uniform over the hitting half without the dead zone.
+    """Return random hover positions (N, 3) [m], uniform over the half of the court with x < 0.
 
-    The position depends on the index of the serve and the seed alone.
+    They are at least 0.5 m from the net. A position depends on the serve's index and the seed only.
     """
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
@@ -246,9 +252,9 @@ def to_cases(
     robot: QuadrotorModel = PAPER_HITTER,
     dtype=jnp.float32,
 ) -> HitCase:
-    """Make a batch of cases of serves, by default with the numbers of [Yu2023bat].
+    """Make a batch of cases from serves, by default with the numbers of [Yu2023bat].
 
-    Arguments and errors are as in `pj.hit.draw`. The seed determines uniform starts.
+    Arguments and errors are as in `pj.hit.draw`. The seed is used only if `start` is "uniform".
     """
     require_scalar("limit_scale", limit_scale)
     require_scalar("delay", delay)

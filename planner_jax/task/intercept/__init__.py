@@ -1,4 +1,4 @@
-"""Interceptions: a car meets a moving target among standing and moving obstacles [Qu2022]."""
+"""The task `intercept`: a car meets a moving target among static and moving obstacles [Qu2022]."""
 
 import lazy_loader
 

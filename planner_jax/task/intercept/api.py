@@ -1,4 +1,4 @@
-"""The functions `pj.intercept.draw`, `observe`, `planner` and `judge`."""
+"""The public functions `draw`, `observe`, `planner` and `judge` of the task `pj.intercept`."""
 
 import zlib
 from typing import cast
@@ -31,10 +31,10 @@ def draw(
     first: int = 0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Draw a batch of interceptions of a suite, with the arguments and errors of `pj.hit.draw`.
+    """Draw a batch of interception cases from a suite, a named family of random cases.
 
-    The suite is "easy" by default, "medium", "hard", "storm", "gale", "maze", "rush", or a suite of
-    another package. `draw_with_counts` also returns the number of rejected draws.
+    The suite is "easy" (default), "medium", "hard", "storm", "gale", "maze", "rush", or a suite of
+    another package. Arguments and errors are as for `pj.hit.draw`.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:
@@ -51,18 +51,18 @@ def observe(
     first: int = 0,
     until: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw noisy observations of the targets up to the time when the cars set out, or longer.
+    """Simulate noisy observations of the targets' positions up to time 0, when the cars start.
 
-    See [Qu2022, eq. 4].
+    The noise is Gaussian [Qu2022, eq. 4]. With `until` > 0 the observations continue after time 0.
 
     Args:
-        cases: leaves with leading axis B.
-        seed: >= 0. The observations of case k are the same for every batch of a seed.
-        noise: [m], standard deviation on each axis.
+        cases: batch of B cases.
+        seed: >= 0. The noise of a case depends on the seed and the case's index alone.
+        noise: [m], standard deviation of the noise on each axis.
         count: number of observations up to time 0; the last of them is at time 0.
-        interval: [s], between two observations.
-        first: index of the first case, >= 0.
-        until: [s], time of the last observation, >= 0. It does not change earlier observations.
+        interval: [s], time between two observations.
+        first: >= 0, index of the first case of the batch.
+        until: [s], time up to which observations continue, >= 0.
 
     Returns:
         times: (L,) [s], L = count + floor(until / interval).
@@ -89,37 +89,39 @@ def observe(
 
 @jax.jit
 def _positions_at(paths: PlanePath, times: Array) -> Array:
-    """Return positions (B, L, 2) [m] on paths with leading axis B at times (L,) [s]."""
+    """Return the positions (B, L, 2) [m] of B targets at times (L,) [s]."""
     return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
 
 
 def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase, InterceptPlan]:
-    """Make the intercept planner of a name.
+    """Make a planner of interceptions by its name.
 
-    * `spacetime`: plans path and speed together, from a reach set in space and time.
+    * `spacetime`: computes the set of cells in space and time that the car can reach, and optimises
+      path and speed together, by least squares from random paths through this set.
     * `quick`: `spacetime` with fewer paths and steps, for large batches on a GPU.
-    * `best`: `spacetime` with more paths and steps; selects the plan of least effort.
-    * `lattice`: plans eight paths among the walls from a reach set, then a speed along each among
-      the movers, and selects the best plan.
-    * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then a speed along it. It
+    * `best`: `spacetime` with more paths and steps; selects the plan of least squared acceleration.
+    * `lattice`: plans eight paths among the walls, then the speed along each path among the moving
+      obstacles, and selects the best plan.
+    * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then the speed along it. It
       runs on the host and needs the extra `baselines`.
-    * `em`: the best path of `lattice` with the speed step of the EM planner.
-    * `constant`: the best path of `lattice` at constant speed; it ignores the movers.
+    * `em`: the best path of `lattice`, with the speed optimisation of the EM planner.
+    * `constant`: the best path of `lattice` at constant speed; ignores moving obstacles.
 
-    Arguments and errors are as for `pj.hit.planner`. The options are the fields of
-    `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
+    Arguments and errors are as for `pj.hit.planner`. The options are the fields of the planner's
+    class: `SpacetimeIntercept`, `PathThenSpeed` or `PaperIntercept`.
     """
     return TASK.make_planner(name, options)
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
-    """Judge one plan, or a batch of plans, with arguments, result and errors of `pj.hit.judge`.
+    """Judge one plan, or a batch of plans, by a check that is independent of the planners.
 
-    The referee computes the positions of `TurningPath`, `PolynomialPath` and `LaterPath` itself.
-    It calls the method `at` of a target of any other class, in float64.
+    The referee computes the positions of targets of the classes `TurningPath`, `PolynomialPath` and
+    `LaterPath` itself. For other classes it calls the target's method `at` in float64.
 
-    The settings are keyword arguments of `referee_intercepts`, such as `truth`: the path, or a
-    batch of paths, that the target really takes if the case holds a predicted path.
+    Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
+    `referee_intercepts`, such as `truth`: the true path of the target, or a batch of true paths, if
+    the paths in the cases are predictions.
     """
     require_kind("cases", cases, InterceptCase)
     target = cases.target
@@ -134,7 +136,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the setting that the referee needs for a target of a class that it does not know."""
+    """Return the setting of the referee for targets of a user's class; {} for the library's."""
     while isinstance(target, LaterPath):
         target = target.path
     is_known = type(target) in (TurningPath, PolynomialPath)
@@ -142,7 +144,7 @@ def position_setting(target: PlanePath) -> dict[str, object]:
 
 
 def positions(target: PlanePath, times: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 2"]:
-    """Compute the positions [m] of targets (B,) of any class at times (B,) [s], in float64."""
+    """Return positions [m] of B targets, each at its own time [s], by method `at` in float64."""
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), target)
         return np.asarray(jax.vmap(lambda path, time: path.at(time).pos)(double, times))

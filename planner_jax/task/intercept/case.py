@@ -1,4 +1,4 @@
-"""The case of one interception: a car, its target, and the obstacles between them."""
+"""Cases of the task `intercept`: a car, a moving target, and obstacles, in the plane."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from planner_jax.task.arguments import array_of, batch_of
 
 _BODY, _LIMITS = ([field.name for field in dataclasses.fields(c)] for c in (CarBody, CarLimits))
 
-# Shapes, types and ranges of the leaves of a case.
+# Shapes, types and ranges that `pj.require_sound` checks for the arrays of an `InterceptCase`.
 RULES: Table = (
     Field("start", (3,)),
     Field("speed", (), NOT_NEGATIVE),
@@ -55,7 +55,7 @@ RULES: Table = (
     Field("body.rear_overhang", ()),
     *(Field(f"limits.{name}", (), POSITIVE_OR_NONE) for name in _LIMITS),
 )
-# Field of a case -> argument of `case`, for error messages.
+# Field of a case -> argument of `case` that sets it. Error messages name the argument.
 _ARGUMENTS = {
     "speed": "initial_speed",
     "curvature": "initial_curvature",
@@ -66,23 +66,23 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class InterceptCase:
-    """The case of one interception, or a batch; every number is a leaf of the pytree.
+    """One interception to plan, or a batch of cases; every number is a leaf of the pytree.
 
-    World frame in the plane, SI units. Times count from the moment at which the car sets out. The
-    middle of the car's body has to meet the target.
+    The middle of the car's body has to come within `tolerance` of the target at the time of the
+    meeting. World frame in the plane, SI units. Time 0 is when the car starts to drive.
     """
 
     rules: ClassVar[Table] = RULES
 
     start: Array  # (3,) x [m], y [m] of the rear axle's middle and heading [rad] at time 0
-    speed: Array  # () [m/s], at time 0
-    curvature: Array  # () [1/m], at time 0, from the steering angle
-    target: PlanePath  # the expected path
+    speed: Array  # () [m/s], of the car at time 0
+    curvature: Array  # () [1/m], of the rear axle's path at time 0, from the steering angle
+    target: PlanePath  # expected path of the target
     time: Array  # () [s], of the meeting; the latest time for planners that choose the time
-    tolerance: Array  # () [m], greatest distance of the body's middle from the target then
-    end_heading: Array  # () [rad], at the meeting
-    heading_tolerance: Array  # () [rad]; pi leaves the heading free
-    walls: Obstacles  # standing obstacles
+    tolerance: Array  # () [m], greatest distance of the body's middle from the target at `time`
+    end_heading: Array  # () [rad], required heading of the car at the meeting
+    heading_tolerance: Array  # () [rad], greatest deviation from `end_heading`; pi: any heading
+    walls: Obstacles  # static obstacles
     movers: Obstacles  # moving obstacles
     lower: Array  # (2,) [m], corner of the map; the body's middle must not leave the map
     upper: Array  # (2,) [m], the opposite corner
@@ -91,7 +91,7 @@ class InterceptCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one case, (B,) for a batch."""
+        """Shape of the batch: () for one case, (B,) for a batch of B cases."""
         return np.shape(self.time)
 
 
@@ -121,40 +121,41 @@ def case(
     steering_rate: ArrayLike = 2.0,
     dtype: DTypeLike = jnp.float32,
 ) -> InterceptCase:
-    """Make an interception, or a batch, by default with the setting of [Qu2022].
+    """Make one case of an interception, or a batch, by default with the numbers of [Qu2022].
 
-    The paper states a map of 80 x 80 pixels, T = 10 s, and 0.5 m/s at the start (Section V). The
-    default car is a model car of scale 1:10 on a map of 8 m x 8 m; that is an assumption.
+    The paper states a map of 80 x 80 pixels, a meeting after 10 s, and 0.5 m/s at the start
+    (Section V). This library assumes that the map is 8 m x 8 m and the car a model of scale 1:10.
 
     Args:
-        target: a path pytree such as `TurningPath`, leaves with the batch's axes first.
-        time: () or (B,) [s], of the meeting, > 0. The time and all later numbers are one value, or
-            one value for each case.
-        start: (3,) x, y of the rear axle's middle [m], and heading [rad].
-        initial_speed: [m/s].
-        initial_curvature: [1/m].
-        walls: convex polygons, (V, 2) [m] each, the same for all cases; or `Obstacles` with the
-            batch's axes on every leaf.
-        movers: moving obstacles at time 0, in the form of the walls.
+        target: path of the target, such as a `TurningPath`; for a batch every leaf has a leading
+            axis B.
+        time: () or (B,) [s], of the meeting, > 0. The time and every following number is one value
+            for all cases, or one value for each case.
+        start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.
+        initial_speed: [m/s], speed at time 0.
+        initial_curvature: [1/m], curvature of the rear axle's path at time 0.
+        walls: static obstacles: convex polygons, (V, 2) [m] each, which all cases share; or
+            `Obstacles` with the batch's axes on every leaf.
+        movers: moving obstacles at time 0, as polygons or `Obstacles`, like the walls.
         mover_velocities: (2,) or (N, 2) [m/s], of the polygons in `movers`.
-        tolerance: [m], greatest distance of the body's middle from the target at the end.
-        end_heading: [rad]; free by default.
+        tolerance: [m], greatest distance of the body's middle from the target at the meeting.
+        end_heading: [rad], heading of the car at the meeting; by default any heading.
         heading_tolerance: [rad], greatest deviation from `end_heading`.
         lower: (2,) [m], corner of the map.
         upper: (2,) [m], the opposite corner.
         length: [m], of the body.
         width: [m], of the body.
-        wheelbase: [m].
-        rear_overhang: [m], from the rear axle to the rear end.
-        speed: greatest [m/s].
-        acceleration: greatest [m/s^2].
-        lateral_acceleration: greatest [m/s^2].
-        curvature: greatest [1/m].
-        steering_rate: greatest [rad/s].
-        dtype: of every floating leaf.
+        wheelbase: [m], distance between the axles.
+        rear_overhang: [m], distance of the body's rear end behind the rear axle.
+        speed: [m/s], greatest speed.
+        acceleration: [m/s^2], greatest magnitude of the acceleration along the path.
+        lateral_acceleration: [m/s^2], greatest magnitude of speed^2 * curvature.
+        curvature: [1/m], greatest magnitude of the curvature.
+        steering_rate: [rad/s], greatest rate of the steering angle.
+        dtype: type of every floating leaf.
 
     Raises:
-        ValueError: a polygon is not convex; otherwise the errors of `pj.hit.case`.
+        ValueError: a polygon is not convex. All other errors are as for `pj.hit.case`.
     """
     dtype, shapes = floating(dtype), [batch_of("start", start, 3)]
     scalars = {"time": time, "initial_speed": initial_speed, "tolerance": tolerance}
@@ -196,7 +197,7 @@ def _make_obstacles(
     batch: tuple[int, ...],
     dtype: DTypeLike,
 ) -> Obstacles:
-    """Make obstacles with the batch's axes on every leaf; errors name the argument of `case`."""
+    """Make `Obstacles` with the batch's axes from polygons; errors name the argument of `case`."""
     if isinstance(polygons, Obstacles):
         return polygons
     try:

@@ -1,14 +1,15 @@
-"""The motion of a car by speed and curvature at knots, and derivatives of costs by the knots.
+"""Car motions given by speed and curvature at knots, and derivatives of costs by these unknowns.
 
-Speed and curvature are linear in time between equally spaced knots. The heading is then a cubic in
-time, known exactly, and the position is its integral by Simpson's rule. The unknowns are the speeds
-at the knots 1..K, then the curvatures there, then the time of the end if it is free. The values at
-knot 0 are the car's state.
+Speed and curvature are linear in time between equally spaced knots. The heading, the integral of
+their product, is then a cubic polynomial on each piece between two knots. The position is computed
+by Simpson's rule. The unknowns are the speeds at the knots 1..K, the curvatures at the knots 1..K,
+and the end time if it is free. Speed and curvature at knot 0 are known from the car's state.
 
-A knot deforms the motion in the two pieces beside it. The motion after these pieces moves as one
-rigid piece, so that a small change of a knot is a twist (a, b) (3,) of it: the twist moves a pose
-at p by a + b (-p_y, p_x) and turns it by b. Gradient and curvature of a sum over samples are then
-sums over pieces and products of twists. No matrix of all samples by all unknowns is ever formed.
+A change of the values at a knot deforms the motion only on the two pieces beside the knot. All
+later pieces are displaced as one rigid body, by a twist (a, b): it moves a point p by
+a + b (-p_y, p_x) and turns headings by b. Gradient and Hessian of a cost that is a sum over samples
+therefore follow from sums over pieces and from twists (3,). The large matrix of derivatives of all
+samples by all unknowns is never formed.
 """
 
 import functools
@@ -19,46 +20,51 @@ from flax import struct
 from jax import Array, lax
 
 _HIGHEST = lax.Precision.HIGHEST
-# The five variables of a piece: speed and curvature at its start and end, and the time of the end.
+# Indices of the five variables that a piece of the motion depends on: speed at its start and end,
+# curvature at its start and end, and the end time of the whole motion.
 V_LEFT, V_RIGHT, C_LEFT, C_RIGHT, TIME = range(5)
 
 
 @struct.dataclass
 class Motion:
-    """The motion over K pieces of S equally spaced samples, the last of each at the piece's end."""
+    """A car motion of K pieces with S equally spaced samples each, the last at the piece's end."""
 
     pos: Array  # (K, S, 2) [m], of the rear axle's middle
     heading: Array  # (K, S) [rad]
-    direction: Array  # (K, S, 2), the heading's cosine and sine
+    direction: Array  # (K, S, 2), cosine and sine of the heading
     time: Array  # (K, S) [s]
-    # Derivatives of x, y, heading and time of each sample by the five variables of its own piece,
-    # and by a twist of the motion before the piece.
+    # Derivatives of x, y, heading and time of each sample by 8 variables: the five variables of its
+    # own piece, and the three components of a twist of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    right: Array  # (K, 2, 3), twist after a piece by speed and curvature at the piece's end
-    left: Array  # (K, 2, 3), twist after a piece by speed and curvature at its start
+    # Derivatives of the twist of all later pieces, by speed and curvature at the piece's end.
+    right: Array  # (K, 2, 3)
+    left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
 
 
 @struct.dataclass
 class Quadratic:
-    """A quadratic model of a cost of the motion: half its gradient and half its Hessian."""
+    """Half the gradient and half the Hessian of a cost by samples and by variables of pieces."""
 
-    push: Array  # (K, S, 4), gradient by x, y, heading and time of every sample
-    stiffness: Array  # (K, S, 4, 4), Hessian
-    piece_push: Array  # (K, 5), gradient by the five variables of each piece
-    piece_stiffness: Array  # (K, 5, 5), Hessian
+    push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
+    stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
+    piece_push: Array  # (K, 5), half gradient by the five variables of each piece
+    piece_stiffness: Array  # (K, 5, 5), half Hessian by the five variables of each piece
 
 
 @functools.cache
 def _weights(samples: int) -> tuple[np.ndarray, ...]:
-    """Return constants of a piece for its 2 S + 1 nodes at u = 0 .. 1.
+    """Return the integration weights of one piece with S samples.
 
-    The hat functions of the piece's two knots are l = 1 - u and r = u.
+    The position u on the piece is from 0 to 1. The speed and the curvature are combinations of the
+    hat functions l = 1 - u and r = u of the piece's two knots. There are 2 S + 1 equally spaced
+    nodes; every second node is a sample.
 
     Returns:
-        turned: (3, 2 S + 1), integrals of l l, l r and r r from 0 to the nodes.
-        weights: (2 S + 1, 9 S), of values at the nodes. They select each of S samples; and
-            integrate up to each sample, by Simpson's rule, the values times l, times r, and times
-            the products of l and r with the three integrals.
+        turned: (3, 2 S + 1), integrals of l^2, l r and r^2 from 0 to each node.
+        weights: (2 S + 1, 9 S), nine blocks of S columns that are applied to values f at the nodes.
+            Block 0 selects f at the samples. Blocks 1 and 2 are the integrals of f l and f r up to
+            each sample by Simpson's rule. Blocks 3 to 8 are the integrals of f times l, then r,
+            times each of the three integrals in `turned`.
     """
     u = np.linspace(0.0, 1.0, 2 * samples + 1)
     hats = np.stack([1.0 - u, u])
@@ -73,14 +79,14 @@ def _weights(samples: int) -> tuple[np.ndarray, ...]:
 
 
 def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: int) -> Motion:
-    """Return the motion of K pieces and its derivatives.
+    """Compute the samples of a car motion of K pieces, and their derivatives.
 
     Args:
         start: (3,) x, y [m] and heading [rad] at time 0.
-        time: () [s], of the last knot.
+        time: () [s], of the last knot; the first knot is at time 0.
         speed: (K + 1,) [m/s], at the knots.
         curvature: (K + 1,) [1/m], at the knots.
-        samples: number of samples of each piece, static.
+        samples: number S of samples on each piece, static.
     """
     num, dtype = speed.shape[0] - 1, speed.dtype
     turned, weights = (jnp.asarray(each, dtype) for each in _weights(samples))
@@ -93,7 +99,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     whole = angle[:, -1]
     heading = start[2] + (jnp.cumsum(whole) - whole)[:, None] + angle
     direction = jnp.concatenate([jnp.cos(heading), jnp.sin(heading)])
-    # All else follows from these sums over the nodes.
+    # One matrix product computes all integrals that positions and derivatives need.
     sums = jnp.matmul(direction, weights, precision=_HIGHEST).reshape(2, num, 9, samples)
     cos, sin = sums[:, :, 0]
     by_hat = sums[:, :, 1:3]  # (2, K, 2, S), integrals of the direction
@@ -132,8 +138,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # as twists, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # Time changes all pieces before a piece. The values at a piece's start also change the piece
-    # before it.
+    # The five variables of a piece also deform earlier pieces, which displaces the piece by a
+    # twist: the end time deforms all earlier pieces, the values at the piece's start the last one.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
@@ -172,7 +178,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
 def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
     """Return half the gradient (n,) and half the Hessian (n, n) of a cost by the n unknowns.
 
-    There are n = 2 K unknowns, or 2 K + 1 with a free time.
+    The unknowns are the speeds at the knots 1..K, then the curvatures, then the end time if it is
+    free. The chain rule is applied to `cost`, which has derivatives by the samples of `drive`.
     """
     num, samples = drive.heading.shape
     flat = drive.slope.reshape(num, samples * 4, 8)
@@ -183,12 +190,12 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     pull = forms[:, :5, 8] + cost.piece_push
 
     def shift(values: Array, by: int) -> Array:
-        """Return for each piece the value of the piece `by` later, zero past the end."""
+        """Shift values (K, ...) of pieces: result[k] = values[k + by], or zero past the end."""
         if by >= num:
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
-    # Sums over all pieces from the second one after each knot.
+    # For each knot, sums over all pieces that move rigidly with it: from the second piece after it.
     later = shift(jnp.cumsum(forms[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
     lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
     twist = drive.right + shift(drive.left, 1)  # (K, 2, 3)
@@ -199,7 +206,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     same = own[:, rights][:, :, rights] + shift(own[:, lefts][:, :, lefts], 1)
 
     def flatten(values: Array) -> Array:
-        """Reorder (K, 2, ...) in the order of the unknowns, (2 K, ...)."""
+        """Reorder values (K, 2, ...) of speeds and curvatures to (2 K, ...): first all speeds."""
         return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
 
     size = 2 * num
@@ -213,7 +220,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
         return x + y + turn
 
     def spread(values: Array) -> Array:
-        """Repeat (K, 2, 2) for all columns of the same kind of unknown, (n, n)."""
+        """Repeat values (K, 2, 2) along the columns of all speeds and of all curvatures, (n, n)."""
         return jnp.repeat(flatten(values), num, axis=1)
 
     lower = jnp.where(

@@ -1,4 +1,4 @@
-"""The plan of an interception, and functions that make it, check it and set its status."""
+"""Plans of interceptions: the class, and functions that make a plan and set its status."""
 
 import dataclasses
 
@@ -19,14 +19,14 @@ from planner_jax.task.intercept.terms import (
     meeting_terms,
 )
 
-_GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between them
+_GRAZING = 5e-3  # [m], required clearance at samples, so that nothing is touched between samples
 
 
 @struct.dataclass
 class InterceptPlan(CarPlan):
-    """One plan that ends at the meeting, or a batch of plans with a leading axis on every leaf."""
+    """A car's plan up to the meeting with its target, or a batch: each leaf has a leading axis."""
 
-    meeting: Array  # (2,) [m], expected position of the target at the end
+    meeting: Array  # (2,) [m], expected position of the target at the end of the plan
 
 
 def make_plan(
@@ -39,12 +39,13 @@ def make_plan(
     points: int,
     steps: Array,
 ) -> InterceptPlan:
-    """Make the plan of knots and check it against every limit of its case.
+    """Make a plan from speed and curvature at knots, and check it against every limit of the case.
 
     The cost of the plan is the integral of the squared acceleration [m^2/s^3] [Qu2022, eq. 8a].
-    Speed [m/s] and curvature [1/m] (K + 1,) are at equal knots up to the time () [s] of the end.
-    Obstacles are checked at `samples` points of every piece, the lateral acceleration at `points`;
-    both numbers are static. `steps` () int32 is the number of iterations.
+    Speed [m/s] and curvature [1/m], (K + 1,) each, are the values at equally spaced knots from time
+    0 to `time` () [s]. On each piece between two knots the distance from obstacles is checked at
+    `samples` positions, and the lateral acceleration at `points` positions. Both numbers are
+    static. `steps` () int32 is the number of iterations that the plan reports.
     """
     drive = motion(case.start, time, speed, curvature, samples)
     _, violation = limit_terms(case, time, speed, curvature, Weights(), points)
@@ -66,7 +67,7 @@ def make_plan(
 
 
 def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
-    """Make the unsolved plan of a case that has no other plan: constant speed and curvature."""
+    """Make a plan of status INFEASIBLE, for cases without a plan: constant speed and curvature."""
     return InterceptPlan(
         cost=jnp.zeros_like(case.time),
         violation=jnp.full_like(case.time, jnp.inf),
@@ -83,10 +84,11 @@ def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
 def explain(
     case: InterceptCase, reason: Array, plan: InterceptPlan, *, is_time_free: bool = False
 ) -> InterceptPlan:
-    """Set the status of an unsolved plan to the reason why the case has no plan.
+    """Return a plan; if it is unsolved, its status is replaced by the reason.
 
-    The status is `reason` () int32 unless the case itself is blocked or not finite. `is_time_free`
-    is true if the target may be met before the case's time.
+    The new status is BLOCKED if the start overlaps an obstacle, or the meeting does and its time is
+    fixed; NON_FINITE if a number of the case is NaN; and else `reason` () int32. `is_time_free` is
+    true if the target may be met before the case's time.
     """
     is_start_blocked, is_goal_blocked = is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked

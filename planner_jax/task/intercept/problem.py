@@ -1,11 +1,14 @@
-"""The least-squares problem of an interception, solved in stages and differentiated.
+"""The least-squares problem of an interception: cost, stages of its solution, and derivatives.
 
 The unknowns are speed and curvature at the knots 1..K, and the time of the meeting if it is free.
-The cost is a sum of squares: effort, and hinges on the miss, limits and obstacles (`terms`).
+The cost is a sum of squares (`terms`): the effort, which is the integral of the squared
+acceleration; the distance from the target at the end; and one-sided penalties (hinges) on limits
+and on distances from obstacles.
 
-The search for a path round the obstacles has no derivative. From its path, least squares lead to a
-point of least cost. This point moves smoothly with the case, and the implicit function theorem
-gives its derivatives. Only hinges on limits and obstacles that are active contribute to them.
+The search for a path round the obstacles cannot be differentiated. Its path only determines where
+least squares start and which local minimum of the cost they reach. This minimum moves smoothly with
+the numbers of the case, and the implicit function theorem gives its derivatives. Hinges that are
+zero at the minimum contribute nothing to the derivatives.
 """
 
 import dataclasses
@@ -37,43 +40,40 @@ from planner_jax.task.intercept.terms import (
     obstacle_terms,
 )
 
-_SOONEST = 0.01  # least time of a meeting, as a share of the case's time
+_SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
-# Weights of each stage.
+# Weights of the cost in each stage: follow the path of cells; meet all limits; reduce the effort.
 _FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = Weights()
 _SETTLING = Weights(effort=10.0)
-_HURRYING = Weights(early=1000.0)  # replaces `_SETTLING` for meetings as early as possible
-# Weight of an early meeting when the cost is differentiated: so small beside the weight of limits
-# that the point of least cost stays within their slack.
+_HURRYING = Weights(early=1000.0)  # of the last stage if the meeting shall be as early as possible
+# Weight of the meeting time when the cost is differentiated. It is small beside the weight of the
+# limits, so that the minimum exceeds no limit: the penalties start before a limit is reached.
 _EARLY = 30.0
 
 
 @struct.dataclass
 class Stage:
-    """A number of least-squares steps with the same weights."""
+    """A stage of the search: Levenberg-Marquardt steps with fixed weights of the cost."""
 
     weights: Weights
-    steps: Array | int  # at most
-    tolerance: Array | float = 1.0  # of `LevenbergConfig`; 1 ends at the first feasible point
-    settled: Array | int = 1  # of `LevenbergConfig`
-    only_feasible: Array | bool = False  # whether a point that breaks a limit is left unchanged
+    steps: Array | int  # greatest number of steps
+    tolerance: Array | float = 1.0  # as in `LevenbergConfig`; 1 ends at the first feasible point
+    settled: Array | int = 1  # as in `LevenbergConfig`
+    only_feasible: Array | bool = False  # whether to skip the stage at a point that breaks a limit
 
 
 @struct.dataclass
 class Guess:
-    """A starting point of least squares, and the positions on a path of cells."""
+    """A starting point of least squares, and the positions that its first stage follows."""
 
     point: Array  # (n,), unknowns
-    positions: Array  # (K, 2) [m], of the rear axle's middle at the knots 1..K
+    positions: Array  # (K, 2) [m], rear axle's middle at the knots 1..K, on a path of cells
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionProblem:
-    """The least-squares problem of a planner; static.
-
-    `SpacetimeIntercept` describes the fields.
-    """
+    """The least-squares problem of `SpacetimeIntercept`, which describes the fields; static."""
 
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32
@@ -82,21 +82,21 @@ class MotionProblem:
 
     @property
     def is_time_free(self) -> bool:
-        """True if the meeting time is an unknown."""
+        """Whether the time of the meeting is an unknown instead of a number of the case."""
         return self.meet != "given"
 
     @property
     def weights(self) -> Weights:
-        """The cost weights of the last stage of least squares; early meetings weigh the time."""
+        """Weights of the cost in the last stage, which reduces the meeting time or the effort."""
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:
-        """Return the unknowns (..., n) of values (..., K) at the knots 1..K and a time (...)."""
+        """Join speed and curvature (..., K) at knots 1..K, and a free time (...), as unknowns."""
         parts = [speed, curvature, time[..., None]]
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
-        """Return speed and curvature at all knots, (K + 1,) each, and the time of the meeting."""
+        """Return speed and curvature (K + 1,) at knots 0..K, and the meeting time, of unknowns."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
         time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
         return (
@@ -106,24 +106,29 @@ class MotionProblem:
         )
 
     def decode(self, case: InterceptCase, point: Array, steps: Array) -> InterceptPlan:
-        """Make the plan of a point and check it at more samples than least squares use."""
+        """Make the plan of unknowns (n,), and check limits at more samples than the cost uses."""
         speed, curvature, time = self.unpack(case, point)
         plan = make_plan(case, time, speed, curvature, samples=self.checked, points=12, steps=steps)
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def guess_at(self, point: Array) -> Guess:
-        """Return a guess at unknowns (n,) for stages that follow no path of cells."""
+        """Return a guess with unknowns (n,) and positions of zero, if no stage follows a path."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
-        """Return a guess that follows a path of cells up to a layer () int32."""
+        """Return a guess whose motion follows a path of cells, headings and speeds over time.
+
+        The path has an entry for each of some equally spaced times, the layers of the grid. At the
+        layer with the index `layer` () int32 it meets the target.
+        """
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
         steps = layer.astype(pace.dtype) + 0.5
-        at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)  # in steps
+        # Times of the knots 1..K, in units of the time between two layers.
+        at = jnp.arange(1, self.pieces + 1, dtype=steps.dtype) * (steps / self.pieces)
 
         def interpolate(values: Array, first: Array, at: Array) -> Array:
-            """Interpolate values on the path: `first` at time 0, then one value at every step."""
+            """Interpolate linearly at times `at`: `first` at time 0, then a value at each layer."""
             at = jnp.clip(at - 1.0, -1.0, layer.astype(at.dtype) - 1.0)
             below = jnp.floor(at).astype(jnp.int32)
             share, is_first = (
@@ -135,10 +140,12 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi  # bin 0 plus whole turns
+        # [rad], initial heading relative to bin 0: 0 plus the whole turns of the unwrapped bins.
+        straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step
-        # The car starts with a rate of its own: the first two rates make up for the lag in heading.
+        # The car starts with its own turn rate instead of the path's. The turn rates at the knots 1
+        # and 2 are changed to make up for the difference that this causes in all later headings.
         time = steps * grid.step
         knot = time / self.pieces
         first = case.speed * case.curvature
@@ -160,10 +167,10 @@ class MotionProblem:
         positions: Array,
         discs: int = 3,
     ) -> Model:
-        """Return the sum of squares at a point (n,) of unknowns, and its quadratic model.
+        """Return the cost, a sum of squares, at unknowns (n,), and its quadratic model.
 
-        The cost of following is the distance from positions (K, 2) [m]. A static number of discs
-        covers the body.
+        `field` has the distances from walls. `positions` (K, 2) [m] are the points that the rear
+        axle should follow at the knots 1..K. A static number of discs covers the car's body.
         """
         speed, curvature, time = self.unpack(case, point)
         drive = motion(case.start, time, speed, curvature, self.samples)
@@ -181,7 +188,8 @@ class MotionProblem:
         gradient, curvature = by_unknowns(drive, cost, self.is_time_free)
         total = jnp.sum(squares[..., 4, 4]) + jnp.sum(limits[:, 5, 5])
         if self.is_time_free:
-            # Penalise a meeting later than the case's time, and weigh an early one.
+            # Add two costs of the meeting time: a penalty if it exceeds the case's time, and, if
+            # the meeting shall be early, the square of the time.
             late = jnp.maximum(point[-1] / case.time - 1.0, 0.0)
             pull = weights.early if self.meet == "early" else 0.0
             push = (weights.limit * late + pull * time / case.time) / case.time
@@ -197,11 +205,11 @@ class MotionProblem:
         )
 
     def list_stages(self, attempt: Search) -> list[Stage]:
-        """List the stages of a guess along a path of cells."""
+        """Return the stages of least squares from a guess that follows a path of cells."""
         return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
-        """List the stages of a guess that is close to a plan."""
+        """Return the last two stages: meet all limits, then reduce the effort or the time."""
         margins = {"margin": attempt.margin, "slack": attempt.slack}
         keeping = Stage(dataclasses.replace(_KEEPING, **margins), attempt.solver.max_steps)
         if self.is_time_free:
@@ -224,8 +232,8 @@ class MotionProblem:
         """Run S stages of least squares, each from the point at which the previous stage ended.
 
         Returns:
-            points: (S, n), the ends of the stages.
-            steps: () int32, of all stages together.
+            points: (S, n), unknowns at the end of each stage.
+            steps: () int32, number of iterations of all stages together.
         """
 
         def run(state: tuple[Array, Array], stage: Stage) -> tuple[tuple, LevenbergState]:
@@ -243,7 +251,7 @@ class MotionProblem:
             end = least_squares(model, point, config)
             return (end.point, end.model.violation <= 0.0), end
 
-        # A loop over stages, so that all stages share one compiled step.
+        # `scan` over the stages, so that one compiled loop serves all stages.
         stacked = jax.tree.map(lambda *each: jnp.stack([jnp.asarray(x) for x in each]), *stages)
         _, ends = lax.scan(run, (guess.point, jnp.asarray(False)), stacked)
         return ends.point, jnp.sum(ends.steps).astype(jnp.int32)
@@ -256,7 +264,7 @@ class MotionProblem:
         attempt: Search | Warm,
         stages: list[Stage],
     ) -> InterceptPlan:
-        """Return the plan after the last stage, or the plan before it if that is better."""
+        """Run the stages from a guess; return the better of the plans before and after the last."""
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
@@ -265,7 +273,7 @@ class MotionProblem:
     def refine_solved(
         self, case: InterceptCase, field: DistanceField, plan: InterceptPlan, attempt: Search
     ) -> InterceptPlan:
-        """Run the last stage from a plan if it is solved, and return the better plan."""
+        """Run the last stage from a plan that is solved, and return the better of both plans."""
         guess = self.guess_at(self.pack(plan.speed[1:], plan.curvature[1:], plan.time))
         last = self.list_last_stages(attempt)[-1]
         steps = jnp.where(is_solved(plan.status), last.steps, 0)
@@ -276,35 +284,35 @@ class MotionProblem:
 
 @struct.dataclass
 class StartedCase(InterceptCase):
-    """A case with a starting point for least squares."""
+    """A case, and the unknowns of a plan of it, from which least squares start."""
 
-    start_point: Array  # (n,) unknowns of a plan, constant under differentiation
+    start_point: Array  # (n,) unknowns, treated as constant when the case is differentiated
 
 
 @struct.dataclass
 class _Context:
     case: StartedCase
-    moving: StartedCase  # the case with its walls among the movers
-    field: DistanceField  # without walls
+    moving: StartedCase  # the case with its walls added to the movers, at speed 0
+    field: DistanceField  # distances of a map without walls
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class SmoothIntercept(OptimisedPlanner):
-    """Planner that minimises the sum of squares of a `MotionProblem` from another plan."""
+    """Planner that minimises the cost of a `MotionProblem` from a plan; used by `pj.gradient`."""
 
     case_type: ClassVar[type] = StartedCase
     adjoint: ClassVar[str] = "whole"
     problem: MotionProblem = MotionProblem()
     solver: LevenbergConfig = LevenbergConfig(2000, settled=12, tolerance=1e-9)
-    # No rounds: least squares run until they converge.
+    # A single round without steps of L-BFGS: `guesses` already returns the minimum.
     rounds: tuple[Round, ...] = (Round(solver=LbfgsConfig(max_steps=0)),)
 
     def prepare(self, case: StartedCase) -> _Context:
-        """Return the case, and the same case with the walls as movers at standstill.
+        """Return the case, and a copy in which the walls are moving obstacles with speed 0.
 
-        Distances from movers are exact. Distances from the field of the walls are interpolated, so
-        that their derivatives jump between nodes.
+        Distances from moving obstacles are computed exactly. Distances from walls are usually
+        interpolated on a grid, so that their derivatives are discontinuous.
         """
         nowhere = jnp.full((2, 2), 1e3, case.lower.dtype)
         return _Context(
@@ -314,44 +322,44 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the point of least cost, (num, n): the same point for every guess."""
+        """Return the minimum of the cost near the starting point, repeated: (num, n)."""
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
         return jnp.broadcast_to(end.point, (num, *end.point.shape))
 
     def _model(self, point: Array, context: _Context) -> Model:
-        """Return the sum of squares and its quadratic model."""
+        """Return the cost at unknowns (n,) and its quadratic model; see `build_model`."""
         problem = self.problem
         weights = dataclasses.replace(problem.weights, early=_EARLY)
         positions = problem.guess_at(point).positions
         return problem.build_model(point, context.moving, context.field, weights, positions)
 
     def _exact_model(self, point: Array, context: _Context) -> Model:
-        """Return the model with the exact gradient of the cost.
+        """Return the quadratic model with the gradient of the cost by automatic differentiation.
 
-        The problem's own gradient neglects how the limit on the rate of curvature changes with the
-        curvature.
+        The gradient of `build_model` is approximate: it neglects that the conversion from the rate
+        of curvature to the steering rate depends on the curvature.
         """
         model = self._model(point, context)
         gradient = jax.grad(lambda x: self.objective(x, context).cost)(point)
-        # The `gradient` of a `Model` is half the slope of the cost
+        # The field `gradient` of a `Model` is half the gradient of the cost.
         return dataclasses.replace(model, gradient=0.5 * gradient)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Return the sum of squares and the largest violation at a point (n,)."""
+        """Return the cost at unknowns (n,), and the largest relative excess over a limit."""
         model = self._model(point, context)
         return Evaluation(cost=model.cost, violation=model.violation)
 
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
-        """Return the plan of a point."""
+        """Return the plan of unknowns (n,)."""
         return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
-        """Return the planner itself: its plans are optimal already."""
+        """Return the planner unchanged: its plans need no Newton steps, as they are minima."""
         return self
 
 
 def add_start(case: InterceptCase, point: Array) -> StartedCase:
-    """Return a case, or a batch, with a starting point (n,) or (B, n)."""
+    """Add to a case, or a batch, unknowns (n,) or (B, n) from which least squares start."""
     return StartedCase(**vars(case), start_point=lax.stop_gradient(point))

@@ -1,4 +1,8 @@
-"""Searches for starting points of an interception: their settings, and the reach set of a case."""
+"""Searches for starting points of an interception: their settings, and the reach set of a case.
+
+The reach set (`plane.reach`) holds one bit for every cell, heading, speed and time: whether the car
+can be there. Random paths through the set are the starting points of least squares.
+"""
 
 import dataclasses
 
@@ -16,30 +20,30 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory of a path, and of a word of a reach set, in units of a start of a planner of few unknowns.
+# Memory of a path, and of a 32-bit word of a reach set, in units of one guess of a small planner.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
-_FIELD = 128  # nodes of the distance field along either side of the map
+_FIELD = 128  # number of nodes of the grid of distances from walls, along each side of the map
 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt at a case: random paths, and least squares from each; static."""
+    """Settings of one attempt: draw random paths, and run least squares from each; static."""
 
     starts: int = dataclasses.field(init=False, default=1)
-    paths: int = 16  # number of paths
-    solver: LevenbergConfig = LevenbergConfig()  # of the stage that meets all limits
-    following: int = 4  # steps of the stage that follows the path of cells
-    settling: int = 16  # steps of the last stage, towards less effort or an earlier meeting
-    margin: float = 0.03  # [m], distance from obstacles at which hinges start
-    slack: float = 0.015  # hinges start at (1 - slack) times a limit
-    discs: int = 3  # that cover the body in least squares
-    seed: int = 0  # of the paths
-    candidates: int = 4  # paths that are drawn for each path; the smoothest is used
-    directness: float = 2.0  # of paths; see `cell_paths.draw_path`
+    paths: int = 16  # number of paths from which least squares run
+    solver: LevenbergConfig = LevenbergConfig()  # settings of the stage that meets all limits
+    following: int = 4  # number of steps of the first stage, which follows the path of cells
+    settling: int = 16  # number of steps of the last stage, which reduces the effort or the time
+    margin: float = 0.03  # [m], distance from obstacles below which they are penalised
+    slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
+    discs: int = 3  # number of discs that cover the car's body in least squares
+    seed: int = 0  # seed of the random paths
+    candidates: int = 4  # number of random paths of which the smoothest is used as one path
+    directness: float = 2.0  # preference for straight paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
-    # Factor on the body's radius in the reach set. Below 1 it admits paths that the rounding to
-    # cells closes.
+    # Factor on the body's radius in the reach set. The set is conservative, because obstacles are
+    # rounded to whole cells. A factor below 1 admits narrow passages that are open in truth.
     body_scale: float = 1.0
 
     def __post_init__(self) -> None:
@@ -51,16 +55,16 @@ class Search(Attempt):
         object.__setattr__(self, "starts", starts)
 
     def draw_noise(self) -> cell_paths.PathNoise:
-        """Draw the noise of every path; leaves have a leading axis for the paths."""
+        """Draw the random numbers that select each path; leaves have a leading axis `paths`."""
         return cell_paths.draw_noise(self.lattice, self.paths, self.seed, self.candidates)
 
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """An attempt at re-planning: least squares from the remainder of the previous plan; static."""
+    """Settings of re-planning: least squares start from the previous plan's remainder; static."""
 
     solver: LevenbergConfig = LevenbergConfig(8)
-    settling: int = 4  # this and the other fields are as in `Search`
+    settling: int = 4  # number of steps of the last stage; all fields are as in `Search`
     margin: float = 0.03
     slack: float = 0.015
     discs: int = 3
@@ -75,14 +79,16 @@ QUICK = tuple(
     dataclasses.replace(search, paths=paths, solver=LevenbergConfig(steps), settling=12)
     for search, paths, steps in zip(_GIVEN, (2, 4, 6), (8, 10, 14), strict=True)
 )
-# For a car that starts beside a wall: many paths with almost no margin.
+# Attempts for cars that start close to a wall and cannot keep a large distance from it: many paths,
+# and penalties only at distances below 6 mm from obstacles.
 _NARROW = tuple(
     Search(64, LevenbergConfig(60), seed=seed, body_scale=girth, margin=0.006, slack=1e-3, discs=7)
     for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
 )
 BEST = (dataclasses.replace(_GIVEN[0], paths=8, settling=48), *_GIVEN[1:], *_NARROW)
-# If the time is free, least squares run from every path until they improve little, and the best
-# plan is selected. Meetings are earlier if no stage follows the cells.
+# First attempt if the time of the meeting is free: least squares run from every path until the cost
+# falls by less than 0.05 % a step, and the best plan is selected. The stage that follows the cells
+# is left out, because it delays the meeting.
 _EARLY = Search(
     32,
     LevenbergConfig(60, tolerance=5e-4),
@@ -105,26 +111,26 @@ SEARCHES = {
 
 @struct.dataclass
 class Reachability:
-    """The grid, the distance field and the reach set of a case, which all its paths share."""
+    """Grid, distances from walls, and reach set of a case: the data from which paths are drawn."""
 
     grid: reach.Grid
-    field: DistanceField  # of the walls
+    field: DistanceField  # distances from the walls
     reach: reach.ReachSet
-    layers: Array  # (layers + 1,) bool, layers at which a path of cells meets the target
+    layers: Array  # (layers + 1,) bool, whether the car can meet the target at each layer in time
 
     @property
     def is_reached(self) -> Array:
-        """True if a path of cells meets the target, () bool."""
+        """Whether a path through the reach set meets the target, () bool."""
         return jnp.any(self.layers)
 
 
 def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
-    """Make the grid of cells and layers of a case."""
+    """Return the grid of a case: cells that cover its map, and layers in time up to its horizon."""
     return reach.grid_of(lattice, case.start, case.time, case.limits.speed, case.lower, case.upper)
 
 
 def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
-    """Compute the distances from the walls, at one or more nodes for each cell."""
+    """Compute the distance from the walls at the nodes of a grid that is as fine as the cells."""
     spacing = grid.cell * (grid.lattice.cells / _FIELD)
     return distance_field(case.walls, grid.corner, spacing, _FIELD)
 
@@ -132,9 +138,10 @@ def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
 def search_reach(
     case: InterceptCase, search: Search, *, is_time_free: bool, layers: Array | None = None
 ) -> Reachability:
-    """Compute the reach set of a case, by default for the layers up to the case's time.
+    """Compute which cells the car can reach at which times, and when it can meet the target.
 
-    `is_time_free` is true if earlier layers may meet the target.
+    The times are `layers` layers, by default up to the case's time. `is_time_free` is true if the
+    target may be met before the case's time.
     """
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)
@@ -167,7 +174,7 @@ def search_reach(
 def _meeting_cells(
     case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
 ) -> tuple[Array, Array]:
-    """Return the cells of a layer at which the target is met; see `reach.goal_cells`."""
+    """Return the cells around the target at a layer in time, as in `reach.goal_cells`."""
     goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
     width = 2.0 * np.pi / num
@@ -183,21 +190,22 @@ def draw_cell_path(
     noise: cell_paths.PathNoise,
     directness: float,
 ) -> cell_paths.CellPath:
-    """Draw a random path of cells that meets the target at a layer () int32."""
+    """Draw a random path through the reach set to the target's cell at a layer () int32 in time."""
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
     draw = cell_paths.draw_path
     return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)
 
 
-# All values are explicit: published cases depend on them.
+# Settings of `earliest_arrival`. They do not use the defaults of `Search`, because the cases of the
+# suite `rush` depend on these values and must not change if a default changes.
 _ARRIVAL = Search(paths=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), body_scale=1.0)
 
 
 def earliest_arrival(case: InterceptCase) -> Array:
-    """Return the time () [s] of the first layer of a reach set that meets one case's target; pure.
+    """Estimate the earliest time () [s] at which the car of one case can meet its target; pure.
 
-    The layers are about half a second apart if the case's time is 10 s. The result is infinite if
-    no layer up to that time meets the target. No path is drawn, and nothing is optimised.
+    The estimate is the first time in the reach set (about 20 times up to 10 s) at which the car can
+    be at the target; infinite if there is none up to the case's time. Nothing is optimised.
     """
     found = search_reach(case, _ARRIVAL, is_time_free=True)
     first = jnp.argmax(found.layers).astype(case.time.dtype)

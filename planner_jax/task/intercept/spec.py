@@ -1,4 +1,4 @@
-"""Specification of the task `intercept` for the registry; imports no JAX."""
+"""Registry entry of the task `intercept`: names of planners and suites. It imports no JAX."""
 
 import dataclasses
 
@@ -7,25 +7,26 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A kind of interception: numbers of obstacles, and the time of the meeting.
+    """A family of random interceptions: numbers of obstacles, and the time of the meeting.
 
-    The shapes of a suite's arrays depend on its rooms only, so that all its cases share a compiled
-    program.
+    The arrays of obstacles have the sizes `wall_room` and `mover_room` for any number of obstacles,
+    so that all cases of a suite share one compiled program.
     """
 
     description: str
-    num_walls: tuple[int, int]  # fewest and most; in a maze, of walls across the map
-    num_movers: tuple[int, int]  # fewest and most
-    mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s]
+    num_walls: tuple[int, int]  # least and greatest number of walls; in a maze, across the map
+    num_movers: tuple[int, int]  # least and greatest number of moving obstacles
+    mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s], range of moving obstacles' speeds
     time: float = 10.0  # [s], of the meeting
-    spare: float | None = None  # [s]; if not None, the meeting is so long after a reach set's first
+    # [s], time from the earliest arrival by the reach set to the meeting; None: it is at `time`.
+    spare: float | None = None
     is_maze: bool = False
-    wall_room: tuple[int, int] = (12, 6)  # numbers of polygons and corners that the arrays hold
-    mover_room: tuple[int, int] = (4, 6)
-    num_targets: tuple[int, int] = (1, 1)  # fewest and most
+    wall_room: tuple[int, int] = (12, 6)  # sizes of the array of walls: polygons, corners of each
+    mover_room: tuple[int, int] = (4, 6)  # sizes of the array of moving obstacles, as for walls
+    num_targets: tuple[int, int] = (1, 1)  # least and greatest number of targets
 
 
-# `planner_jax.task.intercept.suites` has the other ranges.
+# `planner_jax.task.intercept.suites` defines all ranges that are not fields of `Suite`.
 SUITES = {
     "easy": Suite("Four to six walls and one mover.", (4, 6), (1, 1)),
     "medium": Suite("Seven to nine walls, two or three movers.", (7, 9), (2, 3)),

@@ -1,10 +1,10 @@
 """Named, seeded suites of interceptions on a map of 8 m x 8 m.
 
-[Qu2022] shows one map (Section V) and states no ranges. The ranges here and in
-`planner_jax.task.intercept.spec` are this library's. They are fixed for each name of a suite: other
-ranges need another name. All draws are uniform; the car is the default of `case`; SI units.
+[Qu2022] shows one map (Section V) and states no ranges. This library defines the ranges, here and
+in `planner_jax.task.intercept.spec`. The ranges of a suite never change; other ranges need another
+name. All distributions are uniform. The car is the default of `case`. SI units.
 
-| what | drawn from |
+| quantity | range |
 |---|---|
 | start | x 0.8 m, y 1 to 7 m, heading 0, 0.5 m/s |
 | target | 0.2 to 0.5 m/s in any direction; half of them turn, at 0.03 to 0.1 rad/s |
@@ -12,27 +12,32 @@ ranges need another name. All draws are uniform; the car is the default of `case
 | walls | 3 to 6 corners on a circle of 0.2 to 0.8 m anywhere on the map |
 | movers | 4 to 6 corners on a circle of 0.2 to 0.4 m, 0.1 to 0.6 m/s (`storm`: 0.2 to 1 m/s) |
 
-A mover crosses the straight line from start to meeting point in any direction at 0.2 to 0.8 of the
-time. Its middle is then at the point of a car that drives along this line at constant speed.
+A mover, that is a moving obstacle, obstructs a car that drives straight from the start to the
+meeting point at constant speed: at 0.2 to 0.8 of the meeting time both are at the same point. The
+mover crosses there in any direction.
 
 A maze has walls of 0.2 m across the whole map, each with a gap of 0.7 to 1.1 m. Two arms of 0.5
 to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end where the straight line to
 the meeting point runs into a wall, or at the nearest position that leaves the gap open. Walls less
-than 2.5 m from the map's edge have no arms, so that the start has room to turn.
+than 2.5 m from the map's edge have no arms, so that the car has space to turn at the start.
 
-The suite `rush` draws the cases of `hard` with a seed of its own. Its meeting is not at 10 s, but
-0.5 s after the first layer of the reach set that meets the target (`searches.earliest_arrival`, in
-double precision), so that the time differs from case to case.
+The suite `rush` has the distributions of `hard` and its own seed. The meeting is not at 10 s, but
+0.5 s after the earliest arrival that a coarse reach set predicts (`searches.earliest_arrival`, in
+double precision). The meeting time therefore differs from case to case.
 
 Whether the target turns, and the numbers of walls and movers, are drawn once for each case. All
-else is drawn again until no cause of rejection (`_APPLIES`) applies.
+other quantities are drawn again until no cause of rejection (`_APPLIES`) applies.
 
-Draws are dictionaries of arrays with leading axis B: "start" and "meeting" (B, 2) [m], of the rear
-axle's middle and of the target; the "time" (B,) [s] of the meeting, and whether the target is
-"reached" (B,) by then; the target's "pos" (B, 2) [m], "angle" [rad] and "speed" [m/s] at time 0,
-and its turn "rate" [rad/s]; corners of "walls" and, at time 0, "movers" (B, N, V, 2) [m],
-counter-clockwise and possibly repeated; "walls present" and "movers present" (B, N); and the
-"velocity" (B, N, 2) [m/s] of movers.
+In this module, draws are dictionaries of arrays with leading axis B:
+
+| key | shape | content |
+|---|---|---|
+| start, meeting | (B, 2) | [m], rear axle's middle at time 0; target at the meeting |
+| time, reached | (B,) | [s], of the meeting; bool, whether the car can be there by then |
+| pos, angle, speed, rate | (B, 2), (B,) | [m], [rad], [m/s], [rad/s]: the target at time 0 |
+| walls, movers | (B, N, V, 2) | [m], corners at time 0, counter-clockwise, may be repeated |
+| walls present, movers present | (B, N) | bool, whether each obstacle exists |
+| velocity | (B, N, 2) | [m/s], of the movers |
 """
 
 import dataclasses
@@ -55,37 +60,37 @@ from planner_jax.task.intercept.searches import earliest_arrival
 from planner_jax.task.intercept.spec import SUITES, Suite
 
 SIZE = 8.0  # [m], side of the map
-TOP_SPEED = 1.5  # [m/s]
-BODY_MIDDLE = 0.15  # [m], ahead of the rear axle
-START_ROOM = 0.35  # [m], from the body's middle at the start to walls and movers
-MEETING_ROOM = 0.4  # [m], from the meeting point to walls and movers
-TARGET_ROOM = 0.05  # [m], from the target to walls
-BODY_ROOM = 0.13  # [m], from the middle of the driving body to walls: half its width
-_STEP = 0.1  # [s], between tested positions of a target
-_CELL = 0.1  # [m], side of a cell of the grid on which paths are tested
-START_X, START_SPEED = 0.8, 0.5  # [m], [m/s]
-EDGE_ROOM = 0.3  # [m], from the meeting point to the edge of the map
+TOP_SPEED = 1.5  # [m/s], greatest speed of the car
+BODY_MIDDLE = 0.15  # [m], distance of the body's middle ahead of the rear axle
+START_ROOM = 0.35  # [m], least distance of the body's middle at the start from walls and movers
+MEETING_ROOM = 0.4  # [m], least distance of the meeting point from walls and movers
+TARGET_ROOM = 0.05  # [m], least distance of the target's path from walls
+BODY_ROOM = 0.13  # [m], least distance of the body's middle from walls: half the body's width
+_STEP = 0.1  # [s], between two positions of a target that are tested
+_CELL = 0.1  # [m], side of a cell of the grid on which `_is_separated` searches a path
+START_X, START_SPEED = 0.8, 0.5  # [m], [m/s], of the car at time 0
+EDGE_ROOM = 0.3  # [m], least distance of the meeting point from the edge of the map
 THICKNESS = 0.2  # [m], of a maze's walls
 _SHAPE = 9  # random numbers for a polygon: radius, number of corners, rotation, six angles
 
-Draws = dict[str, np.ndarray]  # leaves with leading axis B; see above
+Draws = dict[str, np.ndarray]  # arrays by key, as in the table of the module's docstring
 
 
 @dataclasses.dataclass(frozen=True)
 class Drawn:
-    """Cases of a suite, and the numbers of draws that they took."""
+    """B random cases of a suite, and how many candidates were drawn and rejected for each case."""
 
     cases: InterceptCase  # leaves with leading axis B
-    draws: np.ndarray  # (B,) int, including the accepted draw
-    rejected: dict[str, np.ndarray]  # cause -> (B,) int, draws that it rejected first
+    draws: np.ndarray  # (B,) int, number of candidates, including the accepted candidate
+    rejected: dict[str, np.ndarray]  # cause of rejection -> (B,) int, number of candidates
 
 
 def draw_with_counts(
     suite: str, num: int, seed: int, first: int = 0, *, dtype: DTypeLike = jnp.float32
 ) -> Drawn:
-    """Draw a batch of cases of a suite in float64, cast it, and count the rejected draws.
+    """Draw a batch of cases in float64, cast it to `dtype`, and count the rejected candidates.
 
-    Arguments and errors are as for `pj.hit.draw`; `suite` is a key of `SUITES`.
+    `suite` is a key of `SUITES`. Other arguments and the errors are as for `pj.hit.draw`.
     """
     require_name(SUITES, "suite", suite)
     spec, randoms, dtype = SUITES[suite], make_generators(suite, num, seed, first), floating(dtype)
@@ -96,12 +101,12 @@ def draw_with_counts(
 def draw_accepted(
     spec: Suite, randoms: list[np.random.Generator]
 ) -> tuple[Draws, np.ndarray, dict[str, np.ndarray]]:
-    """Draw from every generator until no cause of rejection applies.
+    """Draw candidates for each case from its random generator until one is accepted.
 
     Returns:
-        accepted: the last draw of each of the B generators.
-        counts: (B,) int, `Drawn.draws`.
-        rejected: `Drawn.rejected`.
+        accepted: the accepted candidates of B cases, as arrays with leading axis B.
+        counts: (B,) int, number of candidates for each case.
+        rejected: cause of rejection -> (B,) int, number of candidates that it rejected.
     """
     num = len(randoms)
     kinds = np.stack([random.random(3) for random in randoms])
@@ -128,17 +133,17 @@ def draw_accepted(
 
 
 def _count_numbers(suite: Suite) -> int:
-    """Return the number of random numbers of one draw."""
+    """Return how many random numbers one candidate case of a suite takes."""
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
 def _between(uniform: np.ndarray, low: float | np.ndarray, high: float) -> np.ndarray:
-    """Map numbers of [0, 1) to an interval."""
+    """Map uniform random numbers of [0, 1) to the interval from `low` to `high`."""
     return low + uniform * (high - low)
 
 
 def _integer(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
-    """Map numbers of [0, 1) to integers from the fewest to the most."""
+    """Map uniform random numbers of [0, 1) to integers from `fewest` to `most`, inclusive."""
     return np.floor(_between(uniform, fewest, most + 1)).astype(int)
 
 
@@ -148,10 +153,10 @@ def _unit(angle: np.ndarray) -> np.ndarray:
 
 
 def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Make one draw for each of B cases from numbers of [0, 1).
+    """Make one candidate for each of B cases from uniform random numbers of [0, 1).
 
-    `kinds` (B, 3) are the same for all draws of a case; `uniform` has the shape
-    (B, `_count_numbers(suite)`).
+    `kinds` (B, 3) is the same for all candidates of a case: it determines whether the target turns,
+    and the numbers of walls and movers. `uniform` has the shape (B, `_count_numbers(suite)`).
     """
     turning, count_walls = kinds[:, 0] < 0.5, _integer(kinds[:, 1], *suite.num_walls)
     count_movers = _integer(kinds[:, 2], *suite.num_movers)
@@ -191,14 +196,14 @@ def _candidates(suite: Suite, kinds: np.ndarray, uniform: np.ndarray) -> Draws:
 
 
 def anywhere(uniform: np.ndarray) -> np.ndarray:
-    """Map numbers (..., 2) of [0, 1) to meeting points [m] on the map."""
+    """Map uniform random numbers (..., 2) of [0, 1) to meeting points [m] on the map."""
     return _between(uniform, EDGE_ROOM, SIZE - EDGE_ROOM)
 
 
 def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Return the entries of draws for targets that are at `meeting` (B, 2) [m] at a time [s].
+    """Return random targets that are at the points `meeting` (B, 2) [m] at the time `time` [s].
 
-    Targets turn if `turning` (B,) bool; `uniform` (B, 4) are numbers of [0, 1).
+    Targets drive in a circle where `turning` (B,) is true. `uniform` (B, 4) are numbers of [0, 1).
     """
     side = np.where(uniform[:, 3] < 0.5, 1.0, -1.0)
     rate = np.where(turning, side * _between(uniform[:, 2], 0.03, 0.1), 0.0)
@@ -208,7 +213,7 @@ def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np
 
 
 def _shorten_time(suite: Suite, draws: Draws) -> Draws:
-    """Return draws with an earlier meeting, and whether the target can be "reached" by then."""
+    """Return candidates in which the meeting is `spare` after the earliest estimated arrival."""
     with jax.enable_x64(True):
         cases = jax.tree.map(np.asarray, cases_of(draws, jnp.float64))
         num = len(draws["time"])
@@ -219,16 +224,16 @@ def _shorten_time(suite: Suite, draws: Draws) -> Draws:
     return {**draws, "time": time, "reached": reached, "meeting": draws["pos"] + moved}
 
 
-# One case at a time, so that the result does not depend on the batch.
+# Compiled for one case, so that rounding errors do not depend on the size of the batch.
 _earliest = jax.jit(earliest_arrival)
 
 
 def _polygons(
     uniform: np.ndarray, corners: tuple[int, int], radius: tuple[float, float]
 ) -> np.ndarray:
-    """Make convex polygons (..., 6, 2) [m] around the origin from `_SHAPE` numbers each.
+    """Make convex polygons (..., 6, 2) [m] around the origin from `_SHAPE` random numbers each.
 
-    The corners lie on a circle, counter-clockwise; the last corner is repeated.
+    The corners lie on a circle, counter-clockwise; if there are fewer than six, the last repeats.
     """
     size, num = _between(uniform[..., 0], *radius), _integer(uniform[..., 1], *corners)[..., None]
     index = np.minimum(np.arange(6), num - 1)
@@ -238,7 +243,7 @@ def _polygons(
 
 
 def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Map numbers (B, 3) of [0, 1) to the x positions [m] of a maze's walls."""
+    """Map random numbers (B, 3) of [0, 1) to the x positions [m] of a maze's 2 or 3 walls."""
     even = np.where((count == 2)[:, None], [2.9, 5.5, SIZE], [2.2, 4.1, 6.0])
     return even + _between(uniform, -0.2, 0.2)
 
@@ -246,10 +251,10 @@ def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _maze(
     uniform: np.ndarray, across: np.ndarray, count: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (B, 12, 6, 2) [m] of a maze's polygons, and whether they exist, (B, 12).
+    """Return corners (B, 12, 6, 2) [m] of a maze's rectangles, and whether they exist, (B, 12).
 
-    The first `count` (B,) walls at `across` (B, 3) [m] exist. Straight lines from start to end run
-    into dead ends. The first three rows of `uniform` (B, 12, M) are used.
+    The first `count` (B,) walls at the x positions `across` (B, 3) [m] exist. Dead ends lie on the
+    straight line from start to end. Only the first three rows of `uniform` (B, 12, M) are used.
     """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
@@ -257,7 +262,8 @@ def _maze(
     outer = mouth + THICKNESS
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
-    # The line's position, or the nearest position beside the gap that leaves enough space.
+    # y position [m] of the dead end: where the straight line crosses the wall, moved as little as
+    # possible so that the arms leave the gap open.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)
@@ -284,7 +290,7 @@ def _boxes(left, low, right, high) -> np.ndarray:
 
 
 def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
-    """Return the paths of the targets of draws."""
+    """Return the paths of the targets in draws, which are dictionaries of arrays."""
     return TurningPath(
         pos=jnp.asarray(draws["pos"], dtype),
         vel=jnp.asarray(draws["speed"][..., None] * _unit(draws["angle"]), dtype),
@@ -293,7 +299,7 @@ def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
 
 
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
-    """Return the cases of accepted draws."""
+    """Make cases from draws, which are dictionaries of arrays, in a floating-point type."""
 
     def group(kind: str, velocity: np.ndarray) -> Obstacles:
         present = draws[f"{kind} present"]
@@ -321,7 +327,7 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
 
 
 def _displace(angle, speed, rate, time) -> np.ndarray:
-    """Return the displacement (..., 2) [m] of targets with direction `angle` at time 0."""
+    """Return displacements (..., 2) [m] of targets that start in the direction `angle` and turn."""
     half = 0.5 * rate * time
     direction, chord = angle + half, speed * time * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
@@ -335,7 +341,7 @@ def _path(suite: Suite, draws: Draws) -> np.ndarray:
 
 
 def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return whether the targets leave the map, (B,)."""
+    """Return whether the targets leave the map before the meeting, (B,) bool."""
     from_middle = np.abs(_path(suite, draws) - 0.5 * SIZE)
     return from_middle.max(axis=(1, 2)) > 0.5 * SIZE
 
@@ -346,7 +352,7 @@ def _middle(draws: Draws) -> np.ndarray:
 
 
 def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
-    """Return whether a straight drive at the greatest speed takes too long, (B,)."""
+    """Return whether a straight drive at the greatest speed arrives after the meeting, (B,)."""
     distance = draws["meeting"] - _middle(draws)
     return np.linalg.norm(distance, axis=1) > TOP_SPEED * draws["time"]
 
@@ -354,7 +360,7 @@ def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
 def _gap(
     draws: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """Return the least distance (B,) [m] of points (B, [M,] 2) from obstacles at times (B,) [s]."""
+    """Return least distances (B,) [m] of points (B, [M,] 2) from walls, or movers at `times`."""
     corners, points = draws[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
         times = np.broadcast_to(times, len(points))[:, None, None, None]
@@ -370,7 +376,7 @@ def _gap(
 def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
     """Return the distance (...) [m] of points (..., 2) from convex polygons (..., V, 2); 0 inside.
 
-    The corners are counter-clockwise and may be repeated.
+    The corners of a polygon are in counter-clockwise order and may be repeated.
     """
     edge = np.roll(corners, -1, axis=-2) - corners
     away = points[..., None, :] - corners
@@ -382,7 +388,7 @@ def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
-    """Return whether walls separate the start from the meeting point for a disc, (B,)."""
+    """Return whether walls close all paths of a disc as wide as the car to the meeting, (B,)."""
     count = round(SIZE / _CELL)
     middles = (np.arange(count) + 0.5) * _CELL
     separated = np.zeros(len(draws["start"]), bool)
@@ -403,7 +409,8 @@ def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
     return separated
 
 
-# Cause of rejection -> whether it applies, (B,), in the order of the tests.
+# Cause for which a candidate is rejected -> function that returns whether the cause applies to each
+# of B candidates, (B,) bool. The causes are tested in this order.
 _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "target off the map": _is_off_map,
     "start near a wall": lambda _, draws: _gap(draws, "walls", _middle(draws)) < START_ROOM,
@@ -415,15 +422,15 @@ _APPLIES: dict[str, Callable[[Suite, Draws], np.ndarray]] = {
     "mover at the meeting": lambda _, draws: (
         _gap(draws, "movers", draws["meeting"], draws["time"]) < MEETING_ROOM
     ),
-    "too far": _is_too_far,  # at the greatest speed
-    "no way": _is_separated,  # for a disc of the car's width
-    "out of reach": lambda _, draws: ~draws["reached"],  # by a layer of the reach set
+    "too far": _is_too_far,
+    "no way": _is_separated,
+    "out of reach": lambda _, draws: ~draws["reached"],
 }
 CAUSES = tuple(_APPLIES)
 
 
 def first_cause(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return the index (B,) in `CAUSES` of the first cause that applies; len(CAUSES) if none."""
+    """Return the index (B,) in CAUSES of the first cause that rejects; len(CAUSES) if none does."""
     cause = np.full(len(draws["start"]), len(CAUSES))
     alive = np.arange(len(cause))
     for index, applies in enumerate(_APPLIES.values()):

@@ -1,4 +1,8 @@
-"""The cost of an interception: hinges on limits, obstacles and the miss, with derivatives."""
+"""Terms of an interception's cost, with derivatives: weighted squares of residuals.
+
+The residuals are the distance from the target at the end, the effort, and hinges: one-sided
+penalties max(excess, 0) on limits and on distances from obstacles.
+"""
 
 import dataclasses
 from collections.abc import Mapping
@@ -20,29 +24,26 @@ _HIGHEST = lax.Precision.HIGHEST
 
 @struct.dataclass
 class Weights:
-    """Weights of the squared residuals, and the thresholds of hinges.
+    """Weights of the squared residuals, and the thresholds of hinges (one-sided penalties)."""
 
-    Residuals on limits are relative to the limit.
-    """
-
-    miss: float = 300.0  # of the distance to the target at the end [1/m^2]
-    obstacle: float = 1e3
-    limit: float = 1e3
-    effort: float = 0.064  # of the integral of the squared acceleration
-    early: float = 300.0  # of the meeting time over the case's time, if the time is free
-    turning: float = 3e-3  # of the integral of the squared rate of curvature
-    follow: float = 0.0  # of the distance at knots from the positions of a guess [1/m^2]
-    margin: float = 0.03  # [m], distance from obstacles at which hinges start
-    slack: float = 0.015  # hinges start at (1 - slack) times a limit
+    miss: float = 300.0  # [1/m^2], of the distance from the target at the end
+    obstacle: float = 1e3  # [1/m^2], of the distance by which a body comes too close to an obstacle
+    limit: float = 1e3  # of the relative excess of a value over its limit
+    effort: float = 0.064  # [s^3/m^2], of the integral of the squared acceleration
+    early: float = 300.0  # of the meeting time divided by the case's time, if the time is free
+    turning: float = 3e-3  # [m^2 s], of the integral of the squared rate of curvature
+    follow: float = 0.0  # [1/m^2], of the distance at knots from the positions of a guess
+    margin: float = 0.03  # [m], distance from obstacles below which they are penalised
+    slack: float = 0.015  # a value is penalised above (1 - slack) times its limit
 
 
 def wrap(angle: Array) -> Array:
-    """Return the equal angle [rad] between -pi and pi."""
+    """Return an angle [rad] plus the multiple of 2 pi that brings it between -pi and pi."""
     return angle - 2.0 * np.pi * jnp.round(angle / (2.0 * np.pi))
 
 
 def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
-    """Return radius () and distances ahead of the rear axle (num,) [m] of discs over the body."""
+    """Cover the body by discs; return their radius, and positions ahead of the rear axle [m]."""
     half = 0.5 * body.length / num
     radius = jnp.sqrt(half**2 + (0.5 * body.width) ** 2)
     steps = np.arange(1 - num, num, 2)
@@ -57,22 +58,22 @@ def limit_terms(
     weights: Weights,
     points: int,
 ) -> tuple[Array, Array]:
-    """Compute the hinges on the car's limits, and the effort.
+    """Compute the penalties on the car's limits, and the effort, for a motion of K pieces.
 
-    The lateral acceleration is checked at a static number of points of every piece.
+    `points` is the static number of points of a piece at which the lateral acceleration is checked.
 
     Returns:
-        squares: (K, 6, 6), for every piece the sum of w g g' over its residuals r of weight w. The
-            vector g holds the derivatives of r by the five variables of the piece (see `motion`),
-            then r itself.
-        violation: (), largest relative excess.
+        squares: (K, 6, 6), for every piece the sum of w g g^T over its residuals r with weights w.
+            The vector g holds the derivatives of r by the five variables of the piece (see
+            `motion`), and last r itself.
+        violation: (), largest relative excess over a limit.
     """
     limits, dtype = case.limits, speed.dtype
     rate = (speed.shape[0] - 1) / time
     none = jnp.zeros_like(speed[1:])
     v, c = speed[1:], curvature[1:]
     acceleration = (v - speed[:-1]) * rate
-    # The steering angle changes fastest where the curvature is least.
+    # For a given rate of curvature the steering angle changes fastest where |curvature| is least.
     flat = jnp.where(c * curvature[:-1] > 0.0, jnp.minimum(c**2, curvature[:-1] ** 2), 0.0)
     gain = case.body.wheelbase / (1.0 + case.body.wheelbase**2 * flat) * rate
     steering = gain * (c - curvature[:-1])
@@ -85,13 +86,13 @@ def limit_terms(
         excesses.append(excess)
         squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
 
-    # The speed is between 0 and its limit: at most half the limit from their middle.
+    # The condition 0 <= v <= v_max is written as |v - v_max / 2| <= v_max / 2.
     hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, {V_RIGHT: 1.0})
     hinge(c, limits.curvature, {C_RIGHT: 1.0})
     by = {V_LEFT: -rate, V_RIGHT: rate, TIME: -acceleration / time}
     hinge(acceleration, limits.acceleration, by)
     hinge(steering, limits.steering_rate, {C_LEFT: -gain, C_RIGHT: gain, TIME: -steering / time})
-    for share in (np.arange(points) + 1.0) / points:  # of every piece
+    for share in (np.arange(points) + 1.0) / points:  # positions on every piece, from 0 to 1
         fast, bend = (share * each[1:] + (1.0 - share) * each[:-1] for each in (speed, curvature))
         by_speed, by_curvature = 2.0 * fast * bend, fast**2
         by = {
@@ -111,25 +112,26 @@ def limit_terms(
 
 
 class SumOfSquares:
-    """The sum of w g g' over residuals r of weight w; g holds the derivatives of r, then r itself.
+    """Accumulator of the matrix sum of w g g^T over residuals r with weights w.
 
-    Only the entries of g that may differ from zero are multiplied.
+    The vector g holds the derivatives of r, and last r itself. Only its entries that may differ
+    from zero are passed and multiplied.
     """
 
     def __init__(self, size: int, sums: Mapping[tuple[int, int], Array] | None = None):
-        """Start from the sums of the entries (a, b), a <= b, of a matrix of a size."""
+        """Start from given entries (a, b), a <= b, of the matrix (size, size), by default zero."""
         self._size = size
         self._sums: dict[tuple[int, int], Array | float] = dict(sums or {})
 
     def add(self, row: Mapping[int, Array | float], weight: Array | float = 1.0) -> None:
-        """Add the products of the entries of one residual's g, by their indices."""
+        """Add w g g^T of one residual; `row` maps an index of g to the entry of g there."""
         for a, left in row.items():
             for b, right in row.items():
                 if a <= b:
                     self._sums[a, b] = self._sums.get((a, b), 0.0) + weight * (left * right)
 
     def matrix(self, like: Array) -> Array:
-        """Return the sums as a matrix (..., size, size), broadcast to the shape of `like`."""
+        """Return the matrices (..., size, size) for residuals of the shape (...) of `like`."""
         indices = range(self._size)
         sums = [
             jnp.broadcast_to(self._sums.get((min(a, b), max(a, b)), 0.0), like.shape)
@@ -143,12 +145,12 @@ class SumOfSquares:
 def meeting_terms(
     case: InterceptCase, drive: Motion, time: Array, weights: Weights
 ) -> tuple[Array, Array]:
-    """Compute the miss and the hinge on the heading at the end.
+    """Compute the residuals of the meeting: distance from the target, and error of the heading.
 
     Returns:
-        squares: (5, 5), the sum of w g g' over the residuals r of weight w. The vector g holds the
-            derivatives of r by x, y, heading and time of the last sample, then r itself.
-        violation: (), largest relative excess.
+        squares: (5, 5), the sum of w g g^T over the residuals r with weights w. The vector g holds
+            the derivatives of r by x, y, heading and time of the last sample, and last r itself.
+        violation: (), largest relative excess over the tolerances of distance and heading.
     """
     pos, heading, direction = drive.pos[-1, -1], drive.heading[-1, -1], drive.direction[-1, -1]
     target = case.target.at(time)
@@ -170,10 +172,10 @@ def meeting_terms(
 
 
 def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
-    """Compute the distances from positions (K, 2) [m] at the end of every piece.
+    """Compute the residuals of following: distances from positions (K, 2) [m] at the pieces' ends.
 
     Returns:
-        squares: (K, 5, 5), as in `meeting_terms`, for the last sample of every piece.
+        squares: (K, 5, 5), the matrix `squares` of `meeting_terms` for the end of every piece.
     """
     x, y = (drive.pos[:, -1] - positions).T
     squares = SumOfSquares(5)
@@ -185,14 +187,15 @@ def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
 def obstacle_terms(
     case: InterceptCase, field: DistanceField, drive: Motion, weights: Weights, discs: int
 ) -> tuple[Array, Array]:
-    """Compute the hinges on the distance of the body from obstacles and from the map's edge.
+    """Compute the penalties on the distances of the body from obstacles and from the map's edge.
 
-    A static number of discs covers the body. Fewer discs extend further beyond its sides.
+    The body is represented by `discs` discs, a static number. Fewer discs are larger and extend
+    further beyond the sides of the body.
 
     Returns:
-        squares: (K, S, 5, 5), as in `meeting_terms`, for every sample.
+        squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for every sample.
         close: (), largest penetration of an obstacle by a disc, or excess of the body's middle
-            beyond the map, relative to the body's width.
+            beyond the map, divided by the body's width.
     """
     radius, ahead = discs_of(case.body, discs)
     shape = drive.heading.shape
@@ -203,7 +206,7 @@ def obstacle_terms(
     velocity = movers.velocity[..., None]  # (N, 2, 1)
 
     def measure(offset: Array) -> tuple[Array, Array, Array]:
-        """Return distances of one disc from walls and movers, and their gradients, (1 + N, M)."""
+        """Return the distances of a disc from walls and movers, and their gradients, (1 + N, M)."""
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
@@ -216,7 +219,7 @@ def obstacle_terms(
             jnp.concatenate([still_y, away_y]),
         )
 
-    # A loop, because XLA would otherwise compute the distances again for every use.
+    # `lax.map` is a loop, so XLA computes the distances once instead of again for every use.
     far, away_x, away_y = lax.map(measure, ahead)  # (discs, 1 + N, M)
     inside = jnp.maximum(radius + weights.margin - far, 0.0)
     is_inside = inside > 0.0
@@ -244,7 +247,7 @@ def obstacle_terms(
 
 
 def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
-    """Return walls and movers as one group of obstacles."""
+    """Return walls and movers in one `Obstacles`, with corners repeated to equal numbers."""
     size = max(walls.corners.shape[1], movers.corners.shape[1])
 
     def pad(corners: Array) -> Array:
@@ -256,14 +259,15 @@ def join_obstacles(walls: Obstacles, movers: Obstacles) -> Obstacles:
 
 
 def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
-    """Return rear and front end, relative to the rear axle, and half the width [m]."""
+    """Return rear and front end of the body ahead of the rear axle, and half its width, () [m]."""
     return -body.rear_overhang, body.length - body.rear_overhang, 0.5 * body.width
 
 
 def clearance(case: InterceptCase, drive: Motion) -> Array:
-    """Return the clearance (M,) [m] at M samples.
+    """Return the clearance (M,) [m] of the car at the M samples of a motion.
 
-    It is the lesser of the body's distance from obstacles and its middle's distance from the edge.
+    The clearance is the distance of the body from the nearest obstacle, or the distance of the
+    body's middle from the map's edge, whichever is less.
     """
     pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
     times = drive.time.reshape(-1)
@@ -277,7 +281,10 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
-    """Return whether the start is blocked, and whether the meeting is, () bool each."""
+    """Return whether the body overlaps an obstacle at the start, and whether the target is blocked.
+
+    The target is blocked if it is off the map or too close to an obstacle at the case's time.
+    """
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
     x, y = (-(both.centre - case.start[None, :2])[:, axis, None] for axis in range(2))
