@@ -1,19 +1,23 @@
-"""Measure the live loop's deadlines while balls are thrown, with lost, late and repeated packets.
+"""Measure how often the live planning server misses its deadline, with imperfect packets.
 
     python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
         [--deadline 0.01] [--server-core N] [--out DIR]
 
-Starts `planner-jax serve TASK --report` as a separate process. Sends it the positions of flying
-balls of the task's suite, with noise, and the state of a robot that follows the last answer
-exactly. Of --bad per cent of the packets, a third each is lost, delayed by 30 ms, or sent twice. A
-round trip longer than the deadline is a miss.
+The benchmark starts `planner-jax serve TASK --report` as a separate process, and then acts as its
+client. It sends noisy positions of simulated flying balls, and the state of a robot that follows
+the last answer exactly. --bad per cent of the packets are imperfect: a third of them is lost, a
+third is delayed by 30 ms, and a third is sent twice. A round trip longer than --deadline is a miss.
 
-A process that only sleeps records when the host does not run it. With --server-core a second one
-does so on the server's core, which this process then leaves to the server. Misses during such a gap
-are attributed to the host. Printed at the end are misses, times, and the server's own report with
-its memory at the start and at the end. The success of the summary is the share of the balls that
-are within the radius of the net or racket at the contact, where the centre is given by the
-setpoints.
+A miss can also happen because the operating system did not run the server. To recognise such
+misses, a third process does nothing but sleep for short times, and records when it was woken too
+late. With --server-core the server is bound to one core, another sleeping process records gaps on
+this core, and the client uses the other cores. Misses during a recorded gap are attributed to the
+host.
+
+The program prints misses, times, and the server's own report with its memory at the start and at
+the end. The success of the summary is the share of balls that the tool (net or racket) meets. A
+ball is met if it is within the tool's radius of the tool's centre at the planned time of contact,
+for a robot that follows the setpoints exactly.
 """
 
 import gc
@@ -45,12 +49,13 @@ from planner_jax.live.packets import (
 )
 from planner_jax.live.report import Latencies
 
-NUM = 200  # balls that are drawn, and thrown repeatedly
-SECONDS = 1.8  # [s], duration of a throw
-NOISE = 0.005  # [m]
-LATE = 0.03  # [s], delay of late packets
+NUM = 200  # Number of balls that are drawn. They are thrown repeatedly.
+SECONDS = 1.8  # [s] Duration of the flight of a thrown ball.
+NOISE = 0.005  # [m] Standard deviation of each observed coordinate of a ball.
+LATE = 0.03  # [s] Delay of packets that are sent late.
 TOOLS = {"hit": "racket", "catch": "net"}
-NAP, GAP = 0.001, 0.004  # [s], of the sleeping process: sleep, and the least delay that it records
+# [s] Duration of each sleep of the sleeping process, and the least delay that it records as a gap.
+NAP, GAP = 0.001, 0.004
 SLEEPER = """
 import os, sys, time
 nap, gap = map(float, sys.argv[1:3])
@@ -67,7 +72,7 @@ while os.getppid() == asker:
 
 
 def draw_paths(task: str, rate: float) -> np.ndarray:
-    """Return positions (NUM, K, 3) [m] of balls at the rate."""
+    """Draw balls of a task, and return their positions (NUM, K, 3) [m] at a rate [Hz]."""
     steps = int(SECONDS * rate)
     if task == "hit":
         cases = pj.hit.draw(NUM)
@@ -84,7 +89,11 @@ def draw_paths(task: str, rate: float) -> np.ndarray:
 
 
 def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray) -> float:
-    """Return the distance [m] of a tool's centre, `height` above the body, from a ball (3,)."""
+    """Return the distance [m] of the tool's centre from a ball (3,) at the planned contact.
+
+    The tool's centre is `height` [m] above the quadrotor's body, along its thrust. The quadrotor
+    follows the setpoints of the answer.
+    """
     times = answer.begin + answer.period * np.arange(answer.setpoints.shape[0])
     pos, acc = (
         np.array([np.interp(answer.contact, times, x) for x in answer.column(name).T])
@@ -95,16 +104,20 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 
 
 class Naps:
-    """Process that only sleeps, and records when it was not run, on one core or on any."""
+    """Process that sleeps repeatedly, and records when the system woke it too late.
+
+    It is bound to one core, or runs on any core if `core` is None.
+    """
 
     def __init__(self, core: int | None = None) -> None:
         words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]
         words += [] if core is None else [str(core)]
         self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        self.gaps: list[tuple[float, float]] = []  # start and end [s], available after `end`
+        # Start and end [s] of each time in which the process was not run; filled in by `end`.
+        self.gaps: list[tuple[float, float]] = []
 
     def end(self) -> None:
-        """Stop the process, and read the recorded gaps."""
+        """Stop the process, and read the gaps that it has recorded."""
         self._process.terminate()
         output, _ = self._process.communicate()
         lines = output.splitlines(keepends=True)
@@ -117,7 +130,7 @@ class Naps:
 
 
 class Soak:
-    """Client that throws balls at a server and counts the answers."""
+    """Client of the planning server: simulates thrown balls and a robot, and counts answers."""
 
     def __init__(self, port: int, options: Any, tool: tuple[float, float], gravity: float) -> None:
         (self.height, self.radius), self.gravity = tool, gravity  # [m], [m/s^2]
@@ -132,7 +145,16 @@ class Soak:
         self.thrown = self.met = 0
 
     def send(self, kind: int, measured: float, values: tuple, ball: int) -> Any:
-        """Send a packet; return the answer, or None if packet or answer were lost or late."""
+        """Send a packet and wait for the answer; return None if there is no answer in time.
+
+        Some packets are intentionally lost, delayed or sent twice.
+
+        Args:
+            kind: kind of the packet, an observed ball or the robot's state.
+            measured: time of the measurement [s].
+            values: measured numbers.
+            ball: number of the ball.
+        """
         self._sequence = (self._sequence + 1) % 2**32
         sent = time.monotonic()
         data = request(kind, self._sequence, sent, measured, values, ball)
@@ -167,7 +189,13 @@ class Soak:
         return None
 
     def throw(self, path: np.ndarray, start: np.ndarray, ball: int) -> None:
-        """Throw one ball until its contact; the robot hovers at first."""
+        """Simulate one ball until its contact, with a robot that first hovers at `start` (3,) [m].
+
+        Args:
+            path: (K, 3) [m], true positions of the ball, one for each period.
+            start: (3,) [m], initial position of the robot.
+            ball: number of the ball in the packets.
+        """
         self.thrown += 1
         period, state_now, planned = 1.0 / self.options.rate, None, None
         began = time.monotonic()
@@ -195,16 +223,16 @@ class Soak:
                 break
 
     def count_misses(self, gaps: list[tuple[float, float]]) -> int:
-        """Count the misses that overlap one of the gaps."""
+        """Count the missed deadlines that overlap in time with one of the gaps (start, end) [s]."""
         return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
 
     def end(self) -> None:
-        """Close the socket."""
+        """Close the connection to the server."""
         self._socket.close()
 
 
 def start_server(options: Any) -> tuple[subprocess.Popen, int, float]:
-    """Start the server; return its process, its port, and the time [s] until it answers."""
+    """Start the planning server; return its process, its port and the time [s] of its start."""
     words = [sys.executable, "-m", "planner_jax", "serve", options.task, "--port", "0", "--report"]
     words += ["--deadline", str(options.deadline), "--rate", str(options.rate)]
     if options.server_core is not None:
@@ -220,7 +248,7 @@ def start_server(options: Any) -> tuple[subprocess.Popen, int, float]:
 
 
 def main() -> None:
-    """Throw balls, and report."""
+    """Start the server, throw balls for the requested time, and print misses and times."""
     parser = argument_parser("serve_soak", __doc__, seed=0)
     parser.add_argument("--task", choices=("hit", "catch"), default="catch", help="default: catch")
     parser.add_argument("--minutes", type=float, default=1.0, help="duration [min]; default: 1")
@@ -253,7 +281,7 @@ def main() -> None:
             naps["the server's core"] = Naps(options.server_core)
             others = os.sched_getaffinity(0) - {options.server_core}
             os.sched_setaffinity(0, others or {options.server_core})
-        gc.disable()  # otherwise pauses of this process would count
+        gc.disable()  # A garbage collection of the client would count as time of the server.
         soak = Soak(port, options, tool, float(case.gravity))
         ends = time.monotonic() + 60.0 * options.minutes
         while time.monotonic() < ends:

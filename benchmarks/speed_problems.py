@@ -1,4 +1,7 @@
-"""Seeded problems of speed planning, for a comparison like Table II of [Qu2022]."""
+"""Random problems of speed planning along a given path, for `benchmarks.intercept_speed`.
+
+Their setting is like the setting of Table II of [Qu2022].
+"""
 
 from typing import Any
 
@@ -7,26 +10,27 @@ import numpy as np
 
 from planner_jax.baselines.intercept.station_time import Blocked, StationTimeProblem, reference_line
 
-_BLOCK = 256  # problems drawn at once
-_MOST = 3  # maximum number of polygons of a problem
+_BLOCK = 256  # Number of problems that are drawn at once.
+_MOST = 3  # Maximum number of polygons in one problem.
 
 
 def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> StationTimeProblem:
-    """Draw problems with the setting of [Qu2022, Section V-C] and one to three parallelograms.
+    """Draw problems with the setting of [Qu2022, Section V-C] and one to three moving obstacles.
 
-    The car drives 6 m in 10 s, starting at 0.5 m/s with zero acceleration. The limits, 1.5 m/s and
-    2 m/s^2, and the random parallelograms are assumptions: centres at 1 to 5 m and 1.5 to 8.5 s,
-    0.6 to 1.5 m high and 1 to 2.5 s long, moving at -0.3 to 0.5 m/s. Only problems for which
-    dynamic programming on the default grid finds a line are used. The first problems are the same
-    for every `num`.
+    The car drives 6 m along its path in 10 s, starting at 0.5 m/s with zero acceleration. The paper
+    does not state limits and obstacles, which are chosen here. The limits are 1.5 m/s and 2 m/s^2.
+    An obstacle is a parallelogram in the graph of station (distance along the path) over time. Its
+    centre is at 1 to 5 m and 1.5 to 8.5 s. It covers 0.6 to 1.5 m of the path for 1 to 2.5 s, and
+    moves at -0.3 to 0.5 m/s. Only problems for which dynamic programming on the default grid finds
+    a line are used. With a greater `num` the first problems stay the same.
 
     Args:
         num: number of problems.
-        seed: of NumPy's generator.
-        dtype: of every floating leaf.
+        seed: seed of NumPy's random generator.
+        dtype: type of all floating-point arrays.
 
     Returns:
-        Leaves with a leading axis `num`, NumPy arrays.
+        A batch of problems: NumPy arrays with a leading axis of length `num`.
     """
     found = jax.jit(jax.vmap(lambda problem: reference_line(problem).found))
     rng = np.random.default_rng(seed)
@@ -46,7 +50,7 @@ def _convert_floats(problems: StationTimeProblem, dtype: Any) -> StationTimeProb
 
 
 def _draw_block(rng: np.random.Generator) -> StationTimeProblem:
-    """Draw one block of problems, solvable or not, in double precision."""
+    """Draw `_BLOCK` problems in double precision, without a check whether they are solvable."""
     shape = (_BLOCK, _MOST)
     num = rng.integers(1, _MOST + 1, _BLOCK)
     station, time = rng.uniform(1.0, 5.0, shape), rng.uniform(1.5, 8.5, shape)

@@ -1,14 +1,20 @@
 """Count plans whose status disagrees with the referee, for every task, suite and kind of limit.
 
+The status is the planner's own report whether every limit holds. The referee is an independent
+judge.
+
     python -m benchmarks.status_against_referee [--num 200] [--rows hit:court,catch:throws]
         [--seed 0] [--out DIR]
 
-A row counts the plans whose status claims that every limit holds, the plans that the referee
-accepts, and both kinds of disagreement: claims that the referee rejects, with the limits that fail,
-and accepted plans whose status claims nothing. The number in brackets counts accepted plans without
-a claim that exceed a limit by no more than the referee's tolerance, which a status does not use. In
-rows with obstacles each obstacle is put where the plan of the same case without it passes. Slow
-rows have a tenth or a fortieth of the cases.
+Each row of the table counts
+* the plans whose status reports that every limit holds ("solved");
+* the plans that the referee accepts;
+* solved plans that the referee rejects, with the limits that fail;
+* accepted plans that are not solved. In brackets are those of them that exceed a limit by no more
+  than the referee's tolerance; a status permits no tolerance.
+
+In rows with obstacles, an obstacle is placed on the trajectory that the planner finds without
+obstacles. Rows whose planning is slow use only a tenth or a fortieth of the cases.
 """
 
 import collections
@@ -27,34 +33,37 @@ from planner_jax.task.catch.spec import SUITES as CATCHES
 from planner_jax.task.intercept.spec import SUITES as INTERCEPTIONS
 from planner_jax.trajectory.polynomial import states_at
 
-TOLERANCE = 1e-3  # relative, of the referee
+TOLERANCE = 1e-3  # The referee accepts limits that are exceeded by up to this relative amount.
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Cases, and the planner that plans them."""
+    """Definition of a row of the table: how its cases are drawn, planned and judged."""
 
     task: str
     suite: str
-    draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of drawing cases
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the planner
-    judge: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    # Changes the drawn cases
+    judge: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the referee
+    # Function that changes the drawn cases, such as `tighten_limits`; None for no change.
     change: Callable[["Row", Any, np.random.Generator], Any] | None = None
-    every: int = 1  # one in this number of cases is planned
+    every: int = 1  # the number of cases is divided by this number, for slow planners
 
     @property
     def card(self) -> Any:
-        """The specification of the task."""
+        """The specification of the row's task."""
         return pj.task_named(self.task)
 
     @property
     def planner(self) -> Any:
-        """The planner of the row."""
+        """The planner of the row, with the benchmark options of the task and the row's options."""
         return self.card.planner(**{**self.card.bench, **self.options})
 
     def cases(self, num: int, seed: int) -> Any:
-        """Draw a batch in NumPy arrays."""
+        """Draw the row's cases, about `num` / `every` of them, and change them if specified.
+
+        The cases are a batch in NumPy arrays.
+        """
         cases = self.card.draw(max(num // self.every, 1), self.suite, seed, **self.draw)
         cases = jax.tree.map(np.asarray, cases)
         if self.change is None:
@@ -63,7 +72,7 @@ class Row:
 
 
 def tighten_limits(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Tighten the limits to 2.5 m/s, 10 m/s^2 and 3 rad/s."""
+    """Set the limits of speed, acceleration and body rate to 2.5 m/s, 10 m/s^2 and 3 rad/s."""
     own = cases.limits
     weak = {"speed": 2.5 + 0.0 * own.speed, "body_rate": 3.0 + 0.0 * own.body_rate}
     if own.acceleration is not None:
@@ -72,26 +81,26 @@ def tighten_limits(row: Row, cases: Any, random: np.random.Generator) -> Any:
 
 
 def _point_on_plan(row: Row, cases: Any, random: np.random.Generator) -> np.ndarray:
-    """Return a position (B, 3) on the trajectory of each case's plan, at 35 to 75 % of its time."""
+    """Plan B cases; return a position (B, 3) [m] on each plan, at 35 to 75 % of its duration."""
     path = pj.plan(row.planner, cases).trajectory
     share = random.uniform(0.35, 0.75, len(path.durations))
     return states_at(path, share * np.asarray(path.durations).sum(axis=1))[:, 0]
 
 
 def _add_constraint(cases: Any, extra: Any) -> Any:
-    """Return the cases with one more constraint."""
+    """Return cases with the constraint `extra`, such as an obstacle, in single precision."""
     return cases.replace(extras=(jax.tree.map(lambda leaf: leaf.astype(np.float32), extra),))
 
 
 def add_spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add a sphere with a radius of 10 to 30 cm on the trajectory."""
+    """Add to each case a forbidden sphere, 10 to 30 cm in radius, near the case's usual plan."""
     place = _point_on_plan(row, cases, random)
     centre = place + random.normal(0.0, 0.08, place.shape)
     return _add_constraint(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
 
 
 def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add a box with sides of 20 to 60 cm on the trajectory."""
+    """Add to each case a forbidden box, with sides of 20 to 60 cm, near the case's usual plan."""
     place = _point_on_plan(row, cases, random)
     middle = place + random.normal(0.0, 0.08, place.shape)
     half = random.uniform(0.1, 0.3, place.shape)
@@ -99,7 +108,10 @@ def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
 
 
 def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add a wall up to 15 cm from the straight line to a position on the plan, on a random side."""
+    """Add to each case a wall beside the straight line from the start to a point of the usual plan.
+
+    The wall is parallel to the line, up to 15 cm from it, on a random side.
+    """
     start, place = cases.head_state[:, 0], _point_on_plan(row, cases, random)
     along = place - start
     along /= np.linalg.norm(along, axis=1, keepdims=True) + 1e-6
@@ -111,7 +123,7 @@ def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
 
 
 def _hits() -> dict[str, Row]:
-    """Return the rows of hits."""
+    """Return the definitions of all rows for hits, by name."""
     late = {f"late-{delay}": Row("hit", "court", {"delay": delay}) for delay in (0.3, 0.5, 0.6)}
     weak = {
         f"limits-{scale}": Row("hit", "court", {"limit_scale": scale}) for scale in (0.7, 0.5, 0.35)
@@ -135,7 +147,7 @@ def _hits() -> dict[str, Row]:
 
 
 def _catches() -> dict[str, Row]:
-    """Return the rows of catches."""
+    """Return the definitions of all rows for catches, by name."""
     robots = ("crazyflie", "racer-net", "x500-net")
     return {
         **{suite: Row("catch", suite) for suite in CATCHES},
@@ -153,7 +165,7 @@ def _catches() -> dict[str, Row]:
 
 
 def _others() -> dict[str, Row]:
-    """Return the rows of interceptions and blocks."""
+    """Return the definitions of all rows for interceptions, groups and blocks, by name."""
     blocks = {
         f"{suite}-{regime}": Row("block", suite, {"regime": regime}, every=10)
         for suite in ("pole", "open")
@@ -171,7 +183,7 @@ def _others() -> dict[str, Row]:
     }
 
 
-# The key of a row is the task and the name.
+# All rows by "task:name", the form in which --rows selects them.
 ROWS = {
     f"{row.task}:{name}": row
     for rows in (_hits(), _catches(), _others())
@@ -180,7 +192,7 @@ ROWS = {
 
 
 def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
-    """Count what status and referee state about the plans of a row."""
+    """Plan and judge the cases of one row, and count agreement of status and referee, by name."""
     cases, planner = row.cases(num, seed), row.planner
     began = time.perf_counter()
     plans = jax.device_get(pj.plan(planner, cases))
@@ -202,7 +214,7 @@ def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
 
 
 def measure(bench: Bench, options: Any, names: list[str]) -> None:
-    """Print a row each, and the sums."""
+    """Measure the rows with the given names, and print the table with the sums of all rows."""
     bench.say(
         f"seed {options.seed}, {jax.devices()[0].device_kind}, jax {jax.__version__}",
         "| row | cases | solved by status | accepted by referee | solved, rejected | accepted, not "
@@ -229,7 +241,7 @@ def _counts(found: Mapping[str, Any]) -> str:
 
 
 def main() -> None:
-    """Print the table."""
+    """Parse the arguments, and print the table of the requested rows."""
     parser = argument_parser("status_against_referee", __doc__, num=200, seed=0)
     parser.add_argument(
         "--rows", default=",".join(ROWS), help="rows, comma-separated; default: all"

@@ -3,14 +3,18 @@
     planner-jax bench throughput --task hit --batch 1024 65536 288000 [--devices N] [--out DIR]
     python -m benchmarks.throughput [--tasks hit,catch] [--out DIR]
 
-Each batch size has one row: the first call, with its compilation; then, after half a second of
-calls that raise the device's clock, the fastest and the median call; the share of plans that the
-referee accepts; and the cost above a longer search (`cost_gap`). For several devices there is also
-the efficiency relative to one device, and the time of each device alone with its share. The time is
-for the whole of `plan`, by any planner of any task, with the benchmark options of the task
-specification (catches are decided "greedy"). This includes ball tables, guesses, all rounds and the
-check of the limits, from arrays on the devices to arrays on the devices, each with its share. It
-does not include the referee.
+The table has one row for each batch size. It lists the first call with its compile time, the
+fastest and the median of later calls, the share of plans that the referee accepts, and the cost
+above a longer search (`cost_gap`). Before later calls are timed, calls run for half a second, so
+that the device reaches its highest clock frequency. For several devices there is also the
+efficiency relative to one device, and the time that each device alone takes for its part of the
+batch.
+
+A time is for a whole call of `plan`, by any planner of any task, with the benchmark options of the
+task specification: for example, catches use the greedy order. It includes tables of the balls'
+flights, initial guesses, all rounds of the search, and the check of the limits, from arrays on the
+devices to arrays on the devices. Each device holds an equal part of the batch. The referee is not
+part of the time.
 """
 
 import dataclasses
@@ -35,20 +39,20 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.runs.timing import CompileClock
 
-_WARM_UP = 0.5  # [s]
-_JUDGED = 300_000  # maximum number of plans of a batch that the referee judges
+_WARM_UP = 0.5  # [s] Duration of calls before the measurement, so that the device's clock rises.
+_JUDGED = 300_000  # Maximum number of plans of a batch that the referee judges.
 
 
 def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
-    """Measure throughput, print one row a batch size, and write a run folder.
+    """Measure plans per second, print a row for each batch size, and write a run folder.
 
     Args:
-        out: run folder, new or empty; None for a new one in runs/.
+        out: run folder, new or empty; None for a new folder in runs/.
         **settings: fields of `ThroughputSettings`.
 
     Raises:
         ArgumentError: the folder cannot be written, or a setting is invalid.
-        UnknownName: as for `measure`.
+        UnknownName: there is no such task, planner or suite.
     """
     parsed, there = ThroughputSettings(**settings), len(jax.local_devices())
     require((parsed.devices or 1) <= there, "devices", f"<= {there}", parsed.devices)
@@ -57,10 +61,10 @@ def report(*, out: str | os.PathLike | None = None, **settings: Any) -> None:
 
 
 def measure(bench: Bench, settings: ThroughputSettings) -> None:
-    """Measure and print one row a batch size.
+    """Measure plans per second, and print a row for each batch size.
 
     Raises:
-        ArgumentError: there are fewer devices, or the planner has no rounds.
+        ArgumentError: a number of iterations is set for a planner that does not search in rounds.
         UnknownName: there is no such task, planner or suite.
     """
     devices, iterations = settings.devices, settings.iterations
@@ -97,7 +101,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
 
 
 def _with_iterations(planner: Any, iterations: int) -> Any:
-    """Return the planner with another number of iterations in its first round."""
+    """Return a copy of the planner with another number of iterations in its first round."""
     if isinstance(planner, DecidedPlanner):
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
     first, *rest = planner.rounds
@@ -107,12 +111,12 @@ def _with_iterations(planner: Any, iterations: int) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _Timed:
-    """Durations and plans of calls on one batch."""
+    """Durations of several calls that plan one batch, and the plans."""
 
-    first: float  # [s]
+    first: float  # [s], duration of the first call, with compilation
     compiling: float  # [s], compile time of the first call
-    seconds: list[float]  # [s], of the other calls
-    plans: Any
+    seconds: list[float]  # [s], durations of the later calls
+    plans: Any  # plans of the last call
 
     @property
     def fastest(self) -> float:
@@ -120,7 +124,10 @@ class _Timed:
 
 
 def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
-    """Plan a batch, which the devices hold in equal shares, once and then `repeat` times, warm."""
+    """Plan a batch once, and then `repeat` times with compiled programs; return the durations.
+
+    Each device holds an equal part of the batch.
+    """
     num = jax.tree.leaves(host)[0].shape[0]
     shares = NamedSharding(Mesh(np.array(devices), "lanes"), PartitionSpec("lanes"))
     there = shares if len(devices) > 1 and num % len(devices) == 0 else devices[0]
@@ -138,7 +145,7 @@ def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
         call()
     seconds, plans = [], None
     for _ in range(repeat):
-        del plans  # otherwise the memory peak would count these plans too
+        del plans  # The plans of two calls at once would raise the measured peak of memory.
         took, plans = call()
         seconds.append(took)
     return _Timed(first, clock.seconds, seconds, plans)
@@ -176,7 +183,11 @@ def _add_row(
 
 
 def _compare_devices(planner: Any, host: Any, devices: list, repeat: int, timed: _Timed) -> str:
-    """Return text on several devices' speed relative to one device, and to each with its share."""
+    """Compare the time of several devices with one device, and return text.
+
+    The text has the time of one device for the whole batch, the efficiency of all devices, and the
+    time of each device alone for its part of the batch.
+    """
     num = timed.plans.status.size
     whole = _time_calls(planner, host, devices[:1], repeat).fastest
     ends = np.linspace(0, num, len(devices) + 1).astype(int)
@@ -193,7 +204,7 @@ def _compare_devices(planner: Any, host: Any, devices: list, repeat: int, timed:
 
 
 def _peak_memory(devices: list) -> float:
-    """Return the peak memory [GiB] of a device, or of the process on a CPU."""
+    """Return the peak memory [GiB] of the first device, or of this process on a CPU."""
     stats = devices[0].memory_stats() or {}
     peak = stats.get("peak_bytes_in_use")
     if peak is None:
@@ -202,7 +213,7 @@ def _peak_memory(devices: list) -> float:
 
 
 def _compare_with_cpu(card: Task, planner: Any, cases: Any, devices: list) -> str:
-    """Return text on differences between plans of the devices and of a CPU."""
+    """Plan cases on the devices and on a CPU; return text on differences between the plans."""
     cases = jax.tree.map(np.asarray, cases)
     ours = plan(planner, cases, devices=devices)
     with jax.default_device(jax.devices("cpu")[0]):
@@ -221,7 +232,7 @@ def _compare_with_cpu(card: Task, planner: Any, cases: Any, devices: list) -> st
 
 
 def main() -> None:
-    """Measure the requested tasks with small batches."""
+    """Parse the arguments, and measure each requested task with the default batch sizes."""
     parser = argument_parser("throughput", __doc__, seed=0)
     parser.add_argument(
         "--tasks", default="hit,catch", help="tasks, comma-separated (default: hit,catch)"

@@ -1,4 +1,7 @@
-"""Settings of `planner-jax bench throughput`; this module does not import JAX."""
+"""Command-line settings of `planner-jax bench throughput`.
+
+The module does not import JAX, so that the command prints its help quickly.
+"""
 
 import dataclasses
 import pkgutil
@@ -8,16 +11,16 @@ from planner_jax.core.choices import EFFORTS, require, require_memory, require_o
 from planner_jax.core.registry import task_named
 from planner_jax.runs.settings import SweepSettings, option
 
-_MOST = 100_000  # iterations, or calls; more would take hours
+_MOST = 100_000  # Maximum of the settings that are counts. Larger counts would take hours.
 
 
 @dataclasses.dataclass(frozen=True)
 class ThroughputSettings:
-    """Arguments of a throughput measurement.
+    """Arguments of a measurement of plans per second.
 
     Raises:
         ArgumentError: a value is invalid.
-        UnknownName: there is no such task.
+        UnknownName: there is no such task, planner or suite.
     """
 
     task: str = option("hit", "NAME", "task whose cases are planned")

@@ -2,21 +2,24 @@
 
     python -m benchmarks.workers [--num 60000] [--batch 2000] [--turns 3] [--ways 1,2] [--out DIR]
 
-Four set-ups of the same sweep of hits take turns, so that a slow minute of the machine affects all
-of them: (1) a plain sweep on one core; (2) a plain sweep on each core, all at the same time; (3)
-one Ray worker, on one core together with the driver process; and (4) a Ray worker for each core.
-The second shows the greatest speed-up that this machine allows, because cores may share caches,
-memory or a clock. `--ways` selects set-ups by number.
+A sweep plans many drawn cases in chunks and writes the plans to files. Four set-ups of a sweep of
+hits are compared:
+1. a sweep without Ray on one core;
+2. a sweep without Ray on each core, all at the same time. This shows the greatest speed-up that the
+   machine allows, which may be below the number of cores, because cores share caches and memory;
+3. a sweep with one Ray worker, on one core together with the main process of the sweep;
+4. a sweep with a Ray worker for each core.
+The set-ups take turns, so that other load on the machine affects all of them. `--ways` selects
+set-ups by number.
 
-If JAX computes on GPUs, GPUs take the place of cores, and workers on one GPU are compared with
-workers on all GPUs; several workers share a GPU. A sweep on one GPU also gets its share of the
-cores, except the plain sweep on one GPU, which gets all cores as it does without workers. On GPUs
-use --num 10000000 --batch 65536 or more, and a temporary folder with space for 3 kB a hit times the
-number of GPUs.
+If JAX computes on GPUs, each set-up uses GPUs instead of cores, and several workers share a GPU.
+The CPU cores are divided equally among the GPUs. Only in set-up 1 the sweep on one GPU uses all
+cores, as a usual sweep does. On GPUs use --num 10000000 --batch 65536 or more. The temporary folder
+then needs 3 kB per hit and GPU.
 
-A rate is the slope of the number of written chunks over time, without the first few chunks, during
-which the workers start. The cost gap is computed for a thousand of the hits. Linux only, because
-processes are bound to cores.
+Plans per second are the slope of the number of written chunks over time. The first few chunks,
+during which the workers start, are left out. The cost gap is computed for a thousand of the hits.
+The benchmark runs on Linux only, because processes are bound to cores.
 """
 
 import os
@@ -38,24 +41,24 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.cluster import WORKERS_OF_GPU
 
-_FIRST = 9  # minimum number of first chunks that are not counted
+_FIRST = 9  # At least this number of first chunks of a sweep is left out of its plans per second.
 _GPUS, _PREALLOCATE = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 
 class _Share(NamedTuple):
-    """Part of the machine that a sweep may use."""
+    """Cores and GPUs of the machine that one sweep may use."""
 
     cores: list[int]
     gpus: list[str]  # empty if the sweep computes on the cores
 
     @property
     def first(self) -> int:
-        """Number of chunks that are not counted, because the workers start during them."""
+        """Number of first chunks that are not timed, because workers start during that time."""
         return max(_FIRST, WORKERS_OF_GPU * len(self.gpus) if self.gpus else len(self.cores))
 
 
 class _Sweep:
-    """Sweep in a separate process on a part of the machine, with the times of its chunks."""
+    """Sweep of hits in a separate process, on some cores and GPUs; records its chunks' times."""
 
     def __init__(self, out: Path, num: int, batch: int, share: _Share, ray: bool):
         self._out, self._batch, self._first, self._times = out, batch, share.first, list[float]()
@@ -65,7 +68,7 @@ class _Sweep:
         environ = {**os.environ, "NPROC": str(len(share.cores))}
         if share.gpus:
             environ[_GPUS] = ",".join(share.gpus)
-            del environ[_PREALLOCATE]  # which is set for this process only
+            del environ[_PREALLOCATE]  # This variable is meant for the benchmark's process only.
         with open(self._errors, "wb") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "planner_jax", "sweep", *what],
@@ -76,13 +79,13 @@ class _Sweep:
         os.sched_setaffinity(self._process.pid, share.cores)
 
     def poll(self) -> bool:
-        """Record new chunks; return whether the process still runs."""
+        """Record the time of newly written chunks; return whether the process still runs."""
         there = len(list(self._out.glob("plans/part-*.parquet")))
         self._times += [time.perf_counter()] * (there - len(self._times))
         return self._process.poll() is None
 
     def rate(self) -> float:
-        """Return plans per second after the first chunks.
+        """Return plans per second, without the first chunks, during which workers start.
 
         Raises:
             RuntimeError: the sweep has failed.
@@ -94,12 +97,16 @@ class _Sweep:
         return self._batch * np.polyfit(np.array(late) - late[0], np.arange(len(late)), 1)[0]
 
     def summary(self) -> dict:
-        """Return the summary in the manifest."""
+        """Read the summary of the sweep from the manifest in its run folder."""
         return RunFolder(self._out).read_manifest()["summary"]
 
 
 def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
-    """Return by name the shares of the simultaneous sweeps, and whether Ray runs them."""
+    """Return the four set-ups by name.
+
+    A set-up is the list of machine parts on which sweeps run at the same time, one sweep on each
+    part, and whether the sweeps use Ray.
+    """
     whole, num = _Share(cores, gpus), len(gpus or cores)
     if not gpus:
         each = [_Share([core], []) for core in cores]
@@ -124,7 +131,10 @@ def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Sha
 
 
 def _core_order(core: int) -> tuple[int, ...]:
-    """Return a sort key that groups cores by package and by physical core."""
+    """Return a sort key of a core, by which cores of the same processor are neighbours.
+
+    Hardware threads of the same physical core are neighbours, too.
+    """
     topology = Path(f"/sys/devices/system/cpu/cpu{core}/topology")
     try:
         names = "physical_package_id", "core_id"
@@ -142,7 +152,7 @@ def _list_gpus() -> list[str]:
 
 
 def main() -> None:
-    """Take turns and print the rates."""
+    """Run the requested set-ups in turns, and print their plans per second."""
     parser = argument_parser("workers", __doc__, num=60000, batch=2000, turns=3)
     known = "1,2,3,4"
     parser.add_argument("--ways", default=known, help=f"set-ups, by number; default: {known}")
