@@ -14,7 +14,7 @@ EFFORTS = ("feasible", "good", "best")  # how long a planner searches; the first
 RECOVERIES = ("brake", "home")  # to standstill anywhere, or at the initial position of the case
 NONE = "none"  # setting for plans that end at their last contact, without a recovery
 CHOICES = (NONE, *RECOVERIES)
-SCALES = (1e-3, 1e3)  # least and greatest factor on limits that leaves them plausible
+SCALES = (1e-3, 1e3)  # least and greatest plausible factor on the limits of a case
 
 
 def require(

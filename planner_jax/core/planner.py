@@ -77,7 +77,7 @@ class Planner(Generic[CaseT, PlanT]):
 
     kind: ClassVar[Kind | None] = None
     case_type: ClassVar[type] = Case  # cases of other classes are rejected
-    plan_type: ClassVar[type[Plan]] = Plan  # class of the plans that `begin` takes
+    plan_type: ClassVar[type[Plan]] = Plan  # class of the previous plans that `begin` accepts
     # Whether a CPU solves the cases of a batch one after another. This suits planners whose cases
     # differ much in computing time: solved together, all cases would wait for the slowest one.
     is_sequential: ClassVar[bool] = False

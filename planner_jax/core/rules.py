@@ -69,7 +69,7 @@ class Field:
     An array that is None, or that belongs to a part that is None, is not checked.
     """
 
-    name: str  # dotted, as in "limits.speed"
+    name: str  # dotted name of the array, as in "limits.speed"
     shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None allows any shape
     rule: Rule = FINITE
     kind: type = np.floating
@@ -218,7 +218,7 @@ def _usual_batch(part: PyTree) -> tuple[int, ...]:
     return fronts.most_common(1)[0][0] if fronts else ()
 
 
-_PLAIN = (np.ndarray, str, bytes)  # types whose kind NumPy finds quickly
+_PLAIN = (np.ndarray, str, bytes)  # for these types `np.asarray(value).dtype` is fast
 _KINDS = {
     np.floating: "floating-point numbers",
     np.integer: "whole numbers",

@@ -27,7 +27,7 @@ BETWEEN_NODES = 0.004  # typical amount by which a peak between penalty nodes ex
 # A function of a motion and of any pytree of numbers, and of no other array. It returns E arrays
 # with the shape of the motion's height, positive where a limit is exceeded.
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
-# A function of the same arguments, which returns the cost per second at each sample.
+# A function of a motion and a pytree of numbers: it returns the cost per second at each sample.
 Rate = Callable[[Motion, PyTree], Array]
 
 
@@ -43,7 +43,7 @@ class Along:
     maps: ProportionalMinco
     nodes: int  # number of intervals of each piece
     excess: Excess
-    margins: tuple[float, ...]  # (E,), in the unit of each excess
+    margins: tuple[float, ...]  # (E,), added to each excess before the hinge
     hinge_width: float
     # Cost per second of a case's extras, which need the whole position; kernels do not compute it.
     rate: Rate | None = None
@@ -160,7 +160,7 @@ def _greatest_of_segments(
 
     def of_segment(columns: Array, duration: Array) -> tuple[Array, ...]:
         motion = sample_motion(along.maps, along.nodes, columns, duration, along.orders)
-        # Each sample is part of three parabolas; the barrier keeps XLA from computing it thrice.
+        # A sample is part of three parabolas; the barrier keeps XLA from computing it three times.
         excess = jax.lax.optimization_barrier(along.excess(motion, parameters))
         return tuple(greatest_by_parabolas(each, along.times()) for each in excess)
 
@@ -185,7 +185,7 @@ def _slopes(
 
 
 def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
-    """Return `_slopes`, and derivatives by the parameters with a leading axis N for segments."""
+    """Return the results of `_slopes`, and derivatives by the parameters of each segment."""
 
     def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
         value = functools.partial(_of_segment, along)

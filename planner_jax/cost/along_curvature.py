@@ -24,7 +24,7 @@ from planner_jax.trajectory.polynomial import Motion
 
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # pairs of axes
 
-Slot = tuple[int, int]  # order of a derivative of the motion, and axis
+Slot = tuple[int, int]  # order of a derivative of the motion, and its axis
 
 
 @struct.dataclass

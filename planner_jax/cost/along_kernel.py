@@ -28,7 +28,7 @@ from planner_jax.trajectory.polynomial import Motion
 
 _THREADS = 128  # threads of a block, one for each lane
 _ENOUGH = 512  # number of blocks that keeps a large GPU busy
-_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # used axes of position to jerk: height, then all
+_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # axes of position (height only) to jerk
 _WORST = 1  # index of the greatest excess among the results of a kernel
 
 # Results of a kernel: "values" are the sum of penalties and the greatest excess; "slopes" adds the
@@ -46,7 +46,7 @@ class Grid:
     trajectories: int  # number of trajectories of each lane
     num_columns: int  # C
     lanes: int
-    threads: int  # of a block, one for each lane
+    threads: int  # number of threads of a block, one for each lane
 
     @property
     def blocks(self) -> int:

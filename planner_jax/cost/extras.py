@@ -82,7 +82,7 @@ class KeepOutBox:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the depth behind the box's nearest face, divided by half of the shortest side."""
+        """Return the depth inside the box from its nearest face, over half of the shortest side."""
         half = 0.5 * (self.high - self.low)
         return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
 

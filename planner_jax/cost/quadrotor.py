@@ -155,7 +155,7 @@ class _Kind:
 
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
-    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # of motion and gravity
+    excess: Callable[[Motion, Array, QuadrotorLimits], tuple[Array, ...]]  # takes motion, gravity
     orders: tuple[int, ...]  # orders of the motion's derivatives on which the excess depends
 
 
@@ -200,7 +200,7 @@ def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 
 def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
-    """Return the formula of each excess that `flight_excess` returns."""
+    """Return the `Measure`, that is, the formula, of each excess that `flight_excess` returns."""
     return tuple(measure for kind in _kinds(limits) for measure in kind.measures)
 
 

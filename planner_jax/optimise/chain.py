@@ -45,10 +45,10 @@ class ChainEnds:
     """Durations and states at the ends of N segments, computed from the end variables."""
 
     durations: Float[Array, " N"]  # [s], of the segments
-    tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor
-    total_time: Float[Array, ""]  # [s], of the active segments
+    tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor at the segments' ends
+    total_time: Float[Array, ""]  # [s], sum of the durations of the segments that the case uses
     excess: Float[Array, "..."]  # relative excess over the limits at the ends; feasible if <= 0
-    contact: PyTree = None  # task-specific data of the ends for the plan
+    contact: PyTree = None  # data of the ends that the task stores in its plan
 
 
 @dataclasses.dataclass(frozen=True)

@@ -62,7 +62,7 @@ def chain_curvature(
     """
     rows, durations, core, excess = found
     num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
-    given = order if num == 1 else 0  # number of rows of the fixed initial state, if it is the only
+    given = order if num == 1 else 0  # number of fixed rows: the initial state of a single segment
     columns = jnp.concatenate([rows, offsets], axis=1)
     one = functools.partial(curvature_along, along, parameters=parameters, given=given)
     of = jax.vmap(lambda columns, duration: one(columns, duration))(columns, durations)

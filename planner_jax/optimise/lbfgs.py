@@ -35,7 +35,7 @@ class Memory:
 class LbfgsNumbers:
     """The scalars in the state of one problem of the batch."""
 
-    best: Evaluation  # at the best point; not finite before the first iteration
+    best: Evaluation  # objective at the best point; not finite before the first iteration
     reach: Array  # (), factor on the trial steps; it shrinks while no trial lowers the cost
     iteration: Array  # () int32
     stalled: Array  # () int32, iterations in a row that hardly lowered the cost
@@ -47,7 +47,7 @@ class LbfgsState:
 
     point: Array  # (n,)
     step: Array  # (n,), last step, which led to the point; 0 if there was none
-    grad: Array  # (n,), at the start of the last step
+    grad: Array  # (n,), gradient at the start of the last step
     memory: Memory
     best_point: Array  # (n,)
     numbers: LbfgsNumbers

@@ -23,7 +23,7 @@ class Model:
     cost: Array  # ()
     gradient: Array  # (n,)
     curvature: Array  # (n, n), J'J plus other positive terms
-    violation: Array  # (), largest relative excess over a limit; <= 0 is good
+    violation: Array  # (), largest relative excess over a limit; feasible if <= 0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -40,7 +40,7 @@ from planner_jax.optimise.settings import (
 
 _HIGHEST = lax.Precision.HIGHEST
 _HALVINGS = 14  # bisections of the interval that contains the least eigenvalue
-_LEAST_DAMPING = 1e-10  # least damping of a lane
+_LEAST_DAMPING = 1e-10  # least damping of one problem of the batch
 _LEAST = 1e-7  # least pivot, relative to the greatest entry of its matrix
 
 
@@ -141,7 +141,7 @@ def step(
 
 
 def solve_damped(here: Curvature, damping: Array, config: NewtonConfig) -> tuple[Array, Array]:
-    """Return Newton steps (k, n) within the subspace, one for each of k trial dampings.
+    """Return Newton steps (k, n) within the Krylov subspace, one for each of k trial dampings.
 
     `damping` > 0 is the problem's own damping, which is added to the Hessian's diagonal. No step is
     longer than `config.step_cap`. The second result () is the decrease of the cost that the

@@ -44,7 +44,7 @@ class Gradient:
     """The value of one number of a plan, and its gradient by parts of the case."""
 
     value: Array  # ()
-    by: dict[str, PyTree]  # name -> part of the case with d value / d leaf as leaves
+    by: dict[str, PyTree]  # by name: part of the case, with leaves d value / d leaf
     # () Relative residual of the equation for lambda, in the preconditioner's norm; 0 if lambda is
     # exact. It does not measure the distance to the optimum. The residual and `by` are NaN if the
     # Hessian is not positive along the first direction, because the point is then no minimum.

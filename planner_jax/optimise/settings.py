@@ -48,7 +48,7 @@ Curved = Callable[[Array], Curvature]
 class LbfgsConfig:
     """Settings of the L-BFGS solver; hashable, so static under jit."""
 
-    max_steps: int = 10  # 0 returns the start itself
+    max_steps: int = 10  # greatest number of iterations; 0 returns the start itself
     memory: int = 6  # number of stored pairs of a step and the change of the gradient
     trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)  # lengths tried at once in each iteration
     step_cap: float = 2.0  # greatest Euclidean length of a step with trial length 1
@@ -83,7 +83,7 @@ class NewtonConfig:
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # predicted relative decrease below which a problem is stationary
-    trusted: float = MOST_DAMPING  # greatest damping at which the predicted decrease is reliable
+    trusted: float = MOST_DAMPING  # greatest damping at which predicted decreases are reliable
     patience: int = 3  # iterations without progress after which a problem is stationary
     # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
     # cost by this error; such a step counts as progress if the predicted decrease halves.

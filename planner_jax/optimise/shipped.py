@@ -26,8 +26,8 @@ REACH = 4.0  # number of standard deviations at which features are clipped
 class StartNetwork:
     """A network that corrects a guess: its weights, and the statistics of its input features."""
 
-    mean: Array | np.ndarray  # (F,), of the features
-    deviation: Array | np.ndarray  # (F,)
+    mean: Array | np.ndarray  # (F,), mean of each feature in the training data
+    deviation: Array | np.ndarray  # (F,), standard deviation of each feature
     weights: tuple[Array | np.ndarray, ...]  # (inputs, outputs) of each layer
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 

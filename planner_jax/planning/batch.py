@@ -334,7 +334,7 @@ class _Batch:
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return the entries `lanes` of every leaf; an index beyond the end selects the last entry."""
+    """Return every leaf's entries with indices `lanes`; indices beyond the end give the last."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 

@@ -32,8 +32,8 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     ) -> tuple[PyTree, PyTree]:
         """Return the planner that minimises, and the cases with their choices filled in.
 
-        The choices are those of the plans that `plan_of` makes. Without `plan_of` they are the
-        first proposals of the decision, and nothing is planned.
+        The choices come from plans that `plan_of` makes. Without `plan_of` they are the first
+        proposals of the decision, and nothing is planned.
         """
         if plan_of is None:
             return self.planner.settle(first_choice(self.decision, cases))

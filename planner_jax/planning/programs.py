@@ -26,7 +26,7 @@ from planner_jax.core.rules import require_shapes
 
 # Lanes (cases) of a device in one call. The sizes are few, because each needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
-_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # starts in one call: they fit a core's cache, and fill a GPU
+_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # starts in a call that fit a core's cache; that fill a GPU
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 _GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
 _SPARED = 8  # a smaller last call is compiled if it saves more than 1/8 of the lanes before it
@@ -77,7 +77,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
     # Small chunks are enough for sequential solving, and keep all cores busy until the end.
     if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
-    starts = 1 << (attempt.starts - 1).bit_length()  # rounded up to a power of two
+    starts = 1 << (attempt.starts - 1).bit_length()  # number of starts, up to a power of two
     return Sizes(max(BUCKETS[0], _CPU_CHUNK // starts), busy)
 
 
@@ -134,7 +134,7 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
     target = lane_sharding(mesh)
 
     def is_there(leaf: Array) -> bool:
-        own = leaf.sharding  # the fast test by == comes first
+        own = leaf.sharding  # == is the faster test, so it is tried first
         return own == target or own.is_equivalent_to(target, leaf.ndim)
 
     if all(map(is_there, jax.tree.leaves(tree))):
@@ -238,7 +238,7 @@ class _Program:
     """A compiled function that takes the leaves of `own` and a vector, and returns a vector."""
 
     run: Callable[[list[PyTree], np.ndarray], Array]
-    dtype: np.dtype  # of both vectors
+    dtype: np.dtype  # type of the input and output vectors
     result: _Result
 
 

@@ -19,7 +19,7 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
 _ARM_AT_REST = 0.01  # [rad/s] greatest joint rate of an arm that counts as standing still
-_NODES = 40  # intervals of each piece at which the search for the exceeded limit samples it
+_NODES = 40  # intervals of each piece, whose ends are searched for the exceeded limit
 
 
 def is_rested(found: Plan) -> bool:

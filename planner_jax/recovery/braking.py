@@ -26,12 +26,12 @@ PlanT = TypeVar("PlanT", CarPlan, ArmPlan)
 _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
 _GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
-_DECELERATIONS = (1.0, 0.7, 0.4)  # decelerations that are tried / the car's greatest deceleration
+_DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
 # Final curvatures that are tried, as fractions of the car's greatest curvature, positive to the
 # left. The plan's last curvature is tried before them.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
-_SLOWER = (1.5, 2.0, 3.0)  # durations that are tried / shortest one in which all joints can stop
+_SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints can stop
 
 
 def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
@@ -177,7 +177,7 @@ def _arm_candidates(
         pieces = []
         for begin in begins:
             past = np.minimum(begin, ends)
-            share = 1.0 - past / ends  # of the initial rate
+            share = 1.0 - past / ends  # remaining fraction of the initial rate
             reached = angles + 0.5 * rates * past * (1.0 + share)
             pieces.append([reached, rates * share, np.where(share > 0.0, -0.5 * rates / ends, 0.0)])
         yield np.array(pieces), times - begins

@@ -49,7 +49,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     guess_table = _GUESSES
     decode_nodes = (40, 40)
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
-    to: str = "brake"  # position of standstill: "brake" for anywhere, "home" for the case's `home`
+    to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
     # The preceding plan may end at its limits, so later rounds reduce the margin below the limits.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),

@@ -86,7 +86,7 @@ def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def snap_energy(trajectory: PiecewisePolynomial, order: int = 4) -> Array:
-    """Return the integral () of the squared `order`-th derivative, in closed form."""
+    """Return the integral () of a trajectory's squared `order`-th derivative, in closed form."""
     coeffs, durations = trajectory.coeffs, trajectory.durations
     form, exponents = energy_form(coeffs.shape[1] - 1, order)
     powers = durations[:, None, None] ** jnp.asarray(exponents, durations.dtype)[None]

@@ -50,12 +50,12 @@ class ProportionalMinco:
     """Constant float64 matrices of splines with M pieces that minimise the energy |p^(s)|^2."""
 
     order: int
-    proportions: np.ndarray  # (M,) durations over h, mean one
-    coefficients: np.ndarray  # (M, 2s, C), of powers of time over h, from C = 2s + O columns [b; y]
+    proportions: np.ndarray  # (M,) durations of the pieces divided by h; their mean is one
+    coefficients: np.ndarray  # (M, 2s, C), maps C = 2s + O columns [b; y] to pieces in t / h
     waypoints: np.ndarray  # (O, C), maps [b; y] to the waypoints, then their velocities times h
     offsets: np.ndarray  # (O, C), maps [b; waypoints] to y
     boundary_energy: np.ndarray  # (2s, 2s), quadratic form of the least energy for boundary rows
-    offset_energy: float  # energy per unit of |y|^2
+    offset_energy: float  # factor on |y|^2 in the energy
 
     @property
     def num_pieces(self) -> int:
@@ -100,7 +100,7 @@ def _hermite_energy(order: int) -> np.ndarray:
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the energy of all pieces as a quadratic form (C, C) in the columns.
+    """Return the energy of all pieces as a quadratic form (C, C) in the C columns [b; y].
 
     The form is a sum of squares. The same form in the nodes' derivatives would lose the small
     energy of smooth motions far from the origin to rounding errors.
@@ -138,7 +138,7 @@ def proportional_minco(
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # With times in units of piece i's duration, d-th derivatives are r_i^d times as large as for h.
+    # The d-th derivative by t / (r_i h) is r_i^d times the d-th derivative by t / h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
@@ -315,7 +315,7 @@ class Chain:
 
     rows: Float[Array, "N rows 3"]
     offsets: Float[Array, "N offsets 3"]  # whitened
-    piece_durations: Float[Array, " N"]  # [s]
+    piece_durations: Float[Array, " N"]  # [s], mean duration of each segment's pieces
 
     @property
     def columns(self) -> Float[Array, "N columns 3"]:

@@ -133,7 +133,7 @@ def _lift_to_unknowns(
     """Return J^T r (n,) and J^T J (n, n) of all residuals r, by the n = 6 K + 1 unknowns.
 
     Args:
-        lift: (W, K), derivatives of a joint's angle at W samples by its steps.
+        lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
         drift: (W, 6), derivatives of the angles at the samples by the time of contact.
         grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
         pushes: (W, 7), J^T r of these residuals.
@@ -174,7 +174,7 @@ class OnlineBlock(Planner):
     samples: int = 32  # samples of a motion at which least squares compute distances
     worst: int = 8  # samples with the least distances, at which least squares compute derivatives
     checked: int = 96  # samples of the returned plan at which limits are checked
-    margin: float = 0.003  # [m], least distance from everything
+    margin: float = 0.003  # [m], least distance of the arm from all obstacles and itself
     pole_margin: float = 0.012  # [m], least distance from the pole; covers gaps between samples
     slack: float = 0.004  # fraction of every limit that plans leave unused
     # Whether motions from standstill to standstill are as fast as the limits allow, and the fastest

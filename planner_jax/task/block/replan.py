@@ -46,7 +46,7 @@ class WarmBlock(Planner):
 
     case_type: ClassVar[type] = Replanning
     is_sequential: ClassVar[bool] = True
-    planner: OnlineBlock = OnlineBlock()  # has the unknowns, limits and weights
+    planner: OnlineBlock = OnlineBlock()  # its unknowns, limits and weights are used
     attempts: tuple[Warm, ...] = (Warm(),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve(self, task: Replanning, attempt: Warm) -> BlockPlan:
@@ -87,7 +87,7 @@ class ReplanBlock(Planner):
     case_type: ClassVar[type] = Replanning
     plan_type: ClassVar[type] = BlockPlan
     warm: WarmBlock = WarmBlock()
-    planner: OnlineBlock = OnlineBlock()  # for cases that the warm start does not solve
+    planner: OnlineBlock = OnlineBlock()  # for cases that `warm` does not solve
 
     @property
     def inner(self) -> OnlineBlock:

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from planner_jax.task.catch.replan import ReplanCatch
 
 _PROPORTIONS = (0.3,) + (1.0,) * 5
-_FEATURE_TIMES = (-0.1, 0.1)  # [s] the features' times of the ball, from the decided time
+_FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the ball that the network sees, after the decided time
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
 _LEARNED_SIZE = 2.0  # greatest norm of a learned catch point's variables: 0.89 of `_RIM`
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
@@ -60,7 +60,7 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # for `_FIRST`, with a network
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # used after a network
 # With several targets this search precedes Newton's method; `_FIRST` ends too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4

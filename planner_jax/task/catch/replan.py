@@ -34,11 +34,11 @@ from planner_jax.trajectory.polynomial import (
 from planner_jax.trajectory.proportional_minco import boundary_rows
 
 _ORDERS = 4  # number of derivatives in a state, from position to jerk
-_LATEST = 0.05  # [s], greatest change of a catch's time in the starting point
+_LATEST = 0.05  # [s], greatest shift of a catch's time in the starting point
 _SHORTEST = 0.01  # [s], least duration of a segment in the starting point
-_CLOSING = 0.1  # [m/s], least speed towards the net's plane for a change of a catch's time
+_CLOSING = 0.1  # [m/s], least speed towards the net's plane at which a catch's time is shifted
 _BINOMIALS, _SHIFTS = shift_basis(2 * _ORDERS)
-_TRIALS = (1.0, 0.2, 0.04)  # some are short: the first direction ignores curvature and is too long
+_TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as it ignores curvature
 
 
 @struct.dataclass
@@ -109,7 +109,7 @@ class ReplanCatch(OptimisedPlanner):
         order, times = np.asarray(previous.order), np.asarray(previous.times)
         present, horizon = np.asarray(cases.present), np.asarray(cases.horizon)
         is_past = times <= since
-        if times.shape[-1] == 1:  # nothing to reorder
+        if times.shape[-1] == 1:  # a single target needs no new order
             present = present & ~is_past
         elif is_past.any():
             caught = np.empty_like(is_past)

@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from planner_jax.task.hit.replan import ReplanHit
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
-_FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball's states in the features / landing time
+_FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
 # Settings of searches for any feasible plan, whatever its cost. A search with the waypoints'
 # velocities as variables needs a starting point near a feasible one. If limits are active along the
 # whole trajectory, the margin is only as large as peaks between the nodes require.

@@ -27,7 +27,7 @@ from planner_jax.task.hit.plan import HitPlan
 from planner_jax.trajectory.polynomial import evaluate, states_at, total_duration
 
 _SHORTEST = 0.01  # [s] least time to the impact in a starting point
-_TRIALS = (1.0, 0.2, 0.04)  # some are short: the first direction ignores curvature and is too long
+_TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as it ignores curvature
 
 
 @struct.dataclass
@@ -41,7 +41,7 @@ class ReplanHitContext:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class ReplanHit(OptimisedPlanner):
-    """A planner for `pj.replan` of hits; the previous plans may be of any hit planner."""
+    """A planner that re-plans hits for `pj.replan`, from previous plans of any hit planner."""
 
     case_type = Replanning
     plan_type = HitPlan

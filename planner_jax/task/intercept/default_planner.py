@@ -50,7 +50,7 @@ from planner_jax.task.intercept.searches import (
     search_reach,
 )
 
-_SPREAD = 2  # number of the earliest reaching time layers at which early paths may end
+_SPREAD = 2  # early paths end in one of the first two time layers that reach the target
 
 
 @jax.tree_util.register_static
