@@ -104,7 +104,9 @@ def make_page() -> str:
         for number, row in rows.items()
     }
     if wrong := words.keys() ^ places.keys():
-        raise LookupError(f"{WORDS.name} and the citations in the code differ in {sorted(wrong)}")
+        raise LookupError(
+            f"{WORDS.name} and the citations in the code differ: add or remove {sorted(wrong)}"
+        )
     lines = [HEAD]
     for paper, title in PAPERS.items():
         lines.append(f"## {title}, {paper}\n")
