@@ -1,6 +1,4 @@
-"""Extended Kalman filter for a ball's position and velocity.
-
-It follows [Yu2023bat, eq. 5] and [Yu2023catch, Section V-A].
+"""Extended Kalman filter of a ball's state [Yu2023bat, eq. 5; Yu2023catch, Section V-A].
 
 World frame, z up, SI units. Functions take one ball; use `jax.vmap` for many.
 """
@@ -22,7 +20,7 @@ Flight = Callable[[BallState, Array, Array, Array], BallState]
 
 @struct.dataclass
 class EkfModel:
-    """Parameters of the filter's flight model and of its position sensor."""
+    """Parameters of the Kalman filter: of the ball's flight and of the position sensor."""
 
     drag: Array  # (3,) K_i [1/s] for `linear_drag_flight`, () K_D [1/m] for `rk4_step`
     gravity: Array  # () [m/s^2], magnitude

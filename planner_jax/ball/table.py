@@ -102,10 +102,7 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Evaluate the spline's derivative (..., T, 3) of the given order at times `at` (T,) [s].
-
-    The result is computed as a matrix product with `values`, so JAX can differentiate by them.
-    """
+    """Evaluate a derivative (..., T, 3) of the spline at times `at` (T,), linear in `values`."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]

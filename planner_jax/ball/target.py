@@ -63,10 +63,7 @@ class BallPath:
 
 @struct.dataclass
 class HarmonicPath:
-    """Path of a target that drifts and oscillates: p_0 + v t + A sin(w t + phi).
-
-    It covers the targets of [Yu2023catch, Section VII-B b].
-    """
+    """A target that drifts and oscillates, p_0 + v t + A sin(w t + phi) [Yu2023catch, VII-B b]."""
 
     rules: ClassVar[Table] = (
         *(Field(name, (3,)) for name in ("pos", "vel", "amplitude")),

@@ -1,7 +1,4 @@
-"""The command `planner-jax doctor`: it checks the installation and times some plans.
-
-It prints versions, devices, floating-point precision, the compile cache and planning times.
-"""
+"""The command `planner-jax doctor`: it checks devices, precision and caches, and times plans."""
 
 import dataclasses
 import os

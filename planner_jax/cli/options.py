@@ -31,10 +31,7 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, and return the exit code `code`.
-
-    Names of arguments in the message are replaced by their options, such as "--num", in `flags`.
-    """
+    """Print an error in one line, with the options in `flags` for argument names; return `code`."""
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -60,10 +57,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the options and parse the words of the command line.
-
-        The result also has `flags`, the options (such as "--num") by the names of their arguments.
-        """
+        """Add the parser's options, then parse; the result has `flags`, options by argument."""
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
@@ -89,10 +83,7 @@ def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
 
 
 def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
-    """Add an option for every field of the dataclass `kind` of settings.
-
-    The names of a task's planners and suites of cases complete the help texts.
-    """
+    """Add an option for every field of the dataclass `kind`, the settings of a command."""
     hints = typing.get_type_hints(kind)
     names = {"planner": task.all_planners(), "suite": task.all_suites()} if task else {}
     defaults: dict[str, object] = {name: next(iter(known)) for name, known in names.items()}
@@ -138,10 +129,7 @@ def _type_of(hint: Any) -> type:
 
 
 def pop_out(given: Options, kind: str = "folder") -> str | None:
-    """Remove the option `--out` from the options, check it, and return it; None if absent.
-
-    `kind`, "folder" or "file", is what the option must name, for error messages.
-    """
+    """Remove the option `--out`, the name of a `kind`, from the options; return it, or None."""
     out = given.pop("out", None)
     if out == "":
         raise ArgumentError("out", f"a {kind}", out, verb="name")

@@ -1,7 +1,4 @@
-"""Commands that write or read run folders: `sweep`, `fly`, `train`, `report`, `compare` and others.
-
-A run folder has the results of one command: tables, figures, plans and a manifest.
-"""
+"""Commands that write or read run folders: `sweep`, `fly`, `train`, `report`, `compare`, ..."""
 
 import contextlib
 import datetime
@@ -219,10 +216,7 @@ def _quote_command() -> str:
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return the hint `again` on continuing a stopped run, if the run folder has a file `sign`.
-
-    Without this file the run has not started, and nothing needs to be continued.
-    """
+    """Return the hint `again` if the stopped run had started, which its file `sign` shows."""
     return again if (out / sign).exists() else stopping.NOTHING
 
 
@@ -230,10 +224,7 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `remainder()`, a hint on how to continue, to the message of an interruption or failure.
-
-    `rule` describes the requirement that an error of the file system violates.
-    """
+    """Add `remainder()`, how to continue a run, to the message of an interruption or failure."""
     try:
         yield
     except KeyboardInterrupt:

@@ -131,10 +131,7 @@ def _export(given: Options) -> None:
 
 
 def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
-    """Read a plan from a sweep's folder or a file of plans.
-
-    Returns the plan, and the referee's objection to it, which is "" if there is none or no verdict.
-    """
+    """Read a plan of a sweep or a file; return it, and the referee's objection (empty if none)."""
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
         from planner_jax.sweep.rows import read_plan

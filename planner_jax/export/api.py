@@ -137,7 +137,7 @@ def stream(
 
     Args:
         plan: one solved plan of a quadrotor.
-        to: "px4", the only format with messages.
+        to: "px4", the only format that can be sent as messages.
         udp: number of the port.
         rate: messages per second [Hz], 100 by default.
         recovery: see `export`.
@@ -156,10 +156,7 @@ def stream(
 
 
 def default_name(source: str | os.PathLike, row: int | None, to: str) -> str:
-    """Return the default file name, source-row-format, for an exported plan.
-
-    `source` is a run's folder or a file of plans, and `row` the plan's index, or None.
-    """
+    """Return the default file name, SOURCE-ROW-FORMAT, for a plan of a run's folder or a file."""
     extension = next(iter(FORMATS[_require_name(to)].writers))
     index = "" if row is None else f"-{row}"
     return f"{Path(os.path.abspath(source)).stem}{index}-{to}{extension}"
@@ -208,10 +205,7 @@ def lacks_recovery(plan: Plan) -> bool:
 
 
 def _require_name(to: str) -> str:
-    """Return the argument `to` if it names a format; otherwise raise `UnknownName`.
-
-    The error's message proposes the most similar name.
-    """
+    """Return `to` if it names a format; else raise `UnknownName`, with the most similar name."""
     if to not in FORMATS:
         alike = difflib.get_close_matches(str(to).lower(), FORMATS, n=1)
         hint = f"; did you mean {alike[0]!r}?" if alike else ""

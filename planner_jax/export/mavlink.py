@@ -1,7 +1,4 @@
-"""Export of setpoints as MAVLink messages SET_POSITION_TARGET_LOCAL_NED.
-
-The messages are written to a telemetry log, or sent over UDP in real time.
-"""
+"""Export of setpoints as MAVLink messages SET_POSITION_TARGET_LOCAL_NED, to a log or over UDP."""
 
 import socket
 import struct

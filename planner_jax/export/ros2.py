@@ -102,10 +102,7 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
 
 
 def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, ...]:
-    """Return the motion of K setpoints as arrays (K, 3 or 4) in the world frame.
-
-    They are position, quaternion (x, y, z, w), velocity, angular velocity and acceleration.
-    """
+    """Return position, quaternion xyzw, velocity, angular velocity, acceleration, world frame."""
     if isinstance(setpoints, QuadrotorSetpoints):
         quat = setpoints.quat_wxyz
         spin = rotate(quat, setpoints.body_rate)

@@ -1,7 +1,4 @@
-"""Setpoints and polynomials of a plan, which the writers of all export formats use.
-
-They include the plan's recovery trajectory to standstill, if it has one.
-"""
+"""Setpoints and polynomials of a plan and its recovery trajectory, for all export formats."""
 
 import dataclasses
 import os

@@ -30,10 +30,7 @@ class Arrivals:
         self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Check a packet that arrives at the time `now` [s], and remember its sending time.
-
-        Returns the packet's fault, and whether it is the first packet of a new senders' clock.
-        """
+        """Check a packet that arrives `now` [s]; return its fault, and whether its clock is new."""
         self.was_late = False
         if packet.fault:
             return packet.fault, False

@@ -1,7 +1,4 @@
-"""Python client of the UDP server `planner-jax serve`.
-
-`docs/live.md` describes the packets, for clients in other languages.
-"""
+"""Python client of the UDP server `planner-jax serve`; docs/live.md describes the packets."""
 
 import socket
 import time

@@ -33,10 +33,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make the course of a plan whose trajectory to standstill has not been planned.
-
-    Pieces of zero duration at the plan's end take the place of the recovery trajectory.
-    """
+    """Make the course of a plan, with pieces of zero duration in place of a recovery trajectory."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -110,10 +107,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration and jerk in a course after `elapsed` [s], in NumPy.
-
-    After the end of the course the robot stands still.
-    """
+    """Return position to jerk (4, 3) after `elapsed` [s] of a course, whose end is standstill."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:
@@ -122,5 +116,5 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 
 
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration and jerk in a trajectory after `elapsed` [s]."""
+    """Return position to jerk (4, 3) after `elapsed` [s] of a trajectory, as float32."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)

@@ -72,7 +72,7 @@ class Motion(enum.IntEnum):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Packet:
-    """A request whose header and length are valid."""
+    """A decoded request of a client, whose header and length are valid."""
 
     kind: int  # BALL or ROBOT
     ball: int  # number that identifies the ball
@@ -106,10 +106,7 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Encode the request that reports an observed ball or a state of the robot.
-
-    Times are in [s] by the sender's clock, and `values` are the fields of `Packet.values`.
-    """
+    """Encode a request: an observed ball or a robot's state; times [s] by the sender's clock."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 
@@ -144,10 +141,7 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """Encode the answer to a request, with setpoints (K, 20) float32.
-
-    `times` has the values [s] of `begin`, `period` and `contact` of `Answer`.
-    """
+    """Encode an answer with setpoints (K, 20) float32; `times` are begin, period, contact [s]."""
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 

@@ -278,10 +278,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery trajectory, from the current plan's end to standstill.
+        """Plan the recovery trajectory from the current plan's end to standstill.
 
-        If no recovery trajectory keeps the limits, return to the previous course. This is done
-        after an answer is sent, or before if the answer's setpoints reach beyond the contact.
+        If none keeps the limits, return to the previous course. To save time, this is called after
+        an answer is sent, unless the answer's setpoints reach beyond the contact.
         """
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:

@@ -1,7 +1,4 @@
-"""Statistics of live planning (`planner-jax serve`): counts and computing times.
-
-They need constant memory, so that the program can run for days.
-"""
+"""Counts of packets and plans, and computing times of live planning, in constant memory."""
 
 import collections
 import contextlib
@@ -42,10 +39,7 @@ class Latencies:
         self.add(time.perf_counter() - start)
 
     def quantile(self, share: float) -> float:
-        """Return the time [s] that a fraction `share` of the times do not exceed, to 1 %.
-
-        The result is NaN if the histogram is empty.
-        """
+        """Return the time [s] that a fraction `share` of the times do not exceed; NaN if empty."""
         if not self.num:
             return math.nan
         index = int(np.searchsorted(np.cumsum(self._counts), share * self.num))

@@ -1,7 +1,4 @@
-"""Estimate of one observed ball for live planning: a Kalman filter that rejects outliers.
-
-The filter starts anew if another ball is observed.
-"""
+"""Kalman filter of one observed ball, which rejects outliers and restarts for another ball."""
 
 import math
 from typing import Any

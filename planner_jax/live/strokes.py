@@ -99,10 +99,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return position, velocity, acceleration and jerk (4, 3) in the previous plan when it is left.
-
-    This time is `task.elapsed` [s] after the previous plan's start.
-    """
+    """Return position to jerk (4, 3) in the previous plan, `task.elapsed` [s] after its start."""
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
@@ -148,10 +145,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until the ball is too low for an upright net.
-
-    The time is 0 if the ball is too low at its apex, or at time 0 if it falls.
-    """
+    """Return the time (1,) [s] until the falling ball is too low for an upright net, or 0."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's apex, since a rising ball may be too low at time 0.

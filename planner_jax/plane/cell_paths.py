@@ -55,10 +55,7 @@ def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
 
 
 def _roughness(path: CellPath, grid: Grid, num: Array) -> Array:
-    """Return the sum of |v[n + 2] - v[n]|^2 over the first `num` layers n, in levels of speed.
-
-    The velocities v are those of the path at its layers.
-    """
+    """Return the sum of |v[n + 2] - v[n]|^2 for a path's velocities v at its first `num` layers."""
     velocity = _velocity(path.level, path.bin, grid)
     change = jnp.sum((velocity[2:] - velocity[:-2]) ** 2, axis=1)
     return jnp.sum(jnp.where(jnp.arange(2, grid.lattice.layers) < num, change, 0.0))

@@ -121,10 +121,7 @@ def _pack(cells: Array) -> Array:
 
 
 def _move_y(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) along y by `move` (...) cells, at most `_FARTHEST`.
-
-    Cells that leave the grid are dropped.
-    """
+    """Move cells (words, ..., cells) along y by `move` (...) cells; drop cells off the grid."""
     words, cells = rows.shape[0], rows.shape[-1]
     padded = jnp.pad(rows.reshape(words, -1, cells), ((0, 0), (0, 0), (_FARTHEST, _FARTHEST)))
     moved = jax.vmap(
@@ -136,10 +133,7 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) along x by `move` (...) cells, less than 32.
-
-    The cells along x are the bits of the words. Cells that leave the grid are dropped.
-    """
+    """Move cells along x, the bits of words (words, ..., cells), by `move` (...) < 32 cells."""
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31

@@ -273,10 +273,7 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the least distance (B,) [m] over pairs and samples, its sample and its pair's name.
-
-    Samples are indices (B,), and names are (B,) str.
-    """
+    """Return the least distance (B,) [m] over pairs and samples, its sample and its pair's name."""
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")
@@ -294,8 +291,8 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     lanes = np.arange(num_lanes)
     first = np.zeros(bounds.shape, bool)
-    # The exact distance of one pair at one sample is an upper bound of the least distance. Entries
-    # with a lower bound above this upper bound need no exact distance.
+    # One exact distance is an upper bound of the least distance. Entries whose lower bound is above
+    # this upper bound need no exact distance.
     first[lanes, bounds.argmin(axis=1)] = True
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK

@@ -77,7 +77,7 @@ _SAMPLES = 16384  # number of poses whose clearances are computed together and f
 
 @dataclasses.dataclass(frozen=True)
 class BlockVerdict(Verdict):
-    """Verdict on B plans of blocks.
+    """Verdict on B plans in which an arm blocks a ball with its shield.
 
     Measurements are NaN where the inputs are not finite or the plan's times are wrong. A clearance
     is the least distance of solids over the samples. It is minus the penetration depth if they
@@ -150,10 +150,7 @@ def referee_blocks(
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Read all arrays of cases and plans, and check their shapes.
-
-    Returns the arrays by name, and the link of each capsule of the arm (-1 for the base).
-    """
+    """Read all arrays and check their shapes; return them, and the link of each capsule."""
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
@@ -370,10 +367,7 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Measure the ball relative to the shield at the contact; test ball, tilt and tunnel.
-
-    The joint angles are (6, B) [rad]. Returns measurements, and (failed, excess, time) by test.
-    """
+    """Test ball, tilt and tunnel at the contact with joint angles (6, B), and measure them."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
@@ -398,10 +392,7 @@ def _tunnel(case: dict, contact: float) -> tuple:
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """Return the error (B,) [s] of the contact time if boxes change by `grown` [m] per side.
-
-        The outer box is enlarged, and the inner box reduced.
-        """
+        """Return the error (B,) [s] if the outer box grows and the inner box shrinks by `grown`."""
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)

@@ -62,7 +62,7 @@ SLOWEST_TARGET = 1e-6
 
 @dataclasses.dataclass(frozen=True)
 class CatchVerdict(FlightVerdict):
-    """Verdict on B plans that catch up to N targets each.
+    """Verdict on B plans in which a quadrotor catches up to N targets each.
 
     Arrays (B, N) are in the order of the catches, like the plan's `order` and `times`. Their
     entries are NaN after the last catch, and where the plan names a wrong target.
@@ -184,10 +184,7 @@ def _ends(durations: np.ndarray, num: int) -> np.ndarray:
 
 
 def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of targets with the indices `order` at `times`.
-
-    Both `order` and `times` [s] are (B, N).
-    """
+    """Return positions and velocities (B, N, 3) of targets `order` (B, N) at `times` (B, N) [s]."""
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:

@@ -62,7 +62,7 @@ RIM = 0.9  # fraction of the racket's radius within which the ball must meet the
 
 @dataclasses.dataclass(frozen=True)
 class HitVerdict(FlightVerdict):
-    """Verdict on B plans of hits, with measurements of the impact and of the ball's return."""
+    """Verdict on B plans in which a quadrotor hits a ball, with measurements of ball and impact."""
 
     SENTENCES = _SENTENCES
     UNBOUNDED = MOTION_UNBOUNDED | {
@@ -236,10 +236,7 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """Compute the ball's impact and landing; return measurements, and (failed, excess, time).
-
-    In this function vectors are (3, B), and the states of balls are (6, B).
-    """
+    """Compute impact and landing; return measurements and tests. Vectors are (3, B)."""
     durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
     end = durations.sum(axis=1)
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])

@@ -57,7 +57,7 @@ _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
 @dataclasses.dataclass(frozen=True)
 class InterceptVerdict(Verdict):
-    """Verdict on B plans of interceptions.
+    """Verdict on B plans in which a car drives to a moving target.
 
     Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s.
     A clearance is the least distance of the car's body from an obstacle over the samples. It is
@@ -295,11 +295,7 @@ def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure and test speed, acceleration, curvature, steering rate and lateral acceleration.
-
-    Each piece between two knots lasts `span` (B,) [s]. Returns measurements, and
-    (failed, excess, time) by test.
-    """
+    """Measure and test the limits of motions whose pieces last `span` (B,) [s]."""
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]

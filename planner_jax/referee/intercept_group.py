@@ -96,10 +96,7 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """Return the cases of legs that start at times `begin` (B,) [s] with the state `car`.
-
-    The state `car` is pose, speed and curvature.
-    """
+    """Return cases that start at `begin` (B,) [s] with pose, speed and curvature in `car`."""
     movers, (start, speed, curvature) = shared.movers, car
     centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}

@@ -44,10 +44,7 @@ class Verdict:
     failed_excess: np.ndarray
 
     def sentence(self, k: int | None = None) -> str:
-        """Describe in one line which limit plan `k` exceeds, when, and the excess.
-
-        For a verdict on one plan, `k` is None.
-        """
+        """Describe in one line which limit plan `k` exceeds; `k` is None for a single plan."""
         at = () if k is None else k
         name = str(np.asarray(self.failed_limit)[at])
         if not name:
@@ -129,10 +126,7 @@ def flat(values: np.ndarray) -> np.ndarray:
 
 
 def cut(num_lanes: int, size: int) -> list[slice]:
-    """Divide a batch of `num_lanes` plans into slices of at most `size` plans.
-
-    An empty batch gives one empty slice.
-    """
+    """Divide `num_lanes` plans into slices of at most `size`; no plans give one empty slice."""
     return [slice(start, start + size) for start in range(0, max(num_lanes, 1), size)]
 
 
@@ -177,11 +171,7 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def cores() -> int:
-    """Return the number of CPU cores that the referee uses.
-
-    The environment variable `NPROC`, which XLA reads too, sets the number. Without it the number
-    is that of the cores on which the process may run.
-    """
+    """Return the number of cores to use: `NPROC`, which XLA reads too, or all that are allowed."""
     setting = os.environ.get("NPROC", "")
     if setting.isdecimal():
         return max(int(setting), 1)
@@ -239,10 +229,7 @@ def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarr
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate the `order`-th derivative (3, ...) of polynomials at times (...) [s].
-
-    `coeffs` (D + 1, 3, ...) has the coefficients of rising powers on its first axis.
-    """
+    """Evaluate derivatives of polynomials with coefficients (D + 1, 3, ...) at times (...) [s]."""
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

@@ -146,10 +146,7 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Evaluate position, velocity, acceleration and jerk at fractions u (S,) of all pieces.
-
-    Each of the four arrays is (3, B, M, S).
-    """
+    """Evaluate position to jerk, each (3, B, M, S), at fractions u (S,) of all pieces."""
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T

@@ -91,10 +91,7 @@ def rotor_thrusts(
 def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the thrust per unit mass [m/s^2] and the angular velocity [rad/s] at samples.
-
-    Both are (B, M, S, 3), in the world frame.
-    """
+    """Return thrust per mass [m/s^2] and angular velocity [rad/s], (B, M, S, 3), world frame."""
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
@@ -107,10 +104,7 @@ def _pull_and_rate(
 
 
 def _body_axes(pull: np.ndarray) -> np.ndarray:
-    """Return rotations (..., 3, 3), body to world, that turn the z axis into thrusts (..., 3).
-
-    They are the shortest such rotations, which is the convention of zero heading.
-    """
+    """Return the shortest rotations (..., 3, 3) from the world's z axis to thrusts (..., 3)."""
     up = pull / np.linalg.norm(pull, axis=-1, keepdims=True)
     x, y, z = np.moveaxis(up, -1, 0)
     k = 1.0 / (1.0 + z)

@@ -33,10 +33,7 @@ def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the distances (...) [m] of points from line segments with ends `first` and `second`.
-
-    All three arrays are (3, ...) [m]. A segment may have zero length.
-    """
+    """Return distances (...) [m] of points from segments; `first` may equal `second`."""
     span, away = second - first, point - first
     square = dot(span, span)
     share = np.clip(_ratio(dot(away, span), square), 0.0, 1.0)
@@ -124,10 +121,7 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return the least distance (P,) [m] of the 12 edges of each first box from its second box.
-
-    The arguments are those of `between_boxes`.
-    """
+    """Return the least distance (P,) [m] of the first boxes' edges from the second boxes."""
     edges = rotation * half  # (3, 3, P), the half edges as vectors
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]

@@ -27,10 +27,7 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def map_in_processes(
     function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
 ) -> list[ResultT]:
-    """Return the results of `function` for all arguments, computed in worker processes.
-
-    The function, its arguments and its results must be objects that `pickle` can write.
-    """
+    """Return `function` of each argument, computed in worker processes; `pickle` carries both."""
     threads, idle = _start_workers()
 
     def call(argument: ArgumentT) -> ResultT:
@@ -62,10 +59,7 @@ def _call(
 
 @functools.cache
 def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
-    """Start one worker process per core, and a pool of threads that wait for their results.
-
-    Processes and threads end when the calling program ends.
-    """
+    """Start a worker process per core, and threads that wait for them, until the program ends."""
     num, idle = cores(), SimpleQueue()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **_ONE_THREAD}
     pipe, command = subprocess.PIPE, [sys.executable, "-m", __name__]

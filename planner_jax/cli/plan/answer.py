@@ -1,7 +1,4 @@
-"""The answer of the command `planner-jax plan` for one case, as text and as pictures.
-
-It has the plan, the referee's verdict, and how close the plan comes to each limit.
-"""
+"""The answer of `planner-jax plan` for one case: plan, referee's verdict, margins to the limits."""
 
 import abc
 import dataclasses
@@ -50,11 +47,7 @@ class Margin:
 
     @property
     def share(self) -> float:
-        """Used fraction of the limit: reached / allowed, or allowed / reached for a lower bound.
-
-        The fraction is above 1 if the limit is exceeded. It is infinite if an exceeded limit allows
-        no finite ratio.
-        """
+        """Used fraction of the limit: reached / allowed, or its inverse for a lower bound."""
         part, whole = (self.allowed, self.reached) if self.least else (self.reached, self.allowed)
         if whole > 0.0:
             return max(part, 0.0) / whole
@@ -141,10 +134,7 @@ def sample_plan(found: QuadrotorPlan) -> SampledMotion:
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan's polynomial pieces.
-
-    They include the recovery trajectory, but no pieces of zero duration.
-    """
+    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan and its recovery."""
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0

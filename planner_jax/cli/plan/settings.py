@@ -1,7 +1,4 @@
-"""Options of the command `planner-jax plan` for each task.
-
-Nothing here imports JAX, so that the command reports a wrong option at once.
-"""
+"""Options of the command `planner-jax plan` for each task, checked before JAX is imported."""
 
 import dataclasses
 import math
@@ -111,10 +108,7 @@ class SingleHitSettings(SingleSettings):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleCatchSettings(SingleSettings):
-    """Options of `planner-jax plan catch`: the balls, a horizon and limits.
-
-    One ball is specified by `pos` and `vel`, or several balls by a repeated option `ball`.
-    """
+    """Options of `planner-jax plan catch`: one ball by `pos` and `vel`, or several by `ball`."""
 
     pos: tuple[float, ...] | None = option(None, "X Y Z", "initial position of the only ball [m]")
     vel: tuple[float, ...] | None = option(None, "X Y Z", "initial velocity of the only ball [m/s]")
