@@ -171,7 +171,7 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def cores() -> int:
-    """Return the number of cores to use: `NPROC`, which XLA reads too, or all that are allowed."""
+    """Return the number of cores to use: the variable `NPROC`, as XLA does, or all available."""
     setting = os.environ.get("NPROC", "")
     if setting.isdecimal():
         return max(int(setting), 1)
