@@ -32,7 +32,7 @@ from planner_jax.benchmarks.block_library import library_options
 from planner_jax.benchmarks.run import Bench, argument_parser, begin
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 
-WARM = 50  # balls planned before the measurement
+WARM = 50  # Number of balls that are planned before the measurement.
 
 
 def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:

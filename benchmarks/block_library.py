@@ -55,7 +55,7 @@ ROUNDS = 20  # The time of a batch lookup is measured over this number of calls.
 
 
 def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
-    """Return a function's result and its duration [s] without compilation."""
+    """Call a function; return its result, and its duration [s] minus JAX's compile time."""
     began = time.perf_counter()
     with CompileClock() as clock:
         found = function(*arguments, **how)

@@ -81,10 +81,10 @@ TABLE_II = {
 
 @struct.dataclass
 class Torques:
-    """Joint torques of a motion."""
+    """Torques of the arm's six joints over a motion."""
 
-    rms: Array  # (6,) [N m], root of the mean square over the time
-    peak: Array  # (6,) [N m], greatest magnitude
+    rms: Array  # (6,) [N m], root mean square over the duration of the motion
+    peak: Array  # (6,) [N m], greatest magnitude during the motion
 
 
 def motion_torques(
@@ -120,12 +120,12 @@ class Outcome:
     """Success, times and torques of one planner on B throws."""
 
     verdict: BlockVerdict
-    found: np.ndarray  # (B,) bool
-    counted: np.ndarray  # (B,) bool, blocked although planning time counts
-    query: np.ndarray  # (B,) [s]
-    execution: np.ndarray  # (B,) [s]
+    found: np.ndarray  # (B,) bool, whether the motion is free of collision, even if too late
+    counted: np.ndarray  # (B,) bool, whether the ball is blocked if planning time counts
+    query: np.ndarray  # (B,) [s], planning time
+    execution: np.ndarray  # (B,) [s], time during which the arm moves
     with_gravity: Torques  # leaves (B, 6) [N m]
-    without: Torques
+    without: Torques  # leaves (B, 6) [N m], torques without gravity
 
 
 def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
@@ -265,7 +265,7 @@ def main() -> None:
     names = parse_names(parser, "--planners", options.planners, PLANNERS)
     if not 0.0 <= options.delay < np.inf:
         parser.error(f"argument --delay: must be finite and >= 0, got {options.delay:g}")
-    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+    if hasattr(os, "sched_setaffinity"):  # JAX's threads inherit the affinity if they start later.
         os.sched_setaffinity(0, [max(os.sched_getaffinity(0))])
     with begin(parser, options) as bench:
         settings = {"regime": options.regime, "wide": options.wide, "delay": options.delay}

@@ -215,7 +215,7 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
 
 
 def main() -> None:
-    """Learn the starts, and write the shipped file if requested."""
+    """Learn the starting points of the search, and replace the shipped file if requested."""
     parser = argument_parser("block_starts", __doc__, num=60, tries=24)
     parser.add_argument(
         "--lanes", type=at_least(1), default=512, help="starts optimised in one call"

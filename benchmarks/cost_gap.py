@@ -62,7 +62,7 @@ def cost_gaps(
 
 
 def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
-    """Return the planner that provides the reference costs, or None if there is none."""
+    """Return the planner whose costs are the reference for `cost_gaps`, or None if none exists."""
     if isinstance(planner, OptimisedPlanner):
         return with_long_search(planner)
     if card is None or card.yardstick is None:

@@ -73,7 +73,7 @@ def line(name: str, flights: InterceptFlights, seconds: float) -> str:
 
 
 def command(settings: InterceptFly) -> str:
-    """Return the command that runs the drives of a row and writes a run folder."""
+    """Return the shell command that simulates drives with these settings into a run folder."""
     own = InterceptFly(suite=settings.suite, num=settings.num, seed=settings.seed)
     words = [f"--suite {settings.suite} --num {settings.num} --seed {settings.seed}"]
     for field in dataclasses.fields(settings):

@@ -36,25 +36,25 @@ class Scene:
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
     initial_curvature: float  # [1/m]
-    dt: float  # [s], of a layer; the last one of L ends at the case's time
-    target: np.ndarray  # (L + 1, 2) [m], positions at the layers
-    tolerance: float  # [m]
-    end_heading: float  # [rad]
-    heading_tolerance: float  # [rad]
-    walls: tuple[np.ndarray, ...]  # corners (V, 2) [m] each, counter-clockwise
-    movers: tuple[np.ndarray, ...]  # corners as for walls, at time 0
-    velocities: np.ndarray  # (M, 2) [m/s], of the movers
-    lower: np.ndarray  # (2,) [m], of the map, which the body's middle does not leave
-    upper: np.ndarray  # (2,) [m]
-    length: float  # [m], of the body
-    width: float  # [m]
-    middle: float  # [m], from the rear axle to the body's middle
+    dt: float  # [s], length of a layer of time; the last of L layers ends at the case's time
+    target: np.ndarray  # (L + 1, 2) [m], positions of the target at time 0 and after each layer
+    tolerance: float  # [m], greatest distance of the body's middle from the target at the meeting
+    end_heading: float  # [rad], required heading at the meeting
+    heading_tolerance: float  # [rad], greatest deviation from this heading
+    walls: tuple[np.ndarray, ...]  # corners (V, 2) [m] of each wall, counter-clockwise
+    movers: tuple[np.ndarray, ...]  # corners (V, 2) [m] of each moving obstacle at time 0
+    velocities: np.ndarray  # (M, 2) [m/s], constant velocities of the moving obstacles
+    lower: np.ndarray  # (2,) [m], lower corner of the map, which the body's middle must not leave
+    upper: np.ndarray  # (2,) [m], upper corner of the map
+    length: float  # [m], length of the body
+    width: float  # [m], width of the body
+    middle: float  # [m], distance from the rear axle to the body's middle
     wheelbase: float  # [m]
-    speed: float  # [m/s], greatest
-    acceleration: float  # [m/s^2], greatest
-    lateral_acceleration: float  # [m/s^2], greatest
-    curvature: float  # [1/m], greatest
-    steering_rate: float  # [rad/s], greatest; ignored by lattices
+    speed: float  # [m/s], limit
+    acceleration: float  # [m/s^2], limit
+    lateral_acceleration: float  # [m/s^2], limit
+    curvature: float  # [1/m], limit
+    steering_rate: float  # [rad/s], limit, which lattices ignore
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Reach:
     """Result of a lattice search for one scene: whether and when the target can be met."""
 
     at_end: bool  # whether the target can be met at the case's time
-    earliest: float  # [s], first layer at which it can be met; inf if there is none
+    earliest: float  # [s], time of the first layer at which the target can be met, or infinity
     path: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed; None if not requested
 
 
@@ -115,7 +115,7 @@ def near(x: np.ndarray, y: np.ndarray, corners: np.ndarray, radius: float) -> np
 
 
 def _round(value: np.ndarray) -> np.ndarray:
-    """Round to integers; halves are rounded up, also for negative numbers."""
+    """Round numbers to integers; halves are rounded up, also for negative numbers."""
     return np.floor(value + 0.5).astype(int)
 
 
@@ -249,7 +249,7 @@ class Lattice:
         return walls ^ (walls & blocked)
 
     def _goal(self, layer: int) -> list[int]:
-        """Return for each heading the cells at which the body's middle is at the target."""
+        """Return for each heading the cells from which the car meets the target at a layer."""
         scene = self.scene
         reach = scene.tolerance + CELL * np.sqrt(0.5)
         place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL

@@ -54,7 +54,7 @@ TABLE_III = {
     "path": 150.0,
     "speed": 3.0,
     "total": 154.0,
-}  # [ms], means; the paper's speed time is an upper bound
+}  # [ms] Mean times of Table III of [Qu2022]. The time of "speed" is an upper bound.
 
 
 def planners() -> dict[str, Any]:

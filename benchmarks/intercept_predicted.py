@@ -92,8 +92,8 @@ def compute_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Ar
 class Observations:
     """Observations of B targets, before the start and during the drive."""
 
-    times: np.ndarray  # (L,) [s]
-    places: np.ndarray  # (B, L, 2) [m]
+    times: np.ndarray  # (L,) [s], times of the observations
+    places: np.ndarray  # (B, L, 2) [m], observed positions
 
     def paths(self, now: float) -> TurningPath:
         """Predict the paths of all B targets from the observations up to the time `now` [s].
@@ -198,7 +198,7 @@ class Drives:
         if lanes.size:
             is_lost = np.asarray(~is_solved(self.plans.status[lanes]))
             plans = replace_lanes(plans, lanes, plan_cases(take_lanes(task.case, lanes), is_lost))
-        # A plan that exceeds a limit replaces only another such plan.
+        # A new plan that exceeds a limit replaces an old plan only if the old plan exceeds a limit.
         lanes = np.flatnonzero(is_solved(plans.status) | ~is_solved(self.plans.status))
         new, first = take_lanes(plans, lanes), round(now * RATE)
         setpoints = new.sample(RATE)
@@ -329,7 +329,7 @@ def main() -> None:
     with begin(parser, options) as bench:
         truth = take_lanes(pj.intercept.draw(options.num, options.suite, options.seed), slice(None))
         turning = np.asarray(cast("Any", truth.target).turn_rate) != 0.0
-        end = float(truth.time[0])  # equal for all cases of a suite
+        end = float(truth.time[0])  # All cases of a suite have the same time of the meeting.
         observed = Observations(
             *pj.intercept.observe(truth, options.seed, NOISE, COUNT, INTERVAL, until=end)
         )

@@ -61,14 +61,14 @@ PAIRS = (
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """Results of one planner, with one number for each problem."""
+    """Results of one planner: arrays with one number for each problem."""
 
-    good: np.ndarray  # bool: solved, and clear of every polygon
-    rms: np.ndarray  # [m/s^2]
-    peak: np.ndarray  # [m/s^2]
-    jerk: np.ndarray  # [m/s^3], greatest
-    end_error: np.ndarray  # [m]
-    clearance: np.ndarray  # [m], least; negative inside of a polygon
+    good: np.ndarray  # bool, whether the problem is solved and the curve is outside all polygons
+    rms: np.ndarray  # [m/s^2], root mean square acceleration
+    peak: np.ndarray  # [m/s^2], greatest acceleration
+    jerk: np.ndarray  # [m/s^3], greatest jerk
+    end_error: np.ndarray  # [m], distance of the curve's end from the required station
+    clearance: np.ndarray  # [m], least distance from a polygon; negative inside of a polygon
 
 
 def planners() -> dict[str, SpeedPlanner]:

@@ -46,7 +46,7 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.polynomial import snap_energy
 
-# Task -> suite, and the module that defines its problem.
+# Task -> suite of its cases, and module in `ipopt_peer` that defines its problem for IPOPT.
 TASKS = {"hit": ("court", "hits"), "catch": ("throws", "catches")}
 BATCH, GPU_BATCH = 1024, 65536  # Batch sizes on a CPU and on other devices.
 # Greatest published speed-up of the batched interior-point solver jaxipm over IPOPT, measured with
@@ -62,7 +62,8 @@ class Found:
 
     name: str
     cost: np.ndarray  # (B,), cost of snap and time, without penalties
-    # (B,), the planner's objective with penalties; None if the solver does not minimise it
+    # (B,), value of the planner's objective with penalties; None for IPOPT with limits as
+    # constraints
     objective: np.ndarray | None
     accepted: np.ndarray  # (B,) bool, whether the referee accepts the plan
     seconds: np.ndarray  # (B,) [s], CPU times of single cases on one core
@@ -381,7 +382,7 @@ def main() -> None:
     names = parse_names(parser, "--tasks", options.tasks, TASKS)
     if importlib.util.find_spec("casadi") is None:
         parser.exit(2, f"benchmarks.ipopt needs casadi: {install_line('oracle')}\n")
-    if hasattr(os, "sched_setaffinity"):  # before JAX starts its threads
+    if hasattr(os, "sched_setaffinity"):  # JAX's threads inherit the affinity if they start later.
         os.sched_setaffinity(0, [max(os.sched_getaffinity(0))])
     with begin(parser, options) as bench:
         for name in names:

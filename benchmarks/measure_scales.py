@@ -45,15 +45,16 @@ HIT_PIECES, CATCH_PIECES = (6, 12), (6,)
 # Scales of the variables at the end of a hit with which the measurement starts: logarithms of the
 # duration, of the ball's flight time and of the thrust, two speeds [m/s], and jerk [m/s^3].
 _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
-# The same for the end of a catch: logarithm of the duration, position in the net (2), velocity
-# [m/s], acceleration [m/s^2], jerk [m/s^3].
+# Scales of the variables at the end of a catch with which the measurement starts: logarithm of the
+# duration, position in the net (2), velocity [m/s], acceleration [m/s^2], jerk [m/s^3].
 _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
 # Floor of the curvature for catches. It is larger than for hits, because the objective of easy
 # throws hardly depends on the position in the net and the final jerk.
 _CATCH_FLOOR = 0.1
 
 
-# Function of a planner, a point (n,) and its context; returns residuals (R,).
+# Type of a function that returns the residuals (R,) of a planner at decision variables (n,). Its
+# third argument is the planner's prepared data of the case.
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
 _ROUNDS = 3  # Number of measurements, each with the scale of the measurement before.
 
@@ -67,10 +68,11 @@ def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.A
 def measure_scale(
     planner: Any, cases: Any, residuals: Residuals, *, floor: float = 1e-4
 ) -> np.ndarray:
-    """Measure the scale of every decision variable on a batch of cases.
+    """Measure the scale of every decision variable of a planner on a batch of cases.
 
-    Solutions depend on the scale with which they are found, so the measurement is repeated with its
-    own result; it converges in two or three rounds.
+    The solutions at which curvature is measured depend on the scales with which they are computed.
+    The measurement is therefore repeated with the measured scales; it converges in two or three
+    rounds.
 
     Args:
         planner: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.

@@ -85,7 +85,7 @@ class CatchVecEnv(vec_env.VecEnv):
         return seen, reward, np.ones(LANES, bool), [{} for _ in range(LANES)]
 
     def close(self) -> None:
-        """Do nothing: no resource is open."""
+        """Do nothing, because the environment has no open resources."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute of the environment, repeated for each of the `LANES` environments."""

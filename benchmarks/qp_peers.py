@@ -96,7 +96,7 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
     def solve(right_side: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> PeerSolution:
         known = _equality_values(matrices, right_side)
         low, high = np.concatenate([known, lower]), np.concatenate([known, upper])
-        if (low > high).any():  # OSQP rejects such bounds
+        if (low > high).any():  # OSQP rejects a lower bound above its upper bound.
             return _make_solution(matrices, np.full(hessian.shape[0], np.nan), False, np.nan)
         began = time.perf_counter()
         solver.update(l=low, u=high)

@@ -49,7 +49,7 @@ def argument_parser(name: str, doc: str | None, **counts: int) -> argparse.Argum
 
 
 def at_least(least: int) -> Callable[[str], int]:
-    """Return a parser of integer arguments that rejects values below `least`."""
+    """Return a function that parses an integer argument and rejects values below `least`."""
 
     def integer(text: str) -> int:
         if (value := int(text)) < least:
@@ -127,7 +127,7 @@ class Bench:
         self._owning.close()
 
     def say(self, *lines: str) -> None:
-        """Print lines, and store them for table.md."""
+        """Print lines, and store them for the file table.md of the run folder."""
         print("\n".join(lines), flush=True)
         self._lines += lines
 

@@ -210,7 +210,8 @@ class Soak:
             known = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
             answer = self.send(BALL, now, tuple(seen), ball) or known
-            # Until the server knows where the robot hovers, the robot keeps hovering.
+            # The robot starts to follow answers only after the server has received its state, that
+            # is after a state packet was answered. Until then it hovers.
             if answer is None or (state_now is None and known is None):
                 continue
             state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)

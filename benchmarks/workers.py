@@ -139,12 +139,12 @@ def _core_order(core: int) -> tuple[int, ...]:
     try:
         names = "physical_package_id", "core_id"
         return *(int((topology / name).read_text()) for name in names), core
-    except (OSError, ValueError):  # the system does not report it
+    except (OSError, ValueError):  # The system does not report packages and physical cores.
         return (core,)
 
 
 def _list_gpus() -> list[str]:
-    """Return the GPUs that JAX uses, in the notation of CUDA_VISIBLE_DEVICES."""
+    """Return the names of the GPUs that JAX uses, as in the variable CUDA_VISIBLE_DEVICES."""
     if jax.default_backend() != "gpu":
         return []
     known = os.environ.get(_GPUS)
@@ -158,7 +158,8 @@ def main() -> None:
     parser.add_argument("--ways", default=known, help=f"set-ups, by number; default: {known}")
     options = parser.parse_args()
     numbers = parse_names(parser, "--ways", options.ways, known.split(","))
-    os.environ[_PREALLOCATE] = "false"  # leaves the GPUs' memory to the sweeps
+    # JAX in this process must not reserve the GPUs' memory, which the sweeps need.
+    os.environ[_PREALLOCATE] = "false"
     ways = _list_setups(sorted(os.sched_getaffinity(0)), _list_gpus())
     ways = {name: way for k, (name, way) in enumerate(ways.items(), 1) if str(k) in numbers}
     least = 3 + max(share.first for shares, _ in ways.values() for share in shares)

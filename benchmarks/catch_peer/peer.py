@@ -55,12 +55,12 @@ AS_GOOD = 1e-3  # A relative cost above the published cost up to this value coun
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """Settings of the search; the fields are the program's command-line arguments."""
+    """Settings of the C++ program's search. The fields are its command-line arguments."""
 
     # Whether the variables are whitened waypoint offsets from the smoothest trajectory and the
     # net's position relative to the ball. If not, they are waypoints q and the end position p(T).
     relative: bool = False
-    memory: int = 48  # pairs of L-BFGS, at most 64; 0 for BFGS with a dense matrix
+    memory: int = 48  # number of pairs that L-BFGS stores, at most 64; 0 for BFGS
     past: int = 10  # iterations over which the cost is compared
     delta: float = 1e-7  # relative change of the cost over `past` iterations that ends the search
     decrease: float = 1e-4  # constant of sufficient decrease in the weak Wolfe conditions
@@ -74,7 +74,7 @@ class Settings:
     scale_a: float = 1.0
 
     def words(self) -> list[str]:
-        """Return the command-line arguments of the program."""
+        """Return these settings as command-line arguments of the C++ program."""
         given = dataclasses.asdict(self)
         return [f"{name}={float(value):g}" for name, value in given.items()]
 
@@ -104,9 +104,9 @@ class Figures:
 
     plans_per_second: float  # plans per CPU second, without reading input and printing
     share_within: float  # share of cases whose cost is at most `AS_GOOD` above the published one
-    median_gap: float  # relative cost above the published one
+    median_gap: float  # median over cases of the relative cost above the published cost
     mean_iterations: float
-    success_rate: float  # by the published test: 200 samples, five per cent tolerance
+    success_rate: float  # by the published test: limits at 200 samples with a tolerance of 5 %
     guess_error: float  # largest relative error of the cost at the initial guess
 
     def __str__(self) -> str:

@@ -17,7 +17,7 @@ from scipy.interpolate import BPoly
 
 from planner_jax.task.hit.case import HitCase
 
-ca: Any = importlib.import_module("casadi")  # from the extra `oracle`
+ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extra `oracle`.
 
 # Degree of the polynomial that approximates the ball's path until it lands, to 1e-7 m.
 BALL_DEGREE = 10

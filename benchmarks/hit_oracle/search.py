@@ -82,10 +82,10 @@ class Finding:
     starts: int = 0  # number of starting points used
     cpu_seconds: float = 0.0
     impact_time: float = math.nan  # [s], of the hit, or of the trajectory with the least excess
-    flight_time: float = math.nan  # [s]
-    thrust: float = math.nan  # [g], at the impact
-    coeffs: np.ndarray | None = None  # (M, 5, 3) of a hit
-    durations: np.ndarray | None = None  # (M,) [s]
+    flight_time: float = math.nan  # [s], from the impact until the ball reaches its target
+    thrust: float = math.nan  # [g], thrust of the quadrotor at the impact
+    coeffs: np.ndarray | None = None  # (M, 5, 3), polynomial coefficients of a feasible hit
+    durations: np.ndarray | None = None  # (M,) [s], durations of the pieces of a feasible hit
 
     def note(self, unknowns: np.ndarray, durations: np.ndarray) -> None:
         """Store a converged solution if its excess over the limits is the least so far."""
@@ -95,7 +95,11 @@ class Finding:
 
     @property
     def verdict(self) -> str:
-        """Verdict: feasible, infeasible (as far as the programs can show), or undecided."""
+        """The verdict "feasible", "infeasible" or "undecided".
+
+        "Feasible" is proven by a hit. "Infeasible" means that every converged program exceeds a
+        limit clearly, which is no proof.
+        """
         if self.feasible:
             return "feasible"
         clear = INFEASIBLE_ABOVE < self.least_excess < math.inf

@@ -45,7 +45,7 @@ def read_params(context: Any) -> dict[str, Any]:
 
 
 def make_problem(planner: Any) -> Problem:
-    """Define the optimisation problem of an `ExactCatch` for one ball, with its settings."""
+    """Define for IPOPT the problem that the planner `ExactCatch` solves for one ball."""
     return Problem(
         planner=planner,
         sizes=SIZES,
@@ -58,7 +58,10 @@ def make_problem(planner: Any) -> Problem:
 
 
 def ball_at(time: Any, params: dict) -> tuple[Any, Any]:
-    """Return position and velocity of a ball with linear drag on each axis [Yu2023catch, eq. 9]."""
+    """Return a ball's position and velocity at a time, with linear drag [Yu2023catch, eq. 9].
+
+    For small drag times time, a power series replaces the closed form, which would be inaccurate.
+    """
     x = params["ball_drag"] * time
     small = ca.fabs(x) < 0.5
     near, far = ca.if_else(small, x, 0.0), ca.if_else(small, 1.0, x)

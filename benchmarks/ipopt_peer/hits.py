@@ -41,7 +41,7 @@ def read_params(context: Any) -> dict[str, Any]:
 
 
 def make_problem(planner: Any) -> Problem:
-    """Define the optimisation problem of an `ExactHit`, with its settings."""
+    """Define for IPOPT the problem that the planner `ExactHit` solves, with the same settings."""
     nodes = planner.num_table_nodes
     return Problem(
         planner=planner,
