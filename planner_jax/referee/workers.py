@@ -27,7 +27,7 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def map_in_processes(
     function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
 ) -> list[ResultT]:
-    """Return `function` of each argument, computed in worker processes; `pickle` carries both."""
+    """Return `function` of each argument, computed in worker processes; both must be picklable."""
     threads, idle = _start_workers()
 
     def call(argument: ArgumentT) -> ResultT:
