@@ -165,7 +165,7 @@ class Scene:
         return machine_parts(*launch) if launch and self.world.mouth else []
 
     def robot(self, at: int, alpha: float = 1.0) -> list[Any]:
-        """Draw the robot at a sample, with its tool filled; return the drawn artists."""
+        """Draw the robot at a sample, with its tool as a filled polygon; return the artists."""
         robot = self.world.robot
         pose = frame(self.recording, robot, self.flight, at).robot
         drawn: list[Any] = []

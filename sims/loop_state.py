@@ -32,7 +32,7 @@ class Outlook:
 
 
 class Pilot(Protocol):
-    """A task's part of the closed loop: a frozen dataclass, static under jit."""
+    """A task's part of the closed loop: what is planned, and which plan is flown; static."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
         """Return the planning problem at the outlook, while `plan` is flown."""

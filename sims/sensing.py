@@ -120,7 +120,7 @@ def update_unfiltered(
     period = 1.0 / sensing.rate
     before = estimate.belief.ball
     flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
-    # The velocity at the end is the mean velocity, plus half of the velocity's change, in a period.
+    # The final velocity is the mean velocity over the period, plus half of the velocity's change.
     vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
     taken = jnp.concatenate([seen, vel])
     blind = jnp.concatenate([flown.pos, flown.vel])

@@ -109,7 +109,7 @@ class FlySettings:
         return self.planner == next(iter(self.TASK.planners))
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless the flights can replan at the rate `rate`."""
+        """Raise `ValueError` unless the flights can replan at the rate `self.rate` [Hz]."""
         require(self.rate >= 0.0, "replan", ">= 0", self.rate)
 
     def flight(self) -> Any:

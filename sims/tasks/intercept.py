@@ -415,7 +415,7 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Return obstacles in the form of the referee's clearances; absent obstacles are zero."""
+    """Convert obstacles to the arrays that the referee's `clearances` takes; absent ones are zero."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)

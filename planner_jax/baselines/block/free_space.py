@@ -101,7 +101,7 @@ class FreeSpace:
 
 
 def _sample_pieces(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sample the joint angles (N, 6) of all pieces, `counts` equal steps and both ends of each."""
+    """Sample the joint angles (N, 6) of each piece k at the ends of `counts[k]` equal steps."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]
