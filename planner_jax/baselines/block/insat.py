@@ -12,11 +12,11 @@ With fewer control points the bounds on the derivatives' control points force lo
 
     w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
 
-is minimised over the control points and t_f. The velocity bounds (4d) and bounds on accelerations are imposed on
-the control points of the derivatives. The arm stands still at the start, and at the goal if the
-case requires it. For given control points the least t_f that keeps these bounds is a maximum in
-closed form, so that every iterate keeps them. The maximum is smoothed for the gradient. The
-optimisation ignores obstacles (4c): every iterate is checked afterwards, and the last
+is minimised over the control points and t_f. The velocity bounds (4d) and bounds on accelerations
+are imposed on the control points of the derivatives. The arm stands still at the start, and at the
+goal if the case requires it. For given control points the least t_f that keeps these bounds is a
+maximum in closed form, so that every iterate keeps them. The maximum is smoothed for the gradient.
+The optimisation ignores obstacles (4c): every iterate is checked afterwards, and the last
 collision-free iterate is used.
 
 Two parts of the authors' code that the paper does not mention are left out: bounds on jerk, which
