@@ -415,7 +415,7 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Convert obstacles to the arrays that the referee's `clearances` takes; absent ones are zero."""
+    """Convert obstacles to the arrays that the referee's `clearances` takes; zero if absent."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)

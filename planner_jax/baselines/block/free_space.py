@@ -19,7 +19,8 @@ from planner_jax.task.block.scene import Scene
 RESOLUTION = 0.05 / 3.0  # [rad], joint-space distance between samples of an edge, as in [1]
 _BATCHES = (1, 64, 256, 1024)  # batch sizes for which programs are compiled
 
-# [1] The planners' code behind [Natarajan2024], github.com/sbpl/parallel_search.
+# [1] is the planners' code that the authors of [Natarajan2024] published:
+# github.com/sbpl/parallel_search.
 
 
 @jax.jit

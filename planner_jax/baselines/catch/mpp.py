@@ -115,8 +115,8 @@ class MppCatch(Planner):
     speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)  # [m/s], sampled on each axis at a catch
     thrusts: tuple[float, ...] = (0.5, 1.0, 1.5)  # sampled at a catch, in units of gravity
     ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
-    nodes: int = 60  # intervals per piece at whose ends limits are evaluated
-    time_nodes: int = 128  # intervals of a horizon that are searched for a fall
+    nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
+    time_nodes: int = 128  # number of intervals of a horizon that are searched for a fall
 
     def __post_init__(self) -> None:
         require_settings(self)

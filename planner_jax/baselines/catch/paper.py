@@ -170,7 +170,7 @@ class PaperCatch(OptimisedPlanner):
         return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
-        """Return the initial guess (1, n): primitives from standstill to standstill below balls."""
+        """Return the initial guess (1, n): primitives between standstills below all balls."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)

@@ -189,7 +189,7 @@ class BatHit(OptimisedPlanner):
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """Return the impact that the last five variables describe, and the defect of eqs 13-14.
+        """Return the impact of the last five variables, and by how much eqs 13-14 are unsolvable.
 
         The variables are log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
         """
@@ -208,7 +208,7 @@ class BatHit(OptimisedPlanner):
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
-        # If planning starts late, the ball may land before that time; it is hit before it lands.
+        # If planning starts late, the ball may land before T_0 + T_1. Then the guess is earlier.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
@@ -249,7 +249,7 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return whitened offsets, boundary rows, piece duration, impact and defect at a point."""
+        """Return offsets, boundary rows, piece duration, impact and defect of a search point."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
@@ -273,7 +273,7 @@ class BatHit(OptimisedPlanner):
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
-        """Return the penalty on limits along the trajectory (eq. 18a), squares in natural units."""
+        """Return the penalty on limits along the trajectory (eq. 18a), with squares in SI units."""
         limits = case.limits
         along = jnp.stack(motion_excess(motion, case.gravity, limits))
         one = jnp.ones_like(limits.speed)

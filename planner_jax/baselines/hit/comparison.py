@@ -49,9 +49,9 @@ class ScenarioCounts:
     READS = ("scenario", *(column.name for column in OUTCOMES))
 
     def __init__(self) -> None:
-        self._num: Counter[str] = Counter()  # by scenario
+        self._num: Counter[str] = Counter()  # number of cases of each scenario
         self._successes: Counter[str] = Counter()
-        self._published: Counter[tuple[str, str]] = Counter()  # by planner and scenario
+        self._published: Counter[tuple[str, str]] = Counter()  # successes, by (planner, scenario)
         self._num_published: Counter[tuple[str, str]] = Counter()
 
     def add(self, rows: pa.Table) -> None:

@@ -84,7 +84,7 @@ class JuggleHit(Planner):
     thrust_z: float = 1.1  # vertical thrust at the impact, divided by gravity
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
     ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
-    nodes: int = 60  # intervals per piece at whose ends limits are evaluated
+    nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
     num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
 
     def __post_init__(self) -> None:

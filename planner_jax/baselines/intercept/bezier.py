@@ -1,4 +1,4 @@
-"""Scalar curves over time, made of Bezier pieces of equal duration, for `speed`.
+"""Scalar curves over time, made of Bezier pieces of equal duration, for `speed.py`.
 
 Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with the Bernstein
 polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A control point here is the paper's
@@ -101,7 +101,7 @@ def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
 
 
 def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
-    """Expand rows (W, n + 1) for one piece's control points into rows for those of all pieces.
+    """Expand rows (W, n + 1) for one piece's control points into rows for all pieces.
 
     On a smooth curve the first row of a piece equals the last row of the previous piece. Such first
     rows are left out.

@@ -310,7 +310,7 @@ def _cell_of(x, y, heading_bin, field, headings):
 
 @njit(cache=True)
 def _is_free_primitive(tree, node, p, primitives, scene, field):
-    """Return whether a primitive from a node is collision-free."""
+    """Return whether the body touches nothing along arc `p` of the primitives from a node."""
     x, y, k = tree.place[node, 0], tree.place[node, 1], tree.bin[node]
     # The straight arc keeps the node's heading, so that its first sample has the node's direction.
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
@@ -325,7 +325,7 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Collect curvatures [1/m] and lengths [m] of a path's parts: arcs to a node, then a shot."""
+    """Collect curvatures [1/m] and lengths [m] of a path: arcs to a node, then parts to the goal."""
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]

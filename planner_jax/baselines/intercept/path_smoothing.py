@@ -110,7 +110,7 @@ def smooth_path(
     middle = 0.5 * (body[0] + body[1])
 
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the path at a fraction of the shift, and whether it keeps all limits."""
+        """Return the path at a fraction of the shift to smooth points, and if it keeps limits."""
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])
         x, y, heading = found.T
@@ -158,7 +158,8 @@ def smooth_points(
 
     def descend(state: tuple, _: None) -> tuple[tuple, None]:
         points, value, slope, step = state
-        # The cost has lengths in units: its gradient by units is `unit` times that by metres.
+        # Steps are in the unit of length. The gradient by units is unit * slope, and a step of one
+        # unit is `unit` metres.
         moved = points - jnp.where(moves[:, None], step * unit**2 * slope, 0.0)
         new = (moved, *value_and_slope(moved))
         is_lower = new[1] <= value

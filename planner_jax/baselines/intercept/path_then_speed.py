@@ -123,14 +123,14 @@ class PathThenSpeed(Planner):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch, computed together with `vmap`."""
-        # Every case uses the largest number of layers, so that all loops have the same length.
+        # Every case uses the largest number of time layers, so that all loops have equal lengths.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
 
     def solve_in_layers(
         self, case: InterceptCase, attempt: Search, layers: Array | None
     ) -> InterceptPlan:
-        """Return the plan of one case; `layers` () int32 is the reach set's number of layers."""
+        """Return the plan of one case; `layers` () is the number of time layers of the search."""
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
@@ -171,7 +171,7 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Create the planner `lattice`: eight paths, curves in corridors; `fields` are its options."""
+    """Create the planner `lattice`, which tries eight paths; `fields` are the planner's options."""
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 

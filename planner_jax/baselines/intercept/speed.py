@@ -135,7 +135,7 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return one piece's bounded rows of a derivative of an order: control points or samples."""
+    """Return the matrix from a piece's control points to the bounded values of a derivative."""
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows

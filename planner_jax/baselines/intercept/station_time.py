@@ -99,7 +99,7 @@ def reference_line(
     penalty = jnp.where(_find_forbidden_edges(problem, grid), jnp.inf, 0.0)  # (N, J + 1, S + 1)
 
     def shift_to_end(leaving: Array) -> Array:
-        """Shift costs (J + 1, S + 1) from the stations where jumps start to where they end."""
+        """Shift costs (J + 1, S + 1) from the stations where edges start to where they end."""
         padded = jnp.pad(leaving, ((0, 0), (grid.jumps, 0)), constant_values=jnp.inf)
         return jnp.stack([padded[k, grid.jumps - k : grid.jumps - k + num + 1] for k in jumps])
 
@@ -266,14 +266,14 @@ def corridor(
     at_begin, at_end = blocked.start <= start, blocked.end >= start + length
 
     def line(edge: tuple[Array, Array], side: float) -> tuple[Array, Array]:
-        """Return start and rise of the lines above (side 1) or below (side -1) an edge."""
+        """Return start and rise [m] of bounds above (side 1) or below (side -1) polygon edges."""
         own = (edge[1] - edge[0]) / duration
         if lines == "edges":
             chosen = own
         elif lines == "flat":
             chosen = jnp.zeros_like(own)
         else:
-            # If the edge reaches one end of the piece, the line may only turn away from it there.
+            # If the edge reaches one end of the piece, the line may only turn away from the edge.
             turned = side * slope[:, None]
             turned = jnp.where(at_begin, jnp.minimum(turned, side * own), turned)
             turned = jnp.where(at_end, jnp.maximum(turned, side * own), turned)
@@ -307,7 +307,7 @@ def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Ar
     first, last = joints[:-1, None], joints[1:, None]
     is_passed = (edge[:-1] < last - slack) & (edge[1:] > first + slack)
     speed = jnp.min(jnp.where(is_passed, limit, jnp.inf), axis=1)
-    # A line at standstill on the border of two parts passes no part.
+    # A line that stands still on the border of two path parts passes no part.
     speed = jnp.where(jnp.isfinite(speed), speed, jnp.min(limit))
     is_slower = (limit < speed[:, None]) & ~is_passed
     below, above = is_slower & (edge[1:] <= first + slack), is_slower & (edge[:-1] >= last - slack)

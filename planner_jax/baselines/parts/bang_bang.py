@@ -74,8 +74,8 @@ def bang_bang(
     above = 2.0 * c / jnp.maximum(b + _root(b**2 - 4.0 * c), 1e-9)
     below = (d - 0.5 * u**2 / a) / jnp.maximum(duration - u / a, 1e-9)
     peak = jnp.where(d < u * duration - 0.5 * u**2 / a, below, above)
-    rises = jnp.abs(peak - u) / a  # [s], until a joint coasts
-    brakes = duration - peak / a  # [s], when it starts to brake
+    rises = jnp.abs(peak - u) / a  # [s], time at which each joint starts to coast
+    brakes = duration - peak / a  # [s], time at which each joint starts to brake
     first = jnp.sign(peak - u) * a
 
     times = jnp.sort(jnp.clip(jnp.concatenate([rises, brakes]), 0.0, duration))

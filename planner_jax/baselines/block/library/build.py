@@ -61,7 +61,7 @@ class Portions:
     pairs: int  # number of pairs that are planned and written to disk as one part
     lanes: tuple[int, int]  # batch sizes per device, small and large, of one planner call
     # Number of starts of a pair in one call. One start at a time saves work, since the search stops
-    # at the first success. A GPU takes many at once, since a large batch takes as long as a small.
+    # at the first success. A GPU plans many starts at once, which hardly takes longer there.
     starts: int
 
 
@@ -138,7 +138,7 @@ def repair(
     Args:
         library: library of a scene with the same boxes.
         scene: the new scene.
-        retry: also plan for pairs that have no motion.
+        retry: also plan for pairs of cells that have no motion.
         progress: show a progress bar on the standard error stream.
 
     Returns:
@@ -176,7 +176,7 @@ def portions() -> Portions:
 
 
 def _require_free(setting: Setting, homes: ArrayLike) -> None:
-    """Raise `ArgumentError` if the arm touches something at a home."""
+    """Raise `ArgumentError` if the arm touches something at a home, where motions start."""
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
         shown = f"{near:.3g} m to the nearest obstacle at home {k}"
@@ -192,7 +192,7 @@ def plan_pairs(
 ) -> np.ndarray:
     """Plan motions from one home for N pairs of cells; return their table rows (N, 6 K + 10).
 
-    Straight motions are tried first. Then the least squares of `BentPair` start from one learned
+    Straight joint motions are tried first. Then the least squares of `BentPair` start from one learned
     start after another, for pairs that have no motion or might get a motion that allows an earlier
     entry of the ball. If a pair still has no motion, both steps are repeated with a coarse
     tolerance.
@@ -255,7 +255,7 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Split the indices of starts into groups, each planned in one call."""
+    """Split the indices of learned starts (initial guesses) into groups, one planner call each."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
@@ -273,7 +273,7 @@ def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Return table rows for the best motions; without a motion the row's duration is infinite."""
+    """Convert the best motions to table rows; a row without a motion has an infinite duration."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
     steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
@@ -335,7 +335,7 @@ def _nearest(setting: Setting, angles: Array) -> Array:
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
-    """Return a table's rows for all homes and pairs, without a stored motion."""
+    """Return rows for all homes and pairs of cells, each marked as being without a motion."""
     pieces = planner.online.pieces
     rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
     rows[..., 6 * pieces] = np.inf

@@ -68,7 +68,7 @@ class Layout:
 
     @property
     def num_pairs(self) -> int:
-        """The number of pairs of cells, including pairs that no ball can pass."""
+        """The number of pairs of an outer and an inner cell, with pairs that no ball can pass."""
         return self.num_outer * self.num_inner
 
 
@@ -159,7 +159,7 @@ def cells_around(
 
 @struct.dataclass
 class Tunnels:
-    """The tunnels of all P pairs of cells of a layout, with NumPy float64 leaves."""
+    """The tunnels between the two cells of each of P pairs, with NumPy float64 leaves."""
 
     outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
@@ -168,7 +168,7 @@ class Tunnels:
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
-    """Return the tunnels between the cells of the outer and the cells of the inner box.
+    """Return the tunnels, which are the spaces between outer and inner cells that balls pass.
 
     A ball reaches an inner cell only from in front of that cell's face. The outer cell is therefore
     cut off at the plane of this face, and a rectangle remains. Since both boxes are convex, every

@@ -85,7 +85,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print a library's coverage, and draw a map of the coverage as PNG if `map` is a path."""
+    """Print how many pairs of cells have a motion, and draw a map of them at the path `map`."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)

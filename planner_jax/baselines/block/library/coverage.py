@@ -1,4 +1,4 @@
-"""Coverage of a library by stored motions, and a check of these motions by the referee."""
+"""Coverage of a library: which pairs of cells have a motion; a check of motions by the referee."""
 
 import dataclasses
 
@@ -68,7 +68,7 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Random balls through pairs with a motion, which leave just enough time for the motion."""
+    """Random balls through cells with a stored motion, which leave just enough time for it."""
 
     cases: BlockCase
     pairs: np.ndarray  # (B,) int, number of the pair of cells of each ball

@@ -3,7 +3,7 @@
     planner-jax block library 1
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
-The second line is JSON. It holds the hash of the setting, the faces of both boxes and their cells,
+The second line is JSON. It holds a hash of arm and scene, the faces of both boxes and their cells,
 the links of the arm's capsules, the file's size, and type, shape and offset of every array by name.
 Blanks pad the second line to the first array. Arrays are little-endian, in C order, and start at
 multiples of 64 bytes.

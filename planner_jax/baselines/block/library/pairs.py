@@ -64,7 +64,7 @@ class PairCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """() for one pair, (B,) for a batch."""
+        """The shape of the batch: () for one pair of cells, (B,) for a batch of pairs."""
         return np.shape(self.best)
 
 
@@ -94,7 +94,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return case and flight of the nominal ball if it enters the outer box at `entry` [s]."""
+        """Return case and flight of a ball from cell centre to cell centre that enters at `entry`."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -192,7 +192,7 @@ class PairPlanner(Planner):
         )
 
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the plan of a motion `point`, checked for limits, collisions and whole tunnel."""
+        """Return the motion `point` as a plan, with its excess over limits and tunnel coverage."""
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)

@@ -73,7 +73,7 @@ class LibraryBlock(Planner):
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
-        """Return the home () int32 nearest to the arm, and whether the library fits the case."""
+        """Return the home (start pose) nearest to the arm, and whether the library fits the case."""
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
@@ -81,7 +81,7 @@ class LibraryBlock(Planner):
 
 
 def _is_same(own: Setting, other: Setting) -> Array:
-    """Return whether two settings are equal, () bool; False if their shapes differ."""
+    """Return whether arm, limits and scene of two settings are equal; False if shapes differ."""
     mine, theirs = jax.tree.leaves(own), jax.tree.leaves(other)
     if jax.tree.structure(own) != jax.tree.structure(other) or any(
         np.shape(a) != np.shape(b) for a, b in zip(mine, theirs, strict=True)

@@ -43,7 +43,7 @@ def setting_of(case: BlockCase) -> Setting:
 
 
 def fingerprint(setting: Setting) -> str:
-    """Return twelve hexadecimal digits, a hash of all numbers of a setting in float32."""
+    """Return a hash of arm, limits and scene in float32, as twelve hexadecimal digits."""
     digest = hashlib.sha256(repr(setting.arm.capsule_link).encode())
     for path, leaf in jax.tree_util.tree_leaves_with_path(setting):
         value = np.asarray(leaf)
@@ -198,7 +198,7 @@ class Library:
 def library_of(
     rows: Array | np.ndarray, homes: Array | np.ndarray, layout: Layout, setting: Setting
 ) -> Library:
-    """Return a library from table rows (H, P, 6 K + 10) and homes (H, 6) [rad]."""
+    """Return a library from table rows (H, P, 6 K + 10) and start poses `homes` (H, 6) [rad]."""
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
