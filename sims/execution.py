@@ -31,7 +31,7 @@ FRAME = _STEPS * TIMESTEP  # [s], duration of a frame
 
 @struct.dataclass
 class ArmState:
-    """The variables that change while an arm follows a course: physics, torques and errors."""
+    """The variables that change while an arm follows its course, a timed joint motion."""
 
     physics: Physics
     torques: Array  # (6,) [N m], acting torques
@@ -46,7 +46,7 @@ class ArmState:
 
 @struct.dataclass
 class _Setting:
-    """The course and the drives of an arm, constant during its execution."""
+    """The course (a timed joint motion) and the drives of an arm, constant during execution."""
 
     course: Course
     since: Array  # () [s], start of the interval in which errors and torques are summed
@@ -59,7 +59,7 @@ class _Setting:
 
 @dataclasses.dataclass(frozen=True)
 class Executed:
-    """The result of executing B courses, on the host in float64; leaves (B, ...).
+    """The result of executing B courses (timed joint motions), in float64; leaves (B, ...).
 
     Errors and torques are evaluated from the time at which the arm may start until its contact.
     """
@@ -130,7 +130,7 @@ def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState,
 
 
 def _start(world: World, setting: _Setting, key: Array) -> ArmState:
-    """Return an arm at time 0 of its course, with the torques that keep it on the course."""
+    """Return an arm at time 0 of its course, a joint motion, with torques that keep it there."""
     robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
     reference = jax.tree.map(
         lambda leaf: leaf[0], robot.references(setting.course, zero[None], world)
@@ -143,7 +143,7 @@ def _start(world: World, setting: _Setting, key: Array) -> ArmState:
 
 @functools.cache
 def _compile(world: World) -> tuple[Callable, Callable, Callable]:
-    """Return compiled functions that start a batch, advance a batch, and evaluate courses."""
+    """Return compiled functions that start arms, advance arms, and evaluate planned angles."""
     options = compiler_options()
     start = jax.jit(jax.vmap(functools.partial(_start, world)))
     advance = jax.jit(jax.vmap(functools.partial(_frames, world)), compiler_options=options)
@@ -184,7 +184,7 @@ def execute(
     late: np.ndarray | float = 0.0,
     drives: Drives = IDEAL,
 ) -> Executed:
-    """Simulate arms that execute a batch of courses, and return their motions and errors.
+    """Simulate arms that execute courses (timed joint motions); return their motions and errors.
 
     Args:
         world: a world with an arm, and steps of `TIMESTEP`.

@@ -82,7 +82,7 @@ def launch_ball(
         loop: settings of the flights' loop.
         flights: states of the flights, leaves (B, ...).
         balls: leaves (B, N, 3), state of each ball at the start of the plan for it.
-        drag: (B, N), true K_D [1/m].
+        drag: (B, N), true drag coefficient K_D [1/m].
         believed: (B, N), initial estimate of K_D [1/m].
         ball: index of the launched ball among the N balls.
         seen: [s], how long the ball has already been in flight (static).
@@ -169,7 +169,7 @@ def watch_ball(
     Args:
         loop: settings of the loop, with sensing and planning period.
         ball: true state at the start of the plan.
-        drag: (), true K_D [1/m].
+        drag: (), true drag coefficient K_D [1/m].
         believed: (), initial estimate of K_D [1/m].
         key: random key of the observation noise.
         duration: [s], how long the ball has been in flight at the start of the plan (static).

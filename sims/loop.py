@@ -219,7 +219,7 @@ def _next_period(
         pilot: the task's part of the loop.
         flights: the flights at the start of the period.
         cases: cases of the task, leaves (B, ...).
-        drag: (B, N), true K_D [1/m] of the balls.
+        drag: (B, N), true drag coefficients K_D [1/m].
         begin: function that starts one part of the period with its arguments, and returns a
             function that waits for the result.
     """
@@ -259,7 +259,7 @@ def fly_leg(
         pilot: the task's part of the loop.
         flights: the flights at the start, leaves (B, ...).
         cases: cases of the task, leaves (B, ...), with times that count like the flights' times.
-        drag: (B, N), true K_D [1/m] of the balls.
+        drag: (B, N), true drag coefficients K_D [1/m].
         num_periods: number of planning periods.
 
     Returns:
@@ -294,7 +294,7 @@ def begin_compiling(
         pilot: the task's part of the loop.
         flights: leaves (B, ...), which may have no plans.
         cases: cases of `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
-        drag: (B, N), true K_D [1/m] of the balls.
+        drag: (B, N), true drag coefficients K_D [1/m].
 
     Returns:
         A function that waits for the compilation, to be called before `fly_leg`.

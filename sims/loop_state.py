@@ -26,7 +26,7 @@ class Outlook:
     time: Array  # () [s], time of this situation
     elapsed: Array  # () [s], time since the start of the current plan
     balls: BallState  # leaves (N, 3), predicted states of the balls
-    drag: Array  # (N,) K_D [1/m], estimated
+    drag: Array  # (N,), drag coefficients K_D [1/m], estimated
     present: Array  # (N,) bool, whether each ball is in flight and not yet met
     head_state: Array  # planned state of the robot, (4, 3) for a quadrotor
 
@@ -35,7 +35,7 @@ class Pilot(Protocol):
     """A task's part of the closed loop: what is planned, and which plan is flown; static."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
-        """Return the planning problem at the outlook, while `plan` is flown."""
+        """Return the planning problem of the expected situation, while `plan` is flown."""
         ...
 
     @property
@@ -48,7 +48,7 @@ class Pilot(Protocol):
         ...
 
     def times(self, plan: Any) -> Array:
-        """Return planned contact times (N,) [s] since the start of the plan, in balls' order."""
+        """Return planned contact times (N,) [s] since the plan's start, in the order of balls."""
         ...
 
     def plan_shapes(self, cases: Any) -> Any:
@@ -57,7 +57,7 @@ class Pilot(Protocol):
 
     @property
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
-        """The function that finds the contacts and misses of a step, like `scoring.passage`."""
+        """The function, like `scoring.passage`, that finds a step's contacts of tool and balls."""
         ...
 
 

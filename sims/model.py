@@ -137,7 +137,7 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
         world: settings of the model.
         physics: state before the step.
         command: (A,), command for the robot's actuators.
-        drag: (N,) K_D [1/m] of the balls.
+        drag: (N,), drag coefficients K_D [1/m] of the balls.
     """
     model, data = _mjx_model(world)
     controls, forces = world.robot.drive(physics, command, world.timestep)
@@ -181,7 +181,7 @@ def place_balls(
         world: settings of the model.
         physics: state of one world.
         balls: new states, leaves (N, 3).
-        drag: (N,) K_D [1/m].
+        drag: (N,), drag coefficients K_D [1/m].
         which: (N,) bool, the balls to set; other balls do not change.
     """
     acc = _ball_accelerations(world, balls.vel, drag)

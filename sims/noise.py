@@ -108,7 +108,7 @@ class PlaneSensing:
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
-        """Return the number of frames from one plan to the next; without replanning, of 1 s.
+        """Return the number of frames from one plan to the next; the frames of 1 s without any.
 
         Args:
             replan: [Hz], rate of replanning; 0 for never.

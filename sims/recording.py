@@ -81,7 +81,7 @@ class Launches:
     """The states of N balls of F flights before and after their simulation; NumPy leaves."""
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
-    drag: Any  # (F, N), true K_D [1/m]
+    drag: Any  # (F, N), true drag coefficient K_D [1/m]
     begins: np.ndarray  # (N,) [s], start of the plan for each ball
     seen: float  # [s], how long a ball has been in flight at the start of its plan
     returned: BallState | None = None  # leaves (F, 3), the first ball just after its impact
@@ -150,7 +150,7 @@ def make_recording(
     time = np.broadcast_to(grid, (number, grid.size))
 
     def extend(leaf: np.ndarray) -> np.ndarray:
-        """Extend a leaf over all samples: its first value before the record, NaN after it."""
+        """Extend an array over all samples: its first value before the record, NaN after it."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
         whole[:, before : before + samples], whole[:, :before] = leaf, leaf[:, :1]
         return whole

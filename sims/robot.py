@@ -63,7 +63,7 @@ def rotation(quat_wxyz: Any, array_library: Any = jnp) -> Any:
 
 
 class Robot(Protocol):
-    """A robot in the simulation. `World` is `sims.model.World`, which holds the robot."""
+    """The protocol of a simulated robot; `world` is the `sims.model.World` that holds it."""
 
     WORDS: ClassVar[str]  # description of simulation and control, for the report of a run
     num_pos: ClassVar[int]  # R, number of the robot's joint positions in `qpos`

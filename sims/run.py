@@ -184,7 +184,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
     parts, compiling, warm, warm_flights, recorded = [], 0.0, 0.0, 0, None
     watch = Stopwatch()
     for first in range(0, num, size):
-        lanes = np.arange(first, first + size) % num  # the last batch is padded with first cases
+        lanes = np.arange(first, first + size) % num  # the first cases pad the last batch
         with CompileClock() as clock:
             lap = Stopwatch()
             flights = flight.fly(cases[lanes], record)

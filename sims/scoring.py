@@ -116,7 +116,7 @@ def passage(
 
 
 def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
-    """Return a ball's contact so far, or a later passage if that one is nearer to the centre.
+    """Return a ball's contact so far, or a later passage that is nearer to the disc's centre.
 
     A ball that is already met keeps its contact.
     """

@@ -1,7 +1,6 @@
 """Detection of a ball in an image by its colour, and its position from the depth of its pixels.
 
 The method follows [Natarajan2024, Section IV-F]. Thresholds of hue, saturation and value give a
-The method follows [Natarajan2024, Section IV-F]. Thresholds of hue, saturation and value give a
 mask of pixels. Pixels of low confidence and pixels at the depth of other objects are dropped. The
 ball's position is the centroid of the remaining pixels, if there are enough of them.
 """

@@ -70,7 +70,7 @@ class Estimate:
 
 
 def observe(key: Array, pos: Array, sensing: Sensing) -> Array:
-    """Return noisy observations of balls at positions (N, 3) [m]; NaN rows where one is missing."""
+    """Return noisy observations (N, 3) [m] of balls at `pos`; missing ones are rows of NaN."""
     noise_key, drop_key = jax.random.split(key)
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
     lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout

@@ -172,7 +172,7 @@ class CatchFly(BallFly):
 
     @property
     def redecide_rate(self) -> float:
-        """The rate [Hz] at which order and times are decided again."""
+        """The rate [Hz] at which order and times of the catches are decided again."""
         return self.rate if self.redecide is None else self.redecide
 
     def flight(self) -> Any:

@@ -18,7 +18,7 @@ from planner_jax.plane.target import TurningPath, arc
 from planner_jax.sims.prediction.observed import centre, safe_sqrt
 from planner_jax.sims.prediction.turn_fit import best_turn, fit_rate, path_of, tangent
 
-_REACH = 5.0  # half width of the interval of turn rates, in standard deviations
+_REACH = 5.0  # half width of the evaluated interval of turn rates, in standard deviations
 _OFFSETS = np.linspace(-1.0, 1.0, 49)  # evaluated turn rates, relative to that half width
 # Gauss-Legendre nodes and weights on (-1, 1).
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
@@ -143,13 +143,13 @@ def select(
         extent = jnp.sum(seen.weight * (seen.place[0] ** 2 + seen.place[1] ** 2))
         rounding = (4.0 * jnp.finfo(dtype).eps) ** 2 * extent
         variance = jnp.maximum(best.squares / freedom, jnp.maximum(rounding, 1e-30))
-        # With an estimated noise an error has Student's distribution, whose variance is this one.
+        # With an estimated noise, errors have Student's distribution, which has this variance.
         error_variance = variance * freedom / (freedom - 2.0)
     else:
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Return 2 log(L_best / L), the log likelihood ratio of the best turn to this fit."""
+        """Return 2 log(L_best / L), for likelihoods of the best turn and of another fit."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
@@ -191,7 +191,7 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median () of a rate that is zero with `of_zero` or in cells around rates (K,)."""
+    """Return the median () of a turn rate: zero with probability `of_zero`, else near `rates`."""
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)
@@ -203,7 +203,7 @@ def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
 
 
 def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
-    """Return the mean (2,) [m] of the positions of all alternatives at a time () [s]."""
+    """Return the mean (2,) [m] of all alternative paths' positions at a time () [s]."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
     return prediction.path.at(jnp.asarray(time)).pos + mean

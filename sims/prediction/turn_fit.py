@@ -82,7 +82,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
     """
 
     def differentiate_arcs(after: Array) -> tuple[Pair, Pair]:
-        """Return arcs, and the derivatives of paths along the arcs by the turn rate alone."""
+        """Return arcs, and derivatives of positions by the turn rate for a fixed velocity."""
         one = jnp.ones_like(fit.rate)
         arcs, slopes = jax.jvp(lambda rate: arc(rate, after), (fit.rate,), (one,))
         return arcs, _times(fit.velocity, slopes)
@@ -99,7 +99,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit position, velocity and turn rate; derivatives of the fit are those of the optimum."""
+    """Fit position, velocity and turn rate; the fit has the derivatives of the exact optimum."""
 
     def downhill(rate: Array) -> Array:
         """Return minus half the derivative of the sum of squares by the rate, () [m^2 s/rad]."""

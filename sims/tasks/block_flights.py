@@ -231,7 +231,7 @@ def require_arm(world: World, cases: BlockCase) -> None:
 
 
 def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
-    """Return all leaves of cases (B, ...) in float64 by dotted names, as in the referee."""
+    """Return all leaves of cases (B, ...) in float64 by dotted names, as the referee needs them."""
     return {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(cases).items()}
 
 

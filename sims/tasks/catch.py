@@ -49,7 +49,7 @@ from planner_jax.task.catch.case import GRAVITY, START, CatchCase
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
-from planner_jax.task.hit.spec import DRAG  # of the published serves; [Yu2023catch] has no value
+from planner_jax.task.hit.spec import DRAG  # of hits, since [Yu2023catch] reports none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
 # [s], duration of a throw's flight before its first plan: at least 2 m [Yu2023catch, VII-A].
@@ -60,7 +60,7 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Return the planner, with guesses of higher thrust if it is `exact` behind a decision."""
+    """Raise the thrust in the guesses of `exact` with decisions; return other planners as is."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -76,7 +76,7 @@ class Throws(FlightCases):
 
     balls: BallState  # leaves (B, N, 3), each at its own time 0
     horizon: np.ndarray  # (B, N) [s], last time at which each ball may be caught, in its own time
-    drag: np.ndarray  # (B, N), true K_D [1/m]
+    drag: np.ndarray  # (B, N), true drag coefficient K_D [1/m]
     believed: np.ndarray  # (B, N), initial estimate of K_D [1/m]
     gravity: np.ndarray  # (B,) [m/s^2], magnitude
     net_height: np.ndarray  # (B,) [m], height of the hoop above the propeller plane
@@ -98,7 +98,7 @@ def throws(
         num: B >= 1, number of flights.
         num_balls: N, number of balls per flight, 1 to 3 in the paper.
         seed: >= 0, of the throws and of the signs of the drag's errors.
-        drag: true K_D [1/m].
+        drag: true drag coefficient K_D [1/m].
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a net.
     """
@@ -268,7 +268,7 @@ class CatchFlight(BallFlightTask):
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """Return the balls' states at the start of their plans; no ball is returned."""
+        """Return the balls' states at the start of their plans; no ball flies back."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 

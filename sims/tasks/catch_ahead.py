@@ -149,7 +149,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """A driver that makes all attempts of a planner concurrently, whether needed or not."""
+    """A driver that runs all attempts (settings to try) of a planner concurrently."""
 
     # A time limit of 0 s, so that a call starts no further attempts.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))

@@ -152,7 +152,7 @@ def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> H
 
 @dataclasses.dataclass(frozen=True)
 class Volleys(FlightCases):
-    """B serves at the start of the plans for them."""
+    """B served balls as cases at the start of their plans, and initial drag estimates."""
 
     cases: HitCase  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,), initial estimate of K_D [1/m]

@@ -329,7 +329,7 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Return drives and the cases of their plans, with the found plans where `good` (B,)."""
+    """Return drives and cases in which found plans replace old plans where `good` (B,)."""
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)

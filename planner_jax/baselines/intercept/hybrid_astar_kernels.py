@@ -325,7 +325,7 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Collect curvatures [1/m] and lengths [m] of a path: arcs to a node, then parts to the goal."""
+    """Collect curvatures [1/m] and lengths [m] of a path: arcs to a node, then to the goal."""
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]

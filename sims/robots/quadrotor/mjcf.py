@@ -106,7 +106,7 @@ def _rotor(
 
 
 def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
-    """Return the field `rotors`: counter-clockwise, first a rotor with a positive drag torque."""
+    """Return the YAML field `rotors`: counter-clockwise, first a rotor of positive drag torque."""
     rotors = sorted(rotors, key=lambda rotor: np.arctan2(*rotor["place"][::-1]) % 6.28)
     if rotors[0]["ratio"] < 0.0:
         rotors = [*rotors[1:], rotors[0]]
@@ -125,5 +125,5 @@ def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
         "min_thrust": float(first["force"][0]),
         "max_thrust": float(first["force"][1]),
         "torque_ratio": float(ratios[0]),
-        "lag": first["lag"],  # None without a filter: the YAML file or a keyword must have it
+        "lag": first["lag"],  # None without a filter; then the YAML file must have it
     }

@@ -18,7 +18,7 @@ _LOWEST_REST = 0.5  # [m], least height of the position at standstill
 
 @struct.dataclass
 class Reference:
-    """The planned motion of the quadrotor at one instant, and leads that compensate rotor lag."""
+    """The planned motion at one instant, and additions to commands that compensate rotor lag."""
 
     pos: Array  # (3,) [m]
     vel: Array  # (3,) [m/s]
@@ -40,7 +40,7 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
     coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    # Pieces of absent balls come last and have zero duration.
+    # The pieces of the trajectory for absent balls come last and have zero duration.
     last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
     piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
     unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
@@ -69,7 +69,7 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 def reference_at(
     trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
 ) -> Reference:
-    """Return the plan at a time () [s] since its start, with leads for rotors of a lag [s]."""
+    """Return the plan at a time () [s], with additions that compensate a rotor lag [s]."""
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))

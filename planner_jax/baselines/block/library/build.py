@@ -192,10 +192,10 @@ def plan_pairs(
 ) -> np.ndarray:
     """Plan motions from one home for N pairs of cells; return their table rows (N, 6 K + 10).
 
-    Straight joint motions are tried first. Then the least squares of `BentPair` start from one learned
-    start after another, for pairs that have no motion or might get a motion that allows an earlier
-    entry of the ball. If a pair still has no motion, both steps are repeated with a coarse
-    tolerance.
+    Straight joint motions are tried first. The least squares of `BentPair` then start from one
+    learned start after another, for pairs of cells that have no motion or might get a motion that
+    allows an earlier entry of the ball. If a pair still has no motion, both steps are repeated with
+    a coarse tolerance.
 
     Args:
         setting: arm, limits and scene, with NumPy leaves.

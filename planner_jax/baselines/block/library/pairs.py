@@ -94,7 +94,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return case and flight of a ball from cell centre to cell centre that enters at `entry`."""
+        """Return case and flight of a ball through both cells' centres that enters at `entry`."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(

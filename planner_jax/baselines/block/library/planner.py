@@ -73,7 +73,7 @@ class LibraryBlock(Planner):
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
-        """Return the home (start pose) nearest to the arm, and whether the library fits the case."""
+        """Return the start pose nearest to the arm, and whether the library fits the case."""
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
