@@ -11,7 +11,7 @@ def run() -> None:
     """Run the subcommand that `sys.argv` names, and end the process with its exit code."""
     stopping.listen()
     if sys.argv[1:2] == ["sweep"] and _is_on_cpu():
-        # One thread per computation, since a sweep runs several computations at once. With JAX's
+        # Give every computation one thread: a sweep runs several computations at once. With JAX's
         # default, one thread per core, results would depend on the number of cores.
         os.environ.setdefault("PJRT_NPROC", os.environ.get("NPROC", "1"))
     try:

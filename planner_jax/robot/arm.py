@@ -74,7 +74,7 @@ REGIMES = {
 
 
 def product(a: Array, b: Array) -> Array:
-    """Return the matrix product a b in the precision of its arguments, which GPUs may reduce."""
+    """Return the matrix product a b without the reduced precision that GPUs use by default."""
     return jnp.matmul(a, b, precision=lax.Precision.HIGHEST)
 
 

@@ -98,7 +98,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     v, c = speed[:-1], curvature[:-1]
 
     def turn(tau: Array) -> Array:
-        """Return the change of heading (K,) [rad] on each piece in the time `tau` [s] on it."""
+        """Return the change of heading (K,) [rad] on each piece, `tau` [s] after its start."""
         return tau * (v * c + tau * ((v * bend + rise * c) / 2.0 + tau * rise * bend / 3.0))
 
     whole = turn(length)
@@ -115,7 +115,7 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
 
 
 def knots_at(end: Array, speed: Array, curvature: Array, time: Array) -> tuple[Array, Array, Array]:
-    """Interpolate speed, curvature and acceleration at a time () [s] between knots up to `end`."""
+    """Return speed, curvature and acceleration at a time () [s] of a plan that lasts `end` [s]."""
     num = speed.shape[0] - 1
     position = jnp.clip(time / end * num, 0.0, num)
     k = jnp.clip(position.astype(jnp.int32), 0, num - 1)

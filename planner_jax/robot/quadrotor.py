@@ -112,7 +112,7 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
     inverse_squared = inverse_size * inverse_size
     along = tx * jx + ty * jy + tz * jz
     tilt_squared = (jx * jx + jy * jy + jz * jz - along * along * inverse_squared) * inverse_squared
-    # z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 : the jerk along tau cancels.
+    # The jerk along tau cancels:  z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 .
     twist = (ty * jx - tx * jy) * inverse_size
     twist = twist * reciprocal(at_least(size_squared * inverse_size + tz, 1e-2))
     return tilt_squared + twist * twist
@@ -131,7 +131,8 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
     along = x * jx + y * jy + z * jz
     dx, dy, dz = ((j - along * n) * inverse_size for j, n in ((jx, x), (jy, y), (jz, z)))
     k = reciprocal(at_least(1.0 + z, 1e-2))
-    # The body's x axis is (1 - k x^2, -k x y, -x), the y axis (-k x y, 1 - k y^2, -y).
+    # With k = 1 / (1 + z) the body's x axis is (1 - k x^2, -k x y, -x), and its y axis is
+    # (-k x y, 1 - k y^2, -y).
     sway = k * (x * dx + y * dy)
     return -(dy - y * sway - y * dz), dx - x * sway - x * dz, (y * dx - x * dy) * k
 
@@ -174,7 +175,7 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
     """Return the rotation (3, 3) from body to world frame, and the body rate (3,) [rad/s].
 
-    Both follow from acceleration (3,) [m/s^2] and jerk (3,) [m/s^3] at zero heading, by flatness.
+    Differential flatness gives both by acceleration and jerk (3,) [m/s^2], [m/s^3] at zero heading.
     """
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))

@@ -144,7 +144,7 @@ def judge_by(
 
 
 def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:
-    """Raise unless a referee has a keyword argument for every setting, with a default of its type.
+    """Raise unless every setting is a keyword argument of a referee and has its default's type.
 
     If the referee has a parameter `**kwargs`, settings without an own parameter are not checked.
     """

@@ -72,7 +72,7 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least distance (N,) [m] of any two bodies in each of N poses at angles (N, 6)."""
+    """Return the least distance (N,) [m] between any two bodies in N poses at angles (N, 6)."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
@@ -110,8 +110,8 @@ def _from_link(arm: Arm, first: int) -> np.ndarray:
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
     """Return the positions of the arm's parts at angles (N, 6)."""
-    # Without the barriers XLA fuses these computations into the loop of every distance, which
-    # repeats them.
+    # Without `optimization_barrier` XLA would repeat the computation of the poses in the loop of
+    # every distance.
     rotations, origins = lax.optimization_barrier(
         jax.vmap(lambda angles: link_frames(arm, angles), out_axes=-1)(angles)
     )

@@ -41,7 +41,7 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
     """
     position = np.asarray(shares)[:, None] * pieces
     knots = np.arange(pieces + 1)
-    # Integral of the hat function of each knot, from the start to the position.
+    # Integrals of the knots' hat functions (1 at a knot, 0 at others) from the start to `position`.
     left, right = np.clip(position - knots + 1.0, 0.0, 1.0), np.clip(position - knots, 0.0, 1.0)
     weights = 0.5 * left**2 + right - 0.5 * right**2
     weights[:, 0] -= 0.5
@@ -99,7 +99,7 @@ def joint_terms(
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 
     def hinge(share: Array, by_steps: Array, by_time: Array) -> tuple[Array, Array]:
-        """Return penalties on values / limits, `share`, above `most`, and their derivatives."""
+        """Penalise values above `most` times their limits; return residuals and derivatives."""
         over = weights.limits * jnp.maximum(jnp.abs(share) - most, 0.0)
         sign = weights.limits * jnp.sign(share) * (over > 0.0).astype(over.dtype)
         return row(over, by_steps, by_time, sign)
@@ -132,7 +132,7 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return the steps (K, 6) of a bump: joints turn by `height` (6,) [rad] and back, as sin^2."""
+    """Return steps (K, 6) of a detour: joints turn by `height` (6,) [rad] and back, as sin^2."""
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 

@@ -122,7 +122,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
         taken = jnp.sum(jnp.where(left, 0, bits[:, None]), axis=2, keepdims=True)
         *others, last = (taken | bits[:, None]).reshape(len(words), -1)
         state = (*others, last * num + jnp.tile(np.arange(num), width))
-        # Of equal states only the one with the least rank continues.
+        # Among sequences with equal sets of targets and equal last targets only the best continues.
         sorted_ = jnp.lexsort((rank, *state))
         alike = [jnp.diff(word[sorted_], prepend=-1) == 0 for word in state]
         again = functools.reduce(jnp.logical_and, alike)
@@ -157,7 +157,7 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the choice with N targets at positions (N,) of the sequence, at times (N,) [s]."""
+    """Return the choice that catches N targets at positions (N,) of a sequence, at times (N,)."""
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -187,7 +187,7 @@ class CatchDecision:
         """Accept every batch of cases; a subclass may raise an error for unsupported cases."""
 
     def rank(self, plans: CatchPlan) -> Array:
-        """Return each plan's rank, the least is best: last catch [s] plus 100 s a missed target."""
+        """Return the time [s] of each plan's last catch, plus 100 s for each target not caught."""
         left = plans.times.shape[-1] - plans.num_taken
         dtype = plans.times.dtype if isinstance(left, jax.Array) else np.float64
         return plans.times[..., -1] + 100.0 * left.astype(dtype)
@@ -240,7 +240,7 @@ class Greedy(CatchDecision):
     """Decision that always catches next the target with the earliest estimated catch."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the greedy order of one case, leaves (1, N); LENGTHS of them if optional."""
+        """Return the greedy order of one case, leaves (1, N); (LENGTHS, N) for optional targets."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))

@@ -58,7 +58,7 @@ def timetable(case: CatchCase) -> Timetable:
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Return where the quadrotor catches N targets, (N, 3, K), and `Timetable.penalty` (N, K)."""
+    """Return the positions (N, 3, K) for catching N targets, and penalties; see `Timetable`."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)
@@ -93,7 +93,7 @@ arrivals = jax.vmap(arrival, (0, None, None, None))  # the same for N targets
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return by how much (..., K) [m] the point misses `offset` (..., 3, K) [m] in `span` [s]."""
+    """Return the distance (..., K) [m] by which a flight of `span` [s] falls short of `offset`."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
@@ -169,7 +169,7 @@ def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
 
 
 def top_speed(case: CatchCase) -> Array:
-    """Return the greatest speed () [m/s] of the point: 0.9 times the quadrotor's limit."""
+    """Return the greatest speed () [m/s] in estimates: 0.9 times the quadrotor's limit."""
     return 0.9 * case.limits.speed
 
 

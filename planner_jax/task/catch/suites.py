@@ -191,7 +191,7 @@ def _unit(angle: PyTree) -> PyTree:
     return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
 
 
-# Throws.
+# Functions that make the thrown balls of `throws`, `hard`, `parabola1` and `parabola2`.
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
@@ -206,7 +206,7 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return position and velocity (B, 3) at time 0 and horizon (B,) of B balls, one a row."""
+    """Return positions and velocities (B, 3) of thrown balls at time 0, and horizons (B,) [s]."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -244,7 +244,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Return position and velocity (B, 3) after a flight with linear drag [Yu2023catch, eq. 9]."""
+    """Return positions and velocities of balls after a time, linear drag [Yu2023catch, eq. 9]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:
@@ -255,7 +255,7 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
     return pos + vel * decayed + terminal * t, terminal + vel * xp.exp(-drag * t)
 
 
-# Lines and swings.
+# Functions that make targets that move on straight lines or oscillate, for all other suites.
 
 
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:

@@ -75,9 +75,9 @@ class InterceptGroup:
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """Return the interception of the target of an index () int, from the car's state `car`.
+        """Return the case in which the car meets the target with the index `target` () int.
 
-        The car is in this state at the time `begin` () [s], which is time 0 of the returned case.
+        The car starts in the state `car` at the time `begin` () [s], which is time 0 of the result.
         """
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)

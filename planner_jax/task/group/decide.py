@@ -55,7 +55,7 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the earliest meeting with a target, an index, after the meeting `last`.
+    """Estimate the earliest meeting with the target of index `target` after the meeting `last`.
 
     If the target cannot be met in time, the meeting is where the car is least too late.
     """
@@ -79,7 +79,7 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return an order's rank () [s]: time of its last meeting plus ten times its `delay`."""
+    """Return the rank () [s] of an order (N,): time of the last meeting plus 10 times its delay."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None

@@ -79,10 +79,10 @@ def is_too_far(context: HitContext) -> Array:
 
 
 def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
-    """Return 1 - H / H_min and H / H_max - 1 of the apex H [Yu2023bat, eq. 21], shape (2,)."""
+    """Return relative excesses 1 - H / H_min, H / H_max - 1 of the apex H [Yu2023bat, eq. 21]."""
     return jnp.stack([1.0 - apex * reciprocal(min_apex), apex * reciprocal(max_apex) - 1.0])
 
 
 def hitting_speed_excess(vel: Array, limit: Array) -> Array:
-    """Return v_j^2 / v_max,j^2 - 1 for each world axis j [Yu2023bat, eq. 24], shape (3,)."""
+    """Return the excess v_j^2 / v_max,j^2 - 1, (3,), for each world axis j [Yu2023bat, eq. 24]."""
     return (vel * reciprocal(limit)) ** 2 - 1.0

@@ -35,7 +35,7 @@ PLANNERS = ("juggle", "bat-lite", "bat")
 
 
 def _scenario_names() -> tuple[str, ...]:
-    """Return the names of the 36 scenarios: serve, landing and target region, as in "NFL".
+    """Return the names of the 36 scenarios, such as "NFL": serve near, landing far, target left.
 
     Of two scenarios that are mirror images in y only one is listed, where the first L or R is an L.
     """

@@ -136,7 +136,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the setting of the referee for targets of a user's class; {} for the library's."""
+    """Return the referee's setting for targets whose class a user wrote, and {} for others."""
     while isinstance(target, LaterPath):
         target = target.path
     is_known = type(target) in (TurningPath, PolynomialPath)
@@ -144,7 +144,7 @@ def position_setting(target: PlanePath) -> dict[str, object]:
 
 
 def positions(target: PlanePath, times: Float[np.ndarray, " B"]) -> Float[np.ndarray, "B 2"]:
-    """Return positions [m] of B targets, each at its own time [s], by method `at` in float64."""
+    """Return the positions [m] of B targets at B times [s], by their method `at` in float64."""
     with jax.enable_x64(True):
         double = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), target)
         return np.asarray(jax.vmap(lambda path, time: path.at(time).pos)(double, times))

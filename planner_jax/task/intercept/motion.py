@@ -36,14 +36,15 @@ class Motion:
     # Derivatives of x, y, heading and time of each sample by 8 variables: the five variables of its
     # own piece, and the three components of a twist of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    # Derivatives of the twist of all later pieces, by speed and curvature at the piece's end.
+    # Derivatives of the twist (rigid displacement) of all later pieces, by speed and curvature at
+    # the piece's end.
     right: Array  # (K, 2, 3)
     left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
 
 
 @struct.dataclass
 class Quadratic:
-    """Half the gradient and half the Hessian of a cost by samples and by variables of pieces."""
+    """Half the gradient and half the Hessian of a cost, by a motion's samples and variables."""
 
     push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
     stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
@@ -138,8 +139,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # as twists, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # The five variables of a piece also deform earlier pieces, which displaces the piece by a
-    # twist: the end time deforms all earlier pieces, the values at the piece's start the last one.
+    # The variables of a piece also deform earlier pieces, which displaces the piece by a twist. The
+    # end time deforms all earlier pieces, and the values at the start deform the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [

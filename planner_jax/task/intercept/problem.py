@@ -96,7 +96,7 @@ class MotionProblem:
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
-        """Return speed and curvature (K + 1,) at knots 0..K, and the meeting time, of unknowns."""
+        """Return speed and curvature (K + 1,) at all knots, and the meeting time, by unknowns."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
         time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
         return (
@@ -112,7 +112,7 @@ class MotionProblem:
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def guess_at(self, point: Array) -> Guess:
-        """Return a guess with unknowns (n,) and positions of zero, if no stage follows a path."""
+        """Return a guess with unknowns (n,) for stages that follow no path of cells."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
@@ -140,7 +140,8 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        # [rad], initial heading relative to bin 0: 0 plus the whole turns of the unwrapped bins.
+        # [rad], initial heading of the car in the path's headings, which count from it and are not
+        # wrapped: a multiple of 2 pi.
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step
@@ -264,7 +265,7 @@ class MotionProblem:
         attempt: Search | Warm,
         stages: list[Stage],
     ) -> InterceptPlan:
-        """Run the stages from a guess; return the better of the plans before and after the last."""
+        """Run the stages from a guess; return the better of the last two stages' plans."""
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
@@ -322,7 +323,7 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the minimum of the cost near the starting point, repeated: (num, n)."""
+        """Return the unknowns that minimise the cost near the start, as `num` equal rows."""
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)

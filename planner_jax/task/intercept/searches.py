@@ -20,7 +20,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory of a path, and of a 32-bit word of a reach set, in units of one guess of a small planner.
+# Memory of one path, and of one 32-bit word of a reach set, in the unit of `Attempt.starts`: the
+# memory of one guess in a planner with few unknowns.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _FIELD = 128  # number of nodes of the grid of distances from walls, along each side of the map
@@ -140,8 +141,8 @@ def search_reach(
 ) -> Reachability:
     """Compute which cells the car can reach at which times, and when it can meet the target.
 
-    The times are `layers` layers, by default up to the case's time. `is_time_free` is true if the
-    target may be met before the case's time.
+    There are `layers` equally spaced times, called layers; by default they extend to the case's
+    time. `is_time_free` is true if the target may be met before the case's time.
     """
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)
@@ -174,7 +175,7 @@ def search_reach(
 def _meeting_cells(
     case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around the target at a layer in time, as in `reach.goal_cells`."""
+    """Return the cells around the target at a time (a layer), and which of them are reached."""
     goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
     width = 2.0 * np.pi / num
@@ -190,7 +191,7 @@ def draw_cell_path(
     noise: cell_paths.PathNoise,
     directness: float,
 ) -> cell_paths.CellPath:
-    """Draw a random path through the reach set to the target's cell at a layer () int32 in time."""
+    """Draw a random path of cells to the target, which it meets at a time (a layer) () int32."""
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
     draw = cell_paths.draw_path
     return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)

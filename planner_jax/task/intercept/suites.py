@@ -327,7 +327,7 @@ def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
 
 
 def _displace(angle, speed, rate, time) -> np.ndarray:
-    """Return displacements (..., 2) [m] of targets that start in the direction `angle` and turn."""
+    """Return displacements (..., 2) [m] after `time` [s] of targets that turn at a rate [rad/s]."""
     half = 0.5 * rate * time
     direction, chord = angle + half, speed * time * np.sinc(half / np.pi)
     return np.stack([chord * np.cos(direction), chord * np.sin(direction)], axis=-1)
