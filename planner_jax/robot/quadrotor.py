@@ -175,7 +175,7 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
     """Return the rotation (3, 3) from body to world frame, and the body rate (3,) [rad/s].
 
-    Differential flatness gives both by acceleration and jerk (3,) [m/s^2], [m/s^3] at zero heading.
+    At zero heading they are functions of acceleration and jerk (3,), by differential flatness.
     """
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))

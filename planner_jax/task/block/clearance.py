@@ -109,7 +109,7 @@ def _from_link(arm: Arm, first: int) -> np.ndarray:
 
 
 def _poses(arm: Arm, angles: Array) -> _Poses:
-    """Return the positions of the arm's parts at angles (N, 6)."""
+    """Return positions and axes of the arm's parts in N poses with joint angles (N, 6) [rad]."""
     # Without `optimization_barrier` XLA would repeat the computation of the poses in the loop of
     # every distance.
     rotations, origins = lax.optimization_barrier(

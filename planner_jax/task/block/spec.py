@@ -7,7 +7,7 @@ from planner_jax.core.registry import Task
 
 @dataclasses.dataclass(frozen=True)
 class Suite:
-    """A family of random throws: distance of the thrower, and whether the pole exists."""
+    """A family of random throws: launch distance, and whether a pole stands in front of the arm."""
 
     description: str
     distance: tuple[float, float] = (6.0, 12.0)  # [m], from the arm's first axis to the launch

@@ -67,7 +67,7 @@ _ARGUMENTS = {
 
 @struct.dataclass
 class Net:
-    """A net in a hoop above the propellers, normal to the thrust [Yu2023catch, eqs 22 and 25]."""
+    """A net in a hoop above the propellers, across the thrust axis [Yu2023catch, eqs 22 and 25]."""
 
     height: Array  # () l [m], height of the hoop's centre above the propeller plane
     radius: Array  # () [m], of the hoop

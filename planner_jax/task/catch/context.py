@@ -1,4 +1,8 @@
-"""Functions of all catch planners: order the targets, orient the net, and bound the reach."""
+"""Functions that all catch planners share.
+
+They sort the targets by the order of catching, find attitudes of the net, and find cases in which
+the quadrotor cannot reach a target.
+"""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,8 @@
-"""Functions of all hit planners: tabulate the ball's flight, limit the impact, bound the reach."""
+"""Functions that all hit planners share.
+
+They tabulate the incoming ball's flight, compute excesses over the limits of the impact, and find
+cases in which the quadrotor cannot reach the ball.
+"""
 
 import jax.numpy as jnp
 import numpy as np

@@ -91,7 +91,7 @@ class MotionProblem:
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:
-        """Join speed and curvature (..., K) at knots 1..K, and a free time (...), as unknowns."""
+        """Join speed and curvature (..., K) at knots 1..K, and a free time, to unknowns."""
         parts = [speed, curvature, time[..., None]]
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
