@@ -54,10 +54,7 @@ def _inverse_sqrt_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Ar
 
 
 def at_least(x: Array, floor: float) -> Array:
-    """Return max(x, floor) with slope 1 where x == floor.
-
-    The slope of `jnp.maximum` at x == floor is 1/2.
-    """
+    """Return max(x, floor) with slope 1 at x == floor, where `jnp.maximum` has the slope 1/2."""
     return jnp.where(x < floor, floor, x)
 
 

@@ -196,11 +196,11 @@ class PlannerAround(Planner[CaseT, PlanT]):
 
     @property
     def inner(self) -> Planner:
-        """The planner that is called."""
+        """The wrapped planner."""
         return self.planner
 
     def replanner(self) -> Planner:
-        """Return the re-planner of the planner that is called."""
+        """Return the re-planner of the wrapped planner."""
         return self.planner.replanner()
 
 

@@ -172,10 +172,7 @@ def require_rule(
 
 
 def require_shapes(cases: PyTree) -> None:
-    """Raise `ArgumentError` unless every array has the shape and kind of numbers of its field.
-
-    Arrays may be traced.
-    """
+    """Raise `ArgumentError` unless each array, traced or not, has its field's shape and type."""
     for place, part in _parts(cases):
         sizes: dict[str, int] = {}
         batch = _usual_batch(part)

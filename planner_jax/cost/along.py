@@ -70,7 +70,7 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from columns to samples, with times in units of h."""
+        """Return matrices (K, orders, C) from columns to samples, for 1 s mean piece duration."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 

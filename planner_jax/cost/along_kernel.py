@@ -55,10 +55,7 @@ class Grid:
 
     @property
     def shares(self) -> int:
-        """Number of GPU threads, 1 to 8, among which the samples of one trajectory are divided.
-
-        Small batches need several threads for each trajectory to occupy the GPU.
-        """
+        """Number of GPU threads, 1 to 8, for one trajectory's samples; more for small batches."""
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
@@ -237,7 +234,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return height, velocity, acceleration and jerk of a sample, with times in units of h."""
+    """Return height to jerk (height, velocity, ...) at a sample, for pieces of 1 s mean duration."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)
@@ -297,8 +294,8 @@ def _of_sample(
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
     """Return the excess over each limit at one sample of a trajectory.
 
-    `unit` is the result of `unit_motion`: height, velocity, acceleration and jerk with times in
-    units of the `duration` h [s], the mean duration of a piece. `given` has gravity and limits.
+    `unit` is the result of `unit_motion`: height to jerk for pieces of 1 s mean duration, from
+    which those for the mean `duration` [s] follow. `given` has gravity and limits.
     """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]
@@ -311,7 +308,7 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    """Return the sum of a sample's hinges, times the duration h, and its greatest excess."""
+    """Return a sample's sum of hinges times the mean piece duration, and its greatest excess."""
     excess = sample_excess(along, unit, duration, given)
     hinges = [
         factor * smooth_hinge(value + margin, along.hinge_width)

@@ -78,10 +78,7 @@ def relative(squared_excess: Array) -> Array:
 def thrust_excess(
     acc: Components, gravity: Array, least: Array, most: Array
 ) -> tuple[Array, Array]:
-    """Return 1 - f^2 / least^2 and f^2 / most^2 - 1 for the thrust f per unit mass [m/s^2].
-
-    The accelerations are (..., 3).
-    """
+    """Return 1 - f^2 / least^2 and f^2 / most^2 - 1 of thrusts f [m/s^2] for `acc` (..., 3)."""
     x, y, z = components(acc)
     squared = _size_squared((x, y, z + gravity))
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0

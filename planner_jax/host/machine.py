@@ -53,10 +53,7 @@ def _of_container() -> int | None:
 
 
 def free_disk(folder: str | os.PathLike) -> int | None:
-    """Return the free bytes on the disk of a folder; None if unknown.
-
-    The folder need not exist.
-    """
+    """Return the free bytes on the disk of a folder, which need not exist; None if unknown."""
     path = Path(folder).absolute()
     # A name that is too long for the disk does not exist; the disk of its parent is measured.
     existing = next((each for each in [path, *path.parents] if os.path.exists(each)), Path.cwd())

@@ -88,8 +88,8 @@ class NewtonConfig:
     # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
     # cost by this error; such a step counts as progress if the predicted decrease halves.
     slack: float = 0.0
-    # After `max_steps`, unfinished problems continue in groups, greatest predicted decrease first:
-    # a group's fraction of the batch, its iterations, and the greatest number of groups.
+    # After `max_steps`, unfinished problems continue in groups, greatest predicted decrease first.
+    # The numbers: a group's fraction of the batch, its iterations, the greatest number of groups.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:

@@ -24,7 +24,7 @@ REACH = 4.0  # number of standard deviations at which features are clipped
 
 @struct.dataclass
 class StartNetwork:
-    """A network that corrects a guess: its weights, and the statistics of its input features."""
+    """A network that corrects a guessed starting point: weights, and statistics of the inputs."""
 
     mean: Array | np.ndarray  # (F,), mean of each feature in the training data
     deviation: Array | np.ndarray  # (F,), standard deviation of each feature

@@ -41,10 +41,7 @@ class RecoveryPlan(QuadrotorPlan):
 
 
 def end_state(path: PiecewisePolynomial) -> Array:
-    """Return position, velocity, acceleration and jerk (4, 3) at the end of a trajectory.
-
-    Pieces of zero duration are ignored.
-    """
+    """Return the state (4, 3), position to jerk, at the end of the last piece that lasts > 0 s."""
     last = jnp.max(jnp.where(path.durations > 0.0, jnp.arange(path.durations.size), 0))
     piece = PiecewisePolynomial(path.coeffs[last][None], path.durations[last][None])
     return jnp.stack([evaluate(piece, path.durations[last], order) for order in range(4)])

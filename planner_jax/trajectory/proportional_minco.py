@@ -187,7 +187,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return the boundary rows (2s, 3) of two states (s, 3): d-th derivatives times h^d."""
+    """Return the boundary rows (2s, 3) of two states (s, 3): d-th derivatives times duration^d."""
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -270,7 +270,7 @@ def offset_energy(maps: ProportionalMinco, offsets: Array, piece_duration: Array
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _boundary_form(maps: ProportionalMinco, rows: Array) -> Array:
-    """Return the least energy () for boundary rows (2s, 3), with times in units of h."""
+    """Return the least energy () for boundary rows (2s, 3) and pieces of 1 s mean duration."""
     return jnp.sum(rows * _by_rows(maps, rows))
 
 
@@ -284,10 +284,7 @@ def _boundary_form_jvp(
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Multiply the matrix of the energy by the rows.
-
-    A sum is used, because the call of a small matrix product costs more than its arithmetic.
-    """
+    """Multiply the energy's matrix by the rows; a sum is faster here than a matrix product."""
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     return jnp.sum(gram[..., None] * rows[None], axis=1)
 
