@@ -234,7 +234,7 @@ def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
 
 
 def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
-    """Return height to jerk (height, velocity, ...) at a sample, for pieces of 1 s mean duration."""
+    """Return height, velocity, acceleration, jerk of a sample, for pieces of 1 s mean duration."""
     return [
         [_total(row[d][c] * columns[c][axis] for c in range(len(columns))) for axis in axes]
         for d, axes in enumerate(_AXES)

@@ -112,7 +112,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan the cases, by `plan_of` or the first attempt; return `smooth_near` of the plans."""
+        """Plan the cases, by `plan_of` or the first attempt, and apply `smooth_near` to the plans."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
