@@ -310,7 +310,7 @@ class _Batch:
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Make the first attempt by chunks; return plans, and each device's unsolved number."""
+        """Make the first attempt by chunks; return plans, and numbers unsolved by device."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)

@@ -325,7 +325,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         violation: Array,
         context: HitContext,
     ) -> HitPlan:
-        """Return the plan of a trajectory that ends with the stroke `ends.contact`."""
+        """Return the plan of a trajectory that ends with the impact `ends.contact`."""
         return HitPlan(
             trajectory=trajectory,
             gravity=context.case.gravity,

@@ -112,7 +112,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan the cases, by `plan_of` or the first attempt, and apply `smooth_near` to the plans."""
+        """Plan the cases, by `plan_of` or the first attempt; apply `smooth_near` to the plans."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
@@ -145,7 +145,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
-        # All cases compute as many time layers as the case that needs most, to stay in step.
+        # All cases compute as many time layers as the case that needs most, to run together.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
 
