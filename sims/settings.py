@@ -99,7 +99,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; the default is 0 unless the planner is the task's first."""
+        """The rate of replanning [Hz]; only the task's first planner has a default above 0."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0

@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one joint step away whose cells are open and not reached cheaper."""
+        """Return the states one joint step away in open cells that no shorter path reaches."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [

@@ -8,7 +8,8 @@ from every expanded state, first from the start.
 
 A spline is clamped, of degree 3 (order 4), with 7 control points; the authors' code has 4 to 7.
 With fewer control points the bounds on the derivatives' control points force longer motions. With
-4 of them a motion from standstill to standstill takes twice the necessary time. The objective (4a)
+4 of them a motion from standstill to standstill takes twice the necessary time. The objective
+(eq. 4a)
 
     w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
 
@@ -48,7 +49,7 @@ from planner_jax.task.block.plan import BlockPlan
 DEGREE = 3  # degree of the splines
 CONTROL_POINTS = 7  # number of control points of a spline
 ANCESTORS = 8  # number of splines optimised at once: from the start and the nearest ancestors
-TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s] and [1/rad], w_1 and w_2 of (4a)
+TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s] and [1/rad], w_1 and w_2 of eq. 4a
 LEAST_TIME = 0.1  # [s], least duration of a spline; the greatest is the available time
 _SHARES = np.linspace(0.0, 1.0, 33)  # sample positions, as fractions of a spline's duration
 _OUTSIDE = 100.0  # [1/rad^2], penalty weight of control points beyond the position limits

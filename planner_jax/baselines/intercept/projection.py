@@ -142,7 +142,7 @@ def overlap(
     finish = -begin
 
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
-        """Intersect intervals (M, N) with the overlap along axes x, y of shape (M, 1) or (1, N)."""
+        """Intersect time intervals (M, N) with the times of overlap along the axes (x, y)."""
         mine = [x * corner[:, 0] + y * corner[:, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]

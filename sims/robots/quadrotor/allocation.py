@@ -21,7 +21,7 @@ def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) ->
         spare: [N], greatest increase of a rotor's thrust in favour of a torque.
     """
     least, most = rotors.min_thrust, rotors.max_thrust
-    # Fractions of a thrust without torque, times 4: all 1 if the rotors are equally far away.
+    # Each rotor's fraction of a thrust without torque, times 4; 1 if all fractions are equal.
     share = jnp.asarray(4.0 * rotors.shares, torque.dtype)
     inverse = jnp.asarray(rotors.mixer, torque.dtype)
     turning = jnp.matmul(inverse[:, 1:3], torque[:2], precision=lax.Precision.HIGHEST)
