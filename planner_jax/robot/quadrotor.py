@@ -301,7 +301,7 @@ class QuadrotorPlan(Plan):
         Raises:
             ValueError: the rate is not positive.
         """
-        from planner_jax.robot.setpoints import sample_at_rate  # imported here, as rarely needed
+        from planner_jax.robot.setpoints import sample_at_rate  # imported only if needed
 
         path = jax.tree.map(np.asarray, self.whole)
         ends = np.sum(path.durations, axis=-1)

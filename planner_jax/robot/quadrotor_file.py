@@ -224,7 +224,7 @@ def _read_description(path: Path) -> dict[str, Value]:
     if len(text) > _LARGEST:
         raise RobotError(f"{path}: must be at most {_LARGEST} bytes")
     if path.suffix.lower() == ".xml":
-        try:  # MuJoCo compiles the file
+        try:  # the function needs MuJoCo, which may not be installed
             describe = pkgutil.resolve_name("planner_jax.sims.robots.quadrotor.mjcf:describe_mjcf")
         except MissingExtra as error:
             raise error.with_names({error.feature: path.name}) from None
@@ -372,7 +372,7 @@ def _parse(part: Value, kind: str, span: bool) -> list[float]:
     if unit and unit not in known:
         raise QuantityError(f"{rule}{suggestion(unit, known)}")
     factor = known[unit] if unit else Fraction(1)
-    try:  # Fractions are exact until the end: 33 g are 0.033 kg to the last digit.
+    try:  # Fractions avoid rounding of factors: 33 g become exactly the float 0.033 [kg].
         return [float(Fraction(number) * factor) for number in re.findall(_NUMBER, match[1])]
     except OverflowError:
         raise QuantityError(f"must be finite, got {_shorten(part)}") from None

@@ -25,8 +25,8 @@ class EndPoses:
     A straight motion turns all joints in proportion from the start to the pose.
     """
 
-    angles: Array  # (C, 6) [rad]
-    time: Array  # (C,) [s], time of the contact
+    angles: Array  # (C, 6) [rad], joint angles
+    time: Array  # (C,) [s], of the contact of shield and ball
     # (C,), greatest ratio of a joint's rate or acceleration to its limit in the straight motion;
     # infinite if the arm cannot reach the pose.
     effort: Array

@@ -108,7 +108,8 @@ def joint_terms(
     rate_shares = rates / case.limits.velocity[None]
     of_rise = rise[None] * (pieces / duration**2 / case.limits.acceleration[:, None, None])
     rise_shares = accelerations / case.limits.acceleration[None]
-    # The first difference of rates contains `first`, which is proportional to the duration.
+    # The first difference of rates contains the initial rate times the duration, `first`, so that
+    # its derivative by the duration has one more term.
     of_start = jnp.zeros_like(rise_shares).at[0].set(first * pieces / duration**2)
     by_time = (-2.0 * rise_shares - of_start / case.limits.acceleration[None]) / duration
     angle_shares = (angles - middle[None]) / half[None]

@@ -25,8 +25,8 @@ RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401
 class Box:
     """A box whose edges are parallel to the axes of the robot's base frame."""
 
-    lower: Array  # (3,) [m]
-    upper: Array  # (3,) [m]
+    lower: Array  # (3,) [m], least coordinates
+    upper: Array  # (3,) [m], greatest coordinates
 
 
 @struct.dataclass

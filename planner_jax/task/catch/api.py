@@ -59,7 +59,7 @@ def planner(
     decided = DecidedPlanner(own, decision)
     if recovery is None:
         return decided
-    from planner_jax.recovery.with_recovery import add_recovery  # few catches need it
+    from planner_jax.recovery.with_recovery import add_recovery  # imported only if needed
 
     return add_recovery(decided, recovery)
 

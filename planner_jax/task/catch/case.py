@@ -94,8 +94,8 @@ class CatchCase:
 
     rules: ClassVar[Table] = RULES
 
-    targets: TargetPath  # leaves with a leading axis N
-    present: Array  # (N,) bool, whether each target exists; absent targets fill up the shape
+    targets: TargetPath  # paths of the targets, leaves with a leading axis N
+    present: Array  # (N,) bool, whether each target exists; absent targets only pad the arrays
     horizon: Array  # (N,) [s], latest time at which each target may be caught
     order: Array  # (N,) int32, permutation: indices of the targets in the order of catching
     times: Array  # (N,) [s], ascending, first guess of the times of catches in that order

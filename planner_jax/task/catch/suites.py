@@ -99,7 +99,7 @@ class _Throw:
     land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground
     delay: float = 0.3  # [s], from the launch to time 0
-    drag: float = 0.5  # [1/s]
+    drag: float = 0.5  # [1/s], coefficient of linear drag
 
 
 _THROWS = {
@@ -250,7 +250,7 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
     if drag == 0.0:
         return pos + vel * t + 0.5 * pull * t**2, vel + pull * t
     decayed = -xp.expm1(-drag * t) / drag
-    terminal = pull / drag  # velocity
+    terminal = pull / drag  # terminal velocity
     vel = vel - terminal
     return pos + vel * decayed + terminal * t, terminal + vel * xp.exp(-drag * t)
 
@@ -284,7 +284,7 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
     radius, speed = _between(u[:, 4:5], 3.0, 4.0), _between(u[:, 5:6], 1.0, 1.5)
-    side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # sense of rotation
+    side = np.pi / 6.0 * xp.where(u[:, 6] < 0.5, 1.0, -1.0)  # the sign is the sense of rotation
     targets = _lines(centre[:, None] + radius * _unit(corner), -speed * _unit(corner + side))
     return targets, np.full(corner.shape, SUITES["triangle3"].horizon)
 

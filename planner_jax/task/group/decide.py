@@ -29,9 +29,9 @@ _TURNING = 0.6  # assumed mean turn rate of the car, divided by its greatest tur
 class _Meeting:
     """Estimated state of the car at the moment at which it meets a target."""
 
-    time: Array  # () [s]
-    position: Array  # (2,) [m]
-    heading: Array  # () [rad]
+    time: Array  # () [s], of the meeting
+    position: Array  # (2,) [m], of the target and of the middle of the car's body
+    heading: Array  # () [rad], of the car
     delay: Array  # () [s], sum over the meetings so far of the times by which the car is too late
 
 

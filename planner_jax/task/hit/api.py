@@ -93,7 +93,7 @@ def planner(
     own = TASK.make_planner(name, options).with_effort(effort)
     if recovery is None:
         return own
-    from planner_jax.recovery.with_recovery import add_recovery  # few hits need it
+    from planner_jax.recovery.with_recovery import add_recovery  # imported only if needed
 
     return add_recovery(own, recovery)
 

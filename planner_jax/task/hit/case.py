@@ -52,7 +52,7 @@ RULES: Table = (
     Field("hit_limits.min_apex", (), below("hit_limits.max_apex")),
     Field("hit_limits.max_apex", ()),
 )
-GRAVITY = 9.8  # [m/s^2]
+GRAVITY = 9.8  # [m/s^2], default magnitude of gravity in cases
 _ARGUMENTS = {
     **ARGUMENTS,
     **{f"ball.{name}": f"ball_{name}" for name in ("pos", "vel")},
@@ -78,17 +78,17 @@ class HitCase:
 
     rules: ClassVar[Table] = RULES
 
-    ball: BallState  # at time 0
+    ball: BallState  # position and velocity of the ball at time 0
     head_state: Array  # (4, 3) position, velocity, acceleration, jerk of the quadrotor at time 0
     target: Array  # (3,) [m], required landing point of the returned ball
-    drag: Array  # () K_D [1/m]
+    drag: Array  # () [1/m], coefficient K_D of the ball's quadratic drag
     gravity: Array  # () [m/s^2], magnitude
-    restitution: Array  # () coefficient beta of the racket
-    racket_height: Array  # () [m], of the racket's centre above the propeller plane
+    restitution: Array  # () coefficient of restitution beta of the racket
+    racket_height: Array  # () [m], height of the racket's centre above the propeller plane
     limits: QuadrotorLimits
     hit_limits: HitLimits
     extras: tuple[Extra, ...] = ()  # the user's constraints and costs, see `cost.extras`
-    racket_radius: Array | None = None  # () [m]; None: the contact may be anywhere on the racket
+    racket_radius: Array | None = None  # () [m]; None: the contact's offset is not limited
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

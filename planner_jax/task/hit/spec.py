@@ -13,12 +13,12 @@ START = (-3.0, 0.0, 1.5)
 # `court.SCENARIOS`: region of serve, landing and target. The names are an assumption, because the
 # paper describes these scenarios only in words.
 REAL_SCENARIOS = {
-    "S.1": ("FNN", "FFN"),  # from different distances
+    "S.1": ("FNN", "FFN"),  # serves from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions
-    "S.3": ("FFN", "FLN"),  # hit from different directions
-    "S.4": ("FFL", "FNL"),  # hit straight, shoot sideways
-    "S.5": ("FLL", "LLL"),  # hit and shoot sideways to the same side
-    "S.6": ("FLR", "LLR"),  # hit and shoot sideways to different sides
+    "S.3": ("FFN", "FLN"),  # balls that are hit from different directions
+    "S.4": ("FFL", "FNL"),  # balls that come straight and are returned sideways
+    "S.5": ("FLL", "LLL"),  # balls that come from a side and are returned to the same side
+    "S.6": ("FLR", "LLR"),  # balls that come from a side and are returned to the other side
 }
 
 TASK = Task(

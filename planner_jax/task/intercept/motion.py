@@ -136,11 +136,11 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     )
     last = own[..., -1]  # (5, 3, K)
     end_x, end_y = x[None, :, -1], y[None, :, -1]
-    after = jnp.stack(  # as twists, (5, K, 3)
+    after = jnp.stack(  # twists of later pieces by the five variables of a piece, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # The variables of a piece also deform earlier pieces, which displaces the piece by a twist. The
-    # end time deforms all earlier pieces, and the values at the start deform the previous piece.
+    # The variables of a piece also deform earlier pieces, which displaces the piece rigidly, by a
+    # twist. The end time deforms all earlier pieces, the values at the start the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
