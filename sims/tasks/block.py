@@ -49,7 +49,7 @@ _KEPT = 5  # number of simulated frames from one recorded sample to the next
 
 
 class BlockFlight(FlightTask):
-    """The task block for a run of flights; the settings are `BlockFly`."""
+    """The task `block` as `run.py` flies, scores and draws it; the settings are `BlockFly`."""
 
     settings: BlockFly
 

@@ -222,7 +222,7 @@ def fly_catches(
 
 
 class CatchFlight(BallFlightTask):
-    """The task catch for a run of flights; the settings are `CatchFly`."""
+    """The task `catch` as `run.py` flies, scores and draws it; the settings are `CatchFly`."""
 
     settings: CatchFly
 

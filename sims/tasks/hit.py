@@ -275,7 +275,7 @@ def fly_hits(
 
 
 class HitFlight(BallFlightTask):
-    """The task hit for a run of flights; the settings are `HitFly`."""
+    """The task `hit` as `run.py` flies, scores and draws it; the settings are `HitFly`."""
 
     settings: HitFly
 

@@ -276,7 +276,7 @@ class PaperCatch(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """Return the plan at a point; its violation is evaluated at `nodes` samples per piece."""
+        """Return the plan of a search point, with its violation at `nodes` samples per piece."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
         motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(

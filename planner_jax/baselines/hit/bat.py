@@ -306,7 +306,7 @@ class BatHit(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """Return the plan at a point; its violation is evaluated at 24 nodes per piece."""
+        """Return the plan of a search point; its violation is evaluated at 24 nodes per piece."""
         case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])

@@ -75,10 +75,10 @@ class Warped:
 class AdaptBlock(Planner):
     """A planner that meets the ball with a warped stored motion; the cost is its duration [s].
 
-    Arm, limits and scene must equal the library's, and the arm must stand at one of its homes;
-    otherwise the status is BLOCKED, and `check` reports the same on the host. The status is
-    OUT_OF_REACH for a ball that does not pass through both boxes, and INFEASIBLE if no motion was
-    found.
+    Arm, limits and scene must equal the library's, and the arm must stand at one of the library's
+    homes (start poses). Otherwise the status is BLOCKED, and `check` reports the reason on the
+    host. The status is OUT_OF_REACH for a ball that does not pass through both boxes, and
+    INFEASIBLE if no motion was found.
     """
 
     stored: LibraryBlock
