@@ -44,7 +44,7 @@ def cramer_rao(
     if turning:
         slope, information = tangent(seen, fit)
         moved = jnp.stack(slope(after))
-        bound += variance / information * moved[:, None] * moved
+        bound += variance / information * moved[:, None] * moved[None]
     return bound
 
 

@@ -45,7 +45,7 @@ def sample(columns, durations, given):
     """Return the excess over every limit at every sample of the segments, and the hinges."""
     motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
     excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
-    return excess, smooth_hinge(excess + np.array(ALONG.margins)[:, None], ALONG.hinge_width)
+    return excess, smooth_hinge(excess + np.array(ALONG.margins)[None, :, None], ALONG.hinge_width)
 
 
 @jax.jit

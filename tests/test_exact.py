@@ -52,7 +52,7 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
     """Random variables without optimisation satisfy the equations of the impact."""
     lane = pj.take(cases, 3)
     context, guess = first_guess(lane)
-    points = guess + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
+    points = guess[None] + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
     found = jax.jit(jax.vmap(lambda x: PLANNER.decode(x, context)))(points.astype(np.float32))
     many = jax.tree.map(lambda leaf: np.repeat(leaf[None], 8, axis=0), lane)
     verdict = referee_hits(many, found)
@@ -201,12 +201,12 @@ def test_all_guesses_but_the_first_pass_the_ball_as_fast_as_the_way_there_asks(c
     @jax.jit
     def impacts(case):
         context = PLANNER.prepare(case)
-        natural = PLANNER.guesses(context, 12)[:, -8:] * jnp.asarray(PLANNER.scale[-8:])
+        natural = PLANNER.guesses(context, 12)[:, -8:] * jnp.asarray(PLANNER.scale[-8:])[None]
         return jax.vmap(lambda own: PLANNER.impact(own, context))(natural)
 
     found = impacts(lane)
     places, vels = found.tail_state[:, 0], found.tail_state[:, 1]
-    even = 2.0 * (places - lane.head_state[0]) / found.stroke.time[:, None]
+    even = 2.0 * (places - lane.head_state[None, 0]) / found.stroke.time[:, None]
     speed = np.linalg.norm(even, axis=1, keepdims=True)
     even = even * np.minimum(1.0, 0.9 * lane.limits.speed / speed)
     normal = found.stroke.normal

@@ -202,7 +202,7 @@ def test_a_trajectory_in_float32_is_right_to_a_tenth_of_a_millimetre():
     single = interpolate(*draw_problem(4, 6, dtype=np.float32))
     assert single.coeffs.dtype == np.float32
     double = interpolate(*(x.astype(np.float64) for x in draw_problem(4, 6, dtype=np.float32)))
-    times = double.durations[:, None] * np.linspace(0.0, 1.0, 9)
+    times = double.durations[:, None] * np.linspace(0.0, 1.0, 9)[None]
     powers = np.asarray(times)[:, :, None] ** np.arange(8)
     positions = [powers @ np.asarray(x.coeffs, np.float64) for x in (single, double)]
     np.testing.assert_allclose(*positions, atol=1e-4)

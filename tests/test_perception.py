@@ -239,7 +239,7 @@ def test_what_is_lost_or_out_of_view_is_not_seen():
     inside = jnp.broadcast_to(jnp.array([4.0, 1.0, 1.5]), (2000, 3))
     lost = np.isnan(see(key, CAMERA, stereo_noise(dropout=0.3), inside)).any(axis=1)
     assert lost.mean() == pytest.approx(0.3, abs=0.04)
-    behind = inside * jnp.array([-1.0, 1.0, 1.0])
+    behind = inside * jnp.array([[-1.0, 1.0, 1.0]])
     assert np.isnan(see(key, CAMERA, stereo_noise(), behind)).all()
 
 
@@ -272,7 +272,7 @@ def test_the_mask_compares_hue_saturation_and_value(hues):
 def ball_frame(place, radius=0.05):
     """Render image and depth of an orange ball at (3,) [m] before a grey wall, ray by ray."""
     column, row = np.meshgrid(*(np.arange(size) for size in CAMERA.size))
-    across = (np.stack([column, row], axis=-1) - CAMERA.centre) / CAMERA.focal
+    across = (np.stack([column, row], axis=-1) - CAMERA.centre[None, None]) / CAMERA.focal
     ray = np.concatenate([across, np.ones((*across.shape[:2], 1))], axis=-1)
     ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
     middle = np.asarray(CAMERA.rotation).T @ (place - np.asarray(CAMERA.position))

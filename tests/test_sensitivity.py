@@ -61,7 +61,7 @@ class BowlPlanner(OptimisedPlanner):
         return {"force": self.weight * (case.b + case.k * jnp.eye(3)[0])}
 
     def guesses(self, context, num):
-        return jnp.arange(float(num))[:, None] + 0.0 * context["force"]
+        return jnp.arange(float(num))[:, None] + 0.0 * context["force"][None]
 
     def objective(self, point, context):
         energy = 0.5 * self.weight * jnp.sum(point * (CURVED @ point))

@@ -168,7 +168,10 @@ def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, 
         def at(twist):
             turn, move = twist[:3], twist[3:]
             body, *edges = first  # edges only turn
-            moved = [body + jnp.cross(turn, body) + move, *(e + jnp.cross(turn, e) for e in edges)]
+            moved = [
+                body + jnp.cross(turn, body) + jnp.broadcast_to(move, body.shape),
+                *(e + jnp.cross(turn, e) for e in edges),
+            ]
             return distance(*moved, *others)
 
         line = approach(distance, *first, *others)

@@ -61,7 +61,7 @@ def test_a_ball_without_drag_flies_a_parabola(float64, drag):
 def test_a_swing_returns_after_a_period_except_for_its_drift(float64):
     path, period = harmonic_path(), 2.0 * np.pi / 2.1
     now, later = states(path, TIMES), states(path, TIMES + period)
-    np.testing.assert_allclose(later.pos, now.pos + VEL * period, atol=1e-12)
+    np.testing.assert_allclose(later.pos, now.pos + VEL[None] * period, atol=1e-12)
     np.testing.assert_allclose(later.vel, now.vel, atol=1e-12)
     np.testing.assert_allclose(now.pos[0], POS + np.sin(0.7) * path.amplitude, atol=1e-12)
 

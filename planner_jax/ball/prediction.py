@@ -107,13 +107,16 @@ def _node_function(num_nodes: int) -> Callable:
         further = tuple(k for k in moving if k > 0)
         found = [jnp.zeros_like(leaf) for leaf in nodes]
         if 0 in moving:  # a displacement of the initial position displaces the whole path
-            found[0] = found[0] + tangents[0]
+            found[0] = found[0] + tangents[0][None]
         if further:
             for k, by in enumerate(slopes(further)(*primals)):
                 for argument, slope in zip(further, by, strict=True):
-                    along = slope * tangents[argument]
-                    of_vector = tangents[argument].ndim > 0
-                    found[k] = found[k] + (jnp.sum(along, axis=-1) if of_vector else along)
+                    change = tangents[argument]
+                    if change.ndim == 0:
+                        found[k] = found[k] + slope * change
+                    else:
+                        along = slope * change[None, None]
+                        found[k] = found[k] + jnp.sum(along, axis=-1)
         return nodes, tuple(found)
 
     integrate_lanes = with_kernel(integrate, path, num_nodes, jvp=jvp)

@@ -58,6 +58,11 @@ def _size(vector: Numbers) -> Numbers:
     return ((vector**2).sum(-1) + 1e-12) ** 0.5
 
 
+def _beside(vector: Numbers, pos: Numbers) -> Numbers:
+    """Return a vector (3,) with as many axes as positions (..., 3): (..., 3) with sizes 1."""
+    return vector[(None,) * (pos.ndim - vector.ndim)]
+
+
 @struct.dataclass
 class KeepOut:
     """A sphere that the quadrotor must not enter."""
@@ -69,7 +74,7 @@ class KeepOut:
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the depth of the positions inside the sphere, divided by its radius."""
-        return 1.0 - _size(pos - self.centre) / self.radius
+        return 1.0 - _size(pos - _beside(self.centre, pos)) / self.radius
 
 
 @struct.dataclass
@@ -83,8 +88,9 @@ class KeepOutBox:
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the depth inside the box from its nearest face, over half of the shortest side."""
-        half = 0.5 * (self.high - self.low)
-        return (half - abs(pos - self.low - half)).min(-1) / half.min(-1)
+        low, high = _beside(self.low, pos), _beside(self.high, pos)
+        half = 0.5 * (high - low)
+        return (half - abs(pos - low - half)).min(-1) / half.min(-1)
 
 
 @struct.dataclass
@@ -98,7 +104,8 @@ class Plane:
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the distance [m] of positions beyond the plane, negative on the allowed side."""
-        return ((self.point - pos) * self.normal).sum(-1) / (self.normal**2).sum(-1) ** 0.5
+        point, normal = _beside(self.point, pos), _beside(self.normal, pos)
+        return ((point - pos) * normal).sum(-1) / (normal**2).sum(-1) ** 0.5
 
 
 @struct.dataclass
@@ -112,8 +119,9 @@ class Geofence:
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the distance [m] outside of the box, along the axis where it is greatest."""
-        half = 0.5 * (self.high - self.low)
-        return (abs(pos - self.low - half) - half).max(-1)
+        low, high = _beside(self.low, pos), _beside(self.high, pos)
+        half = 0.5 * (high - low)
+        return (abs(pos - low - half) - half).max(-1)
 
 
 @struct.dataclass
@@ -132,7 +140,7 @@ class SpeedZone:
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the ratio of the speed to the limit at the position, minus 1."""
-        u = (5.0 - 4.0 * _size(pos - self.centre) / self.radius).clip(0.0, 1.0)
+        u = (5.0 - 4.0 * _size(pos - _beside(self.centre, pos)) / self.radius).clip(0.0, 1.0)
         return u * u * (3.0 - 2.0 * u) * _size(vel) / self.speed - 1.0
 
 
@@ -148,7 +156,7 @@ class Dislike:
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return weight * (1 - distance^2 / radius^2)^2 inside, zero outside."""
-        inside = 1.0 - ((pos - self.centre) ** 2).sum(-1) / self.radius**2
+        inside = 1.0 - ((pos - _beside(self.centre, pos)) ** 2).sum(-1) / self.radius**2
         return self.weight * inside.clip(0.0, 1.0) ** 2
 
 

@@ -72,17 +72,17 @@ def _call(
             write(new_changes, own[1], k)
             new_inverses[k] = weight
             alpha = weight * dot(own[0], q)
-            q = q - alpha * own[1]
+            q = q - alpha[None] * own[1]
             alphas.append(alpha)
             kept.append((own, weight))
         (_, newest_change), newest = kept[0]
-        q = start_scale(newest, dot(newest_change, newest_change), dot(grad, grad)) * q
+        q = start_scale(newest, dot(newest_change, newest_change), dot(grad, grad))[None] * q
         for ((own_step, own_change), weight), alpha in zip(
             reversed(kept), reversed(alphas), strict=True
         ):
             beta = weight * dot(own_change, q)
-            q = q + own_step * (alpha - beta)
-        write(direction, -q * shortening(dot(q, q), step_cap))
+            q = q + own_step * (alpha - beta)[None]
+        write(direction, -q * shortening(dot(q, q), step_cap)[None])
 
     memory = [(num_pairs, n), (num_pairs, n), (num_pairs,)]
     vector = (n,)

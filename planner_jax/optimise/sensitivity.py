@@ -237,7 +237,7 @@ def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]
     """Return products with the Hessian's inverse, its pivots made positive, and the Hessian."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
-    return lambda right: jnp.sum(inverse * right, axis=1), product
+    return lambda right: jnp.sum(inverse * right[None], axis=1), product
 
 
 def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[Array, Array]:

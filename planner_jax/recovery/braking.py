@@ -113,7 +113,7 @@ def _car_problem(
     for name, each in (("wall", case.walls), ("mover", case.movers)):
         if not np.any(each.present):
             continue
-        moved = each.centre[:, None] + each.velocity[:, None] * (since + times)[:, None]
+        moved = each.centre[:, None] + each.velocity[:, None] * (since + times)[None, :, None]
         apart = (poses[:, :2] - np.asarray(moved)).astype(np.float32)
         x, y, heading = (host_leaf(part) for part in (apart[..., 0], apart[..., 1], poses[:, 2]))
         gaps = np.asarray(separation(each.corners, each.present, x, y, heading, ends)).min(axis=1)

@@ -73,9 +73,9 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
         """Return guesses of log duration and of the displacement to standstill, (num, 1, 4)."""
         case = context.case
-        pos, vel = case.head_state[0], case.head_state[1]
+        pos, vel = case.head_state[None, 0], case.head_state[None, 1]
         base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]
-        low = jnp.minimum(case.limits.min_height + _ABOVE_GROUND, pos[2] + 1.0)
+        low = jnp.minimum(case.limits.min_height + _ABOVE_GROUND, pos[0, 2] + 1.0)
         end = pos + 0.5 * share * base * vel
         end = end.at[:, 2].max(low)
         if self.to == "home":

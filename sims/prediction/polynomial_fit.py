@@ -51,7 +51,7 @@ def fit_polynomial(
         length = jnp.sqrt(jnp.where(total > 0.0, total, 1.0))
         unit = jnp.where(total > 0.0, columns[:, k] / length, 0.0)[:, None]
         row, of_values = jnp.sum(unit * columns, axis=0), jnp.sum(unit * values, axis=0)
-        columns, values = columns - unit * row, values - unit * of_values
+        columns, values = columns - unit * row[None], values - unit * of_values[None]
         rows.append(jnp.where(jnp.arange(degree + 1) < k, 0.0, row))
         right.append(of_values)
     coeffs = _coefficients(jnp.stack(rows), jnp.stack(right), span)

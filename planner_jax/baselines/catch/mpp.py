@@ -206,7 +206,7 @@ class MppCatch(Planner):
         axis = jnp.where(moving, against, jnp.array([0.0, 0.0, 1.0], dtype))
         grid = np.meshgrid(*[self.speeds] * 3, self.thrusts, indexing="ij")
         vx, vy, vz, thrust = (jnp.asarray(g.ravel(), dtype) for g in grid)
-        acc = case.gravity * thrust[:, None] * axis + gravity_vector(case.gravity)
+        acc = case.gravity * thrust[:, None] * axis[None] + gravity_vector(case.gravity)[None]
         pos = jnp.broadcast_to(ball.pos - case.net.height * axis, acc.shape)
         return jnp.stack([pos, jnp.stack([vx, vy, vz], axis=1), acc], axis=1)
 

@@ -175,7 +175,7 @@ class PaperCatch(OptimisedPlanner):
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
         ball = targets_at(context.targets, context.times)
-        below = ball.pos - case.net.height * jnp.array([0.0, 0.0, 1.0], dtype)
+        below = ball.pos - case.net.height * jnp.array([[0.0, 0.0, 1.0]], dtype)
         still = jnp.zeros((2, 3), dtype)
         begins = jnp.concatenate([case.head_state[None, 0], below[:-1]])
 
@@ -202,7 +202,7 @@ class PaperCatch(OptimisedPlanner):
             ],
             axis=1,
         )
-        return (natural / jnp.asarray(self.scale, dtype)).reshape(1, -1)
+        return (natural / jnp.asarray(self.scale, dtype)[None]).reshape(1, -1)
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
         """Return the catches that the variables (N, 13) after the waypoint offsets describe."""
@@ -230,7 +230,7 @@ class PaperCatch(OptimisedPlanner):
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
         """Return the segments and the catches that a point of the search space describes."""
         scale = jnp.asarray(self.scale, point.dtype)
-        natural = point.reshape(-1, scale.size) * scale
+        natural = point.reshape(-1, scale.size) * scale[None]
         catch = self.catches(natural[:, self.num_offsets :], context)
         piece_durations = catch.durations / self.num_pieces
         rows = chain_rows(context.case.head_state, catch.tail_states, piece_durations)

@@ -282,7 +282,7 @@ class BatHit(OptimisedPlanner):
         hinges = smooth_hinge(along * unit[:, None], self.hinge_width)
         weights = join_trapezoid_weights(self.nodes, self.maps.proportions)
         weights = jnp.asarray(weights, along.dtype)
-        return self.limit_weight * duration * jnp.sum(hinges * weights)
+        return self.limit_weight * duration * jnp.sum(hinges * weights[None])
 
     def objective(self, point: Array, context: HitContext) -> Evaluation:
         """Return the cost of eq. 20, divided by `_COST_UNIT`.

@@ -105,7 +105,7 @@ def project_obstacles(
         return _cover_run(own, begin, finish, station, half_step, projection.slabs)
 
     of_runs = jax.vmap(cover, in_axes=(0, None, None))
-    own = is_blocked[:, None] & (run[:, None] == 1 + np.arange(projection.runs)[:, None])
+    own = is_blocked[:, None] & (run[:, None] == 1 + np.arange(projection.runs)[None, :, None])
     covers = jax.vmap(of_runs)(own, begin, finish)  # (M, runs, slabs)
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[3:]), covers)
 
@@ -143,7 +143,7 @@ def overlap(
 
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
         """Intersect time intervals (M, N) with the times of overlap along the axes (x, y)."""
-        mine = [x * corner[:, 0] + y * corner[:, 1] for corner in own]
+        mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
         # Body and polygon overlap while -after < rate t < before.
@@ -192,7 +192,8 @@ def _cover_run(
     width = jnp.maximum(last - first, 1e-3) / slabs
     start = first + width * jnp.arange(slabs)
     middle = (start + 0.5 * width)[:, None]
-    is_in = own & (begin < start[:, None] + width) & (finish > start[:, None])  # (slabs, N)
+    begin, finish = begin[None], finish[None]
+    is_in = own[None] & (begin < start[:, None] + width) & (finish > start[:, None])  # (slabs, N)
     # Every point blocks a rectangle. The times of its sides are relative to the slab's middle.
     left = jnp.clip(begin - middle, -0.5 * width, 0.5 * width)
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
@@ -206,14 +207,15 @@ def _cover_run(
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)
         lowest = jnp.min(jnp.where(is_in, height, jnp.inf), axis=1)
         spread = jnp.where(jnp.isfinite(highest), highest - lowest, 0.0)
-        slope = spread[:, None] / width * _SLOPES.astype(station.dtype)  # (slabs, slopes)
+        slope = spread[:, None] / width * _SLOPES.astype(station.dtype)[None]  # (slabs, slopes)
         above = jnp.maximum(
-            height - slope[..., None] * left[:, None], height - slope[..., None] * right[:, None]
+            height[None, None] - slope[..., None] * left[:, None],
+            height[None, None] - slope[..., None] * right[:, None],
         )
         most = jnp.max(jnp.where(is_in[:, None], above, -jnp.inf), axis=2)
         best = jnp.argmin(most, axis=1)[:, None]
         level, rise = (jnp.take_along_axis(each, best, axis=1) for each in (most, slope))
-        return side * (level + rise * (0.5 * width) * np.array([-1.0, 1.0], station.dtype))
+        return side * (level + rise * (0.5 * width) * np.array([[-1.0, 1.0]], station.dtype))
 
     present = jnp.any(is_in, axis=1)
     lower, upper = edge(-1.0), edge(1.0)

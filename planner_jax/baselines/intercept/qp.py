@@ -173,7 +173,7 @@ def solve_qp(
     )
     cost = _product(right_side, _product(t.base_cost, right_side)) + 0.5 * jnp.sum(point**2)
     pressure = search.sides * _product(inverse, point)
-    is_row = search.rows[:, None] == jnp.arange(lower.shape[0])
+    is_row = search.rows[:, None] == jnp.arange(lower.shape[0])[None]
     multiplier = jnp.sum(jnp.where(is_row, pressure[:, None], 0.0), axis=0) / t.scales
     violation = jnp.max(excess, initial=0.0)
     is_over = jnp.max(search.excess) > 0.0
@@ -236,7 +236,7 @@ def _search(
         kept = jnp.concatenate(
             [jnp.where(is_added, 0.0, lost), (is_added & is_place).astype(dtype)]
         )
-        maps = s.maps + (kept - other)[:, None] * (axis / jnp.sum(axis**2))
+        maps = s.maps + (kept - other)[:, None] * (axis / jnp.sum(axis**2))[None]
 
         point = s.point + jnp.where(is_movable, length, 0.0) * move
         pressure = s.pressure + length

@@ -122,8 +122,8 @@ class PathSource:
             return points, turns, station[-1]
 
         points, turns, length = jax.vmap(way)(times, guesses)
-        apart = jnp.mean(jnp.linalg.norm(points[:, None] - points, axis=-1), axis=-1)
-        is_other = jnp.any((turns[:, None] != turns) & case.walls.present, axis=2)
+        apart = jnp.mean(jnp.linalg.norm(points[:, None] - points[None], axis=-1), axis=-1)
+        is_other = jnp.any((turns[:, None] != turns[None]) & case.walls.present[None, None], axis=2)
         apart = apart + jnp.where(is_other, _OTHER_SIDE, 0.0)
         first = jnp.argmin(length)
 
@@ -158,7 +158,7 @@ def count_turns(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Arra
         pos: (M, 2) [m], points of the path, so close that no step jumps past a wall's centre.
         goal: (2,) [m], end of the path.
     """
-    points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre
+    points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre[None]
     angle = jnp.arctan2(points[..., 1], points[..., 0])  # (M + 2, N)
     turned = jnp.sum(wrap(jnp.diff(angle, axis=0)), axis=0)
     straight = wrap(angle[-1] - angle[0])

@@ -31,10 +31,14 @@ class Blocked:
 
     def edges_at(self, time: Array) -> tuple[Array, Array]:
         """Return stations (..., P) [m] of lower and upper edges at times (..., P) [s]."""
-        share = (time - self.start) / (self.end - self.start)
+        lead = range(time.ndim - 1)
+        start, end, lower, upper = (
+            jnp.expand_dims(each, lead) for each in (self.start, self.end, self.lower, self.upper)
+        )
+        share = (time - start) / (end - start)
         return (
-            self.lower[..., 0] + share * (self.lower[..., 1] - self.lower[..., 0]),
-            self.upper[..., 0] + share * (self.upper[..., 1] - self.upper[..., 0]),
+            lower[..., 0] + share * (lower[..., 1] - lower[..., 0]),
+            upper[..., 0] + share * (upper[..., 1] - upper[..., 0]),
         )
 
 
@@ -91,7 +95,7 @@ def reference_line(
 
     def charge(before: Array) -> Array:
         """Return the cost (J + 1, ...) of changing from speeds (...) to each speed of the grid."""
-        change = (jnp.expand_dims(speed, range(1, 1 + before.ndim)) - before) / step
+        change = (jnp.expand_dims(speed, range(1, 1 + before.ndim)) - before[None]) / step
         is_allowed = jnp.abs(change) <= problem.acceleration_limit * (1.0 + 1e-5)
         return jnp.where(is_allowed, change**2 * step, jnp.inf)
 
@@ -104,9 +108,9 @@ def reference_line(
         return jnp.stack([padded[k, grid.jumps - k : grid.jumps - k + num + 1] for k in jumps])
 
     def advance(cost: Array, penalty: Array) -> tuple[Array, Array]:
-        leaving = cost[0] + change[:, :1]
+        leaving = cost[None, 0] + change[:, :1]
         for k in jumps[1:]:
-            leaving = jnp.minimum(leaving, cost[k] + change[:, k : k + 1])
+            leaving = jnp.minimum(leaving, cost[None, k] + change[:, k : k + 1])
         cost = shift_to_end(leaving) + penalty
         return cost, cost
 
@@ -144,19 +148,20 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
     station_step, step = problem.end_station / num, problem.horizon / steps
     blocked = problem.blocked
     jump = jnp.arange(grid.jumps + 1)[:, None]
-    station = jnp.arange(num + 1) * station_step
+    station = (jnp.arange(num + 1) * station_step)[None, None, None]
 
     # An edge passes a polygon if it is below the polygon at both ends of their common time, or
     # above it at both ends. Each condition is a bound on the station at which the edge ends.
     end = (1.0 + jnp.arange(steps)[:, None, None]) * step
-    begin, finish = jnp.maximum(end - step, blocked.start), jnp.minimum(end, blocked.end)
-    rises = [(end - time) / step * jump * station_step for time in (begin, finish)]
+    begin = jnp.maximum(end - step, blocked.start[None, None])
+    finish = jnp.minimum(end, blocked.end[None, None])
+    rises = [(end - time) / step * jump[None] * station_step for time in (begin, finish)]
     edges = [blocked.edges_at(time) for time in (begin, finish)]
     # Grid lines may coincide with polygon edges; touching an edge is allowed.
     slack = 1e-4 * station_step
     below = jnp.minimum(edges[0][0] + rises[0], edges[1][0] + rises[1]) + slack
     above = jnp.maximum(edges[0][1] + rises[0], edges[1][1] + rises[1]) - slack
-    is_shared = (begin < finish) & blocked.present
+    is_shared = (begin < finish) & blocked.present[None, None]
     below, above = jnp.where(is_shared, below, jnp.inf), jnp.where(is_shared, above, -jnp.inf)
     is_met = (station > below[..., None]) & (station < above[..., None])
 
@@ -169,7 +174,7 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
         cell = jnp.pad(limit, (k, 0), constant_values=jnp.inf)[: num + 1]
         least.append(jnp.minimum(least[-1], cell))
     is_fast = jump * (station_step / step) > jnp.stack(least) * (1.0 + 1e-5)
-    return jnp.any(is_met, axis=2) | is_fast
+    return jnp.any(is_met, axis=2) | is_fast[None]
 
 
 def _parts_of_cells(num: int, parts: int) -> np.ndarray:
@@ -223,7 +228,7 @@ class Corridor:
 
     def bounds(self, shares: Array) -> tuple[Array, Array]:
         """Return least and greatest stations (K, S) [m] at fractions (S,) of every piece."""
-        passed = shares[:, None]
+        passed = shares[None, :, None]
         lower = self.lower[:, None] + passed * self.lower_rise[:, None]
         upper = self.upper[:, None] + passed * self.upper_rise[:, None]
         return (
@@ -257,13 +262,14 @@ def corridor(
     joints = stations_at_joints(station, pieces)
     slope = (joints[1:] - joints[:-1]) * pieces / problem.horizon
     start = (jnp.arange(pieces) * length)[:, None]
-    begin, finish = jnp.maximum(start, blocked.start), jnp.minimum(start + length, blocked.end)
-    is_met = (begin < finish) & blocked.present
+    begin = jnp.maximum(start, blocked.start[None])
+    finish = jnp.minimum(start + length, blocked.end[None])
+    is_met = (begin < finish) & blocked.present[None]
     duration = jnp.where(is_met, finish - begin, 1.0)
-    is_above = is_passed_above(problem, station)
+    is_above = is_passed_above(problem, station)[None]
     edges = zip(blocked.edges_at(begin), blocked.edges_at(finish), strict=True)
     (lower_edge, upper_edge) = edges
-    at_begin, at_end = blocked.start <= start, blocked.end >= start + length
+    at_begin, at_end = blocked.start[None] <= start, blocked.end[None] >= start + length
 
     def line(edge: tuple[Array, Array], side: float) -> tuple[Array, Array]:
         """Return start and rise [m] of bounds above (side 1) or below (side -1) polygon edges."""
@@ -302,17 +308,18 @@ def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Ar
     (K + 1,), passes in the piece. The two stations exclude parts with a lower limit.
     """
     limit = problem.speed_limit
-    edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1) * problem.end_station
+    edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1)[None] * problem.end_station
+    left, right = edge[:, :-1], edge[:, 1:]
     slack = 1e-6 * problem.end_station
     first, last = joints[:-1, None], joints[1:, None]
-    is_passed = (edge[:-1] < last - slack) & (edge[1:] > first + slack)
+    is_passed = (left < last - slack) & (right > first + slack)
     speed = jnp.min(jnp.where(is_passed, limit, jnp.inf), axis=1)
     # A line that stands still on the border of two path parts passes no part.
     speed = jnp.where(jnp.isfinite(speed), speed, jnp.min(limit))
-    is_slower = (limit < speed[:, None]) & ~is_passed
-    below, above = is_slower & (edge[1:] <= first + slack), is_slower & (edge[:-1] >= last - slack)
+    is_slower = (limit[None] < speed[:, None]) & ~is_passed
+    below, above = is_slower & (right <= first + slack), is_slower & (left >= last - slack)
     return (
-        jnp.max(jnp.where(below, edge[1:], -jnp.inf), axis=1),
-        jnp.min(jnp.where(above, edge[:-1], jnp.inf), axis=1),
+        jnp.max(jnp.where(below, right, -jnp.inf), axis=1),
+        jnp.min(jnp.where(above, left, jnp.inf), axis=1),
         speed,
     )

@@ -81,14 +81,15 @@ def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
 
 def to_camera(camera: Camera, points: Array) -> Array:
     """Convert points (..., 3) [m] from the world frame to the camera frame."""
-    away = points - camera.position
+    away = points - camera.position[(None,) * (points.ndim - 1)]
     return jnp.matmul(away, jnp.asarray(camera.rotation), precision=lax.Precision.HIGHEST)
 
 
 def to_world(camera: Camera, points: Array) -> Array:
     """Convert points (..., 3) [m] from the camera frame to the world frame."""
     rotation = jnp.asarray(camera.rotation)
-    return camera.position + jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST)
+    turned = jnp.matmul(points, rotation.T, precision=lax.Precision.HIGHEST)
+    return jnp.broadcast_to(camera.position, turned.shape) + turned
 
 
 def project(camera: Camera, points: Array) -> tuple[Array, Array]:
@@ -102,12 +103,13 @@ def project(camera: Camera, points: Array) -> tuple[Array, Array]:
     point_in_camera = to_camera(camera, points)
     depths = point_in_camera[..., 2]
     safe = jnp.where(depths > 1e-6, depths, 1.0)
-    return camera.centre + camera.focal * point_in_camera[..., :2] / safe[..., None], depths
+    centre = jnp.broadcast_to(camera.centre, (*depths.shape, 2))
+    return centre + camera.focal * point_in_camera[..., :2] / safe[..., None], depths
 
 
 def back_project(camera: Camera, pixels: Array, depths: Array) -> Array:
     """Return the world points (..., 3) [m] seen at pixels (..., 2) [px] with depths (...) [m]."""
-    across = (pixels - camera.centre) / camera.focal
+    across = (pixels - jnp.broadcast_to(camera.centre, pixels.shape)) / camera.focal
     ray = jnp.concatenate([across, jnp.ones_like(across[..., :1])], axis=-1)
     return to_world(camera, ray * depths[..., None])
 
@@ -115,5 +117,7 @@ def back_project(camera: Camera, pixels: Array, depths: Array) -> Array:
 def in_view(camera: Camera, points: Array) -> Array:
     """Return whether world points (..., 3) [m] are in front of the camera and in its image."""
     pixels, depths = project(camera, points)
-    inside = (pixels > -0.5) & (pixels < np.array(camera.size) - 0.5)
+    inside = (pixels > -0.5) & (
+        pixels < jnp.broadcast_to(np.array(camera.size) - 0.5, pixels.shape)
+    )
     return (depths > 1e-6) & jnp.all(inside, axis=-1)

@@ -77,7 +77,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     weights = jnp.asarray(information, dtype)
     if weights.ndim < 3:
         isotropic = jnp.broadcast_to(weights, times.shape)
-        weights = isotropic[:, None, None] * jnp.eye(3, dtype=dtype)
+        weights = isotropic[:, None, None] * jnp.eye(3, dtype=dtype)[None]
     trace = jnp.trace(weights, axis1=1, axis2=2)
     present = jnp.isfinite(times) & jnp.all(jnp.isfinite(places), axis=1) & (trace > 0.0)
     present = present & jnp.isfinite(trace)
@@ -93,9 +93,9 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     enough = (num >= 2) & (square > 1e-12)
     scale = jnp.where(enough, jnp.sqrt(jnp.where(enough, square, 1.0)), 1.0)
     steps = after / scale
-    fallen = places + 0.5 * gravity * after[:, None] ** 2 * jnp.array([0.0, 0.0, 1.0], dtype)
+    fallen = places + 0.5 * gravity * after[:, None] ** 2 * jnp.array([[0.0, 0.0, 1.0]], dtype)
     centre = jnp.sum(share[:, None] * fallen, axis=0)
-    seen = jnp.where(present[:, None], fallen - centre, 0.0)
+    seen = jnp.where(present[:, None], fallen - centre[None], 0.0)
 
     normal = jnp.block(
         [
@@ -111,7 +111,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
 
     def residuals(unknowns: Array) -> Array:
         """Return the observed minus the predicted positions (N, 3) [m] for unknowns (6,)."""
-        return seen - unknowns[:3] - steps[:, None] * unknowns[3:]
+        return seen - unknowns[None, :3] - steps[:, None] * unknowns[None, 3:]
 
     def refine(unknowns: Array) -> Array:
         """Return the unknowns (6,) after one step of iterative refinement of the linear system."""
@@ -125,7 +125,7 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     inverse = solve_definite(normal, jnp.eye(6, dtype=dtype))
     units = jnp.concatenate([jnp.ones(3, dtype), jnp.full(3, 1.0, dtype) / scale])
     mean = units * unknowns + jnp.concatenate([centre, jnp.zeros(3, dtype)])
-    covariance = 0.5 * units[:, None] * (inverse + inverse.T) * units
+    covariance = 0.5 * units[:, None] * (inverse + inverse.T) * units[None]
     off = residuals(unknowns)
     squares = jnp.einsum("ni,nij,nj->", off, weights, off, precision=lax.Precision.HIGHEST)
     free = jnp.maximum(3 * num - 6, 1)

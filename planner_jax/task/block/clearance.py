@@ -84,8 +84,8 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
     poses = _poses(arm, angles)
     # A joint turns about the axis a through the point o. The derivative of a distance along the
     # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
-    axes, origins = (tuple(jnp.moveaxis(each, 1, 0)) for each in poses[3:])  # 3 times (6, N)
-    arms = cross(axes, origins)
+    axes, origins = (tuple(jnp.moveaxis(each, 1, 0)[:, None]) for each in poses[3:])
+    arms = cross(axes, origins)  # 3 times (1, 6, N)
     joint = np.arange(6)[:, None]
     slopes = []
     for pairs in _pairs(arm, scene, poses):

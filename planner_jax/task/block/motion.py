@@ -163,12 +163,12 @@ def speed_up(
         motion: the motion with the same path and the shorter duration.
         pace: () in (0, 1], new duration divided by the old duration.
     """
-    rates = motion.coeffs[:, 1] / velocity
-    rises = 2.0 * motion.coeffs[:, 2] / acceleration
+    rates = motion.coeffs[:, 1] / velocity[None]
+    rises = 2.0 * motion.coeffs[:, 2] / acceleration[None]
     pace = jnp.maximum(jnp.max(jnp.abs(rates)), jnp.sqrt(jnp.max(jnp.abs(rises))))
     pace = jnp.clip(pace, 1e-3, 1.0)
     return PiecewisePolynomial(
-        coeffs=motion.coeffs / (pace ** jnp.arange(3, dtype=pace.dtype))[:, None],
+        coeffs=motion.coeffs / (pace ** jnp.arange(3, dtype=pace.dtype))[None, :, None],
         durations=pace * motion.durations,
     ), pace
 

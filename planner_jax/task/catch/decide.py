@@ -66,7 +66,7 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
     def of_choice(choice: CatchChoice) -> CatchChoice:
         place = jnp.argsort(choice.order)
         number = jnp.sum(choice.taken) - np.arange(LENGTHS)
-        taken = choice.taken & (place < number[:, None])
+        taken = choice.taken[None] & (place[None] < number[:, None])
         whole = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (LENGTHS, *leaf.shape)), choice)
         return dataclasses.replace(whole, taken=taken)
 

@@ -162,14 +162,14 @@ class ReplanCatch(OptimisedPlanner):
         # States of the previous trajectory at the new waypoints and at the starts of the segments.
         proportions = planner.maps.proportions
         shares = np.cumsum(proportions) / np.sum(proportions) - proportions / np.sum(proportions)
-        knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)
+        knots = begins[:, None] + durations[:, None] * jnp.asarray(shares, times.dtype)[None]
         states = _states_along(trajectory, task.elapsed + knots.ravel())
         states = states.reshape(*knots.shape, _ORDERS, 3)
         heads = jnp.concatenate([states[:1, 0], tails[:-1]])
         rows = jax.vmap(boundary_rows)(heads, tails, durations / planner.num_pieces)
         along = jnp.concatenate([rows, states[:, 1:, 0]], axis=1)
         matrix = jnp.asarray(planner.maps.offsets, times.dtype)
-        offsets = jnp.sum(matrix[:, :, None] * along[:, None], axis=2)
+        offsets = jnp.sum(matrix[None, :, :, None] * along[:, None], axis=2)
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
@@ -194,15 +194,15 @@ class ReplanCatch(OptimisedPlanner):
 def _states(coeffs: Array, time: Numbers) -> Array:
     """Evaluate K polynomial pieces (K, D + 1, 3) at times (K,) in them; return states (K, 4, 3)."""
     factors, powers = state_basis(coeffs.shape[1])
-    basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)
-    basis *= jnp.asarray(factors, time.dtype)
+    basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
+    basis *= jnp.asarray(factors, time.dtype)[None]
     return jnp.sum(basis[..., None] * coeffs[:, None], axis=2)
 
 
 def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
     """Return the states (K, 4, 3), position to jerk, of a trajectory at times (K,) [s]."""
     ends = jnp.cumsum(trajectory.durations)
-    piece = jnp.sum(times[:, None] >= ends[:-1], axis=1)
+    piece = jnp.sum(times[:, None] >= ends[None, :-1], axis=1)
     return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])
 
 
@@ -227,18 +227,18 @@ def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
     ends = jnp.cumsum(path.durations)
     knots = jnp.concatenate([jnp.zeros_like(ends[:1]), ends]) - task.elapsed
     each = path.durations.size // num
-    knots = knots[segments[:, None] * each + np.arange(each + 1)]  # (N, M + 1)
+    knots = knots[segments[:, None] * each + np.arange(each + 1)[None]]  # (N, M + 1)
     coeffs = path.coeffs.reshape(num, each, size, 3)[segments]
     begin = jnp.maximum(knots[:, :1], 0.0)
     done = jnp.minimum(jnp.sum(begin >= knots[:, 1:], axis=1, keepdims=True), each - 1)
     until = jnp.take_along_axis(knots, done + 1, axis=1)
-    index = np.arange(each + 1)
+    index = np.arange(each + 1)[None]
     part = (until - begin) / (done + 1).astype(begin.dtype)
     new = jnp.where(index <= done, begin + part * jnp.asarray(index, part.dtype), knots)
-    source = jnp.maximum(index[:-1], done)
+    source = jnp.maximum(index[:, :-1], done)
     local = new[:, :-1] - jnp.take_along_axis(knots, source, axis=1)
-    shift = local[..., None, None] ** jnp.asarray(_SHIFTS, local.dtype)
-    shift *= jnp.asarray(_BINOMIALS, local.dtype)
+    shift = local[..., None, None] ** jnp.asarray(_SHIFTS, local.dtype)[None, None]
+    shift *= jnp.asarray(_BINOMIALS, local.dtype)[None, None]
     coeffs = jnp.take_along_axis(coeffs, source[:, :, None, None], axis=1)
     coeffs = jnp.sum(shift[..., None] * coeffs[:, :, None], axis=3)
     last = _states(path.coeffs[-1:], path.durations[-1:])[0, 0]

@@ -135,22 +135,24 @@ class AdaptBlock(Planner):
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
         total = jnp.asarray(step_weights(pieces, (1.0,))[1][0], dtype)
-        ends = case.angles + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
+        ends = case.angles[None] + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
         # Select the branch nearest to the stored end pose; angles are equal modulo full turns.
         turn = angles - ends[:, None, None]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
-        far = jnp.sum(jnp.asarray(_WEIGHTS, dtype) * turn**2, axis=-1)  # (N, P, 8)
+        weights = jnp.asarray(_WEIGHTS, dtype)[None, None, None]
+        far = jnp.sum(weights * turn**2, axis=-1)  # (N, P, 8)
         far = jnp.where(is_pose.reshape(num, 8), far, jnp.inf)
         branch = jnp.argmin(far, axis=-1)[..., None]
         turn = jnp.take_along_axis(turn, branch[..., None], axis=2)[:, :, 0].at[..., 5].set(0.0)
         time = poses.time.reshape(num, 8)[:, 0]
-        duration = jnp.maximum(time - case.delay, 1e-3)
-        shape = jnp.asarray(profiles(pieces, True)[0], dtype)[:, None]
+        duration = jnp.maximum(time - case.delay, 1e-3)[None]
+        shape = jnp.asarray(profiles(pieces, True)[0], dtype)[None, None, :, None]
         moves = steps[:, None] + shape * turn[:, :, None]  # (N, P, K, 6)
         rise = moves - jnp.pad(moves, ((0, 0), (0, 0), (1, 0), (0, 0)))[:, :, :-1]
-        of_rate = jnp.max(jnp.abs(moves) / case.limits.velocity, axis=(2, 3)) / duration
-        of_rise = jnp.max(jnp.abs(rise) / case.limits.acceleration, axis=(2, 3))
+        fastest, steepest = case.limits.velocity, case.limits.acceleration
+        of_rate = jnp.max(jnp.abs(moves) / fastest[None, None, None], axis=(2, 3)) / duration
+        of_rise = jnp.max(jnp.abs(rise) / steepest[None, None, None], axis=(2, 3))
         share = jnp.maximum(of_rate, of_rise * (pieces / duration**2))
         late = jnp.maximum(share - (1.0 - online.slack), 0.0)
         penalty = jnp.min(far, axis=-1) + _AWAY * away[:, None] + _LATE * late
@@ -188,8 +190,8 @@ class AdaptBlock(Planner):
 
         first, first_away, is_first = around(layout.outer, table.outer, flight.earliest)
         last, last_away, is_last = around(layout.inner, table.inner, flight.latest)
-        away = (first_away[:, None] + last_away).reshape(-1)
-        pairs = (first[:, None] * layout.num_inner + last).reshape(-1)
+        away = (first_away[:, None] + last_away[None]).reshape(-1)
+        pairs = (first[:, None] * layout.num_inner + last[None]).reshape(-1)
         away, nearest = lax.top_k(-away, num)
         rows = jnp.asarray(table.rows)
         indices = home * rows.shape[1] + pairs[nearest]

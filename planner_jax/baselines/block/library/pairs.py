@@ -181,13 +181,13 @@ class PairPlanner(Planner):
         by_angles = product(shield_jacobian(case.arm, angles)[3:].T, rotation[:, 0])
         of_steps = jnp.asarray(step_weights(online.pieces, (1.0,))[1][0], point.dtype)
         held = jnp.where(case.ends_at_rest, 0.0, of_steps[-1])
-        slope = jnp.append((of_steps.at[-1].set(held)[:, None] * by_angles).reshape(-1), 0.0)
+        slope = jnp.append((of_steps.at[-1].set(held)[:, None] * by_angles[None]).reshape(-1), 0.0)
         weight = jnp.where(pair.is_coarse, 0.0, online.weights.tilt**2)
         off = jnp.where(pair.is_coarse, -1.0, jnp.abs(roll) / _ROLL - 1.0)
         return Model(
             cost=model.cost + weight * roll**2,
             gradient=model.gradient + weight * roll * slope,
-            curvature=model.curvature + weight * slope[:, None] * slope,
+            curvature=model.curvature + weight * slope[:, None] * slope[None],
             violation=jnp.maximum(model.violation, off),
         )
 

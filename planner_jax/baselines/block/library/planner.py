@@ -74,7 +74,7 @@ class LibraryBlock(Planner):
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
         """Return the start pose nearest to the arm, and whether the library fits the case."""
-        off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles), axis=1)
+        off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles[None]), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
         return home, fits & _is_same(self.library.setting, setting_of(case))
