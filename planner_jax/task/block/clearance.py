@@ -99,7 +99,7 @@ def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def num_of_pole(arm: Arm) -> int:
-    """Return the number of pairs with the pole: all capsules that move, and the shield."""
+    """Return the number of bodies whose distance from the pole is computed: capsules and shield."""
     return len(_from_link(arm, 1)) + 1
 
 

@@ -59,7 +59,7 @@ def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
 def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the greatest rates and accelerations (P,) of all profiles, and which end at rest.
 
-    They are in rad/s and rad/s^2 for profiles that turn a joint by 1 rad in 1 s.
+    Rates are in rad/s and accelerations in rad/s^2, if a profile turns a joint by 1 rad in 1 s.
     """
     shapes, rests = all_profiles(pieces)
     rises = np.diff(shapes, axis=1, prepend=0.0) * pieces

@@ -24,7 +24,7 @@ class BlockPlan(ArmPlan):
 
 
 def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
-    """Return the plan of a case without a solution: INFEASIBLE, the arm stands still for 1 s."""
+    """Return a plan with the status INFEASIBLE in which the arm stands still for 1 s."""
     none = jnp.full((), jnp.inf, case.angles.dtype)
     still = jnp.zeros((pieces, 6), case.angles.dtype)
     second = jnp.ones((), case.angles.dtype)

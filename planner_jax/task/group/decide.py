@@ -57,7 +57,7 @@ def _next(
 ) -> _Meeting:
     """Estimate the earliest meeting with the target of index `target` after the meeting `last`.
 
-    If the target cannot be met in time, the meeting is where the car is least too late.
+    If the car is too late everywhere, the meeting is where it is too late by the least time.
     """
     times, positions = table[0], table[1][target]
     limits = group.shared.limits

@@ -139,8 +139,9 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # twists of later pieces by the five variables of a piece, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # The variables of a piece also deform earlier pieces, which displaces the piece rigidly, by a
-    # twist. The end time deforms all earlier pieces, the values at the start the previous piece.
+    # Twists (rigid displacements) of each piece that its variables cause by deforming earlier
+    # pieces. The end time deforms all earlier pieces, and the values at the piece's start deform
+    # the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
@@ -191,7 +192,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     pull = forms[:, :5, 8] + cost.piece_push
 
     def shift(values: Array, by: int) -> Array:
-        """Shift values (K, ...) of pieces: result[k] = values[k + by], or zero past the end."""
+        """Return for each piece k the entry k + by of `values` (K, ...), or zero past the end."""
         if by >= num:
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])

@@ -67,7 +67,7 @@ def make_plan(
 
 
 def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
-    """Make a plan of status INFEASIBLE, for cases without a plan: constant speed and curvature."""
+    """Make a plan with the status INFEASIBLE in which speed and curvature stay constant."""
     return InterceptPlan(
         cost=jnp.zeros_like(case.time),
         violation=jnp.full_like(case.time, jnp.inf),

@@ -20,8 +20,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory of one path, and of one 32-bit word of a reach set, in the unit of `Attempt.starts`: the
-# memory of one guess in a planner with few unknowns.
+# Memory of one path, and of one 32-bit word of a reach set. The unit is the memory that a planner
+# with few unknowns needs for one starting point, as for `Attempt.starts`.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _FIELD = 128  # number of nodes of the grid of distances from walls, along each side of the map
