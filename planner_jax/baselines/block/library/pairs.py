@@ -47,7 +47,7 @@ _PATIENCE = 0.8
 _ROLL = np.deg2rad(1.0)  # [rad], greatest roll of a shield that must block a whole tunnel
 _TOUCHING = 10.0  # [s], added to the entry times of poses that collide, so that they come last
 # Least distance of a shield from both cells, as a fraction of the distance between the cells, for
-# fine and coarse tolerances. In an oblique tunnel, a shield plane closer to a cell would cut it.
+# fine and coarse tolerances. In an oblique tunnel a closer shield plane would cut the cell.
 _NEAREST = (0.1, 0.02)
 
 
