@@ -30,7 +30,10 @@ ALONG = Along(
 
 
 def cases(num=LANES, dtype=np.float32):
-    """Return trajectories that break every limit: columns, durations, gravity and limits."""
+    """Draw `num` random trajectories that exceed every limit somewhere.
+
+    Returns coefficients ("columns"), durations of the segments [s], and gravity with the limits.
+    """
     random = np.random.default_rng(0)
     columns = random.standard_normal((num, SEGMENTS, 5, 3)) * 0.7
     durations = random.uniform(0.2, 0.5, (num, SEGMENTS))
@@ -42,7 +45,7 @@ def cases(num=LANES, dtype=np.float32):
 
 @jax.jit
 def sample(columns, durations, given):
-    """Return the excess over every limit at every sample of the segments, and the hinges."""
+    """Sample segments; return the excess over each limit at each sample, and its penalty."""
     motion = jax.vmap(functools.partial(sample_motion, ALONG.maps, ALONG.nodes))(columns, durations)
     excess = jnp.stack(jax.vmap(lambda segment: motion_excess(segment, *given))(motion), axis=1)
     return excess, smooth_hinge(excess + np.array(ALONG.margins)[None, :, None], ALONG.hinge_width)
@@ -50,7 +53,7 @@ def sample(columns, durations, given):
 
 @jax.jit
 def along_a_line(t, x, direction):
-    """Return the penalties' sum at x + t direction, its slope and its curvature."""
+    """Return the sum of penalties at x + t direction, and its first and second derivative by t."""
 
     def value(t):
         columns, durations, given = jax.tree.map(lambda a, b: a + t * b, x, direction)
@@ -89,7 +92,10 @@ def test_slopes_and_curvature_are_those_of_finite_differences(float64):
 
 
 def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
-    """For speed and height; body rates of these trajectories peak too sharply for sampling."""
+    """Compare the greatest excess over the limits of speed and height with 100 times finer samples.
+
+    The body rate is left out, because its peaks are too narrow even for the finer samples.
+    """
     columns, durations, given = jax.tree.map(lambda x: x[0], cases(dtype=np.float64))
     along, finer = dataclasses.replace(ALONG, nodes=20), 100
 
@@ -107,11 +113,11 @@ def test_the_greatest_of_every_limit_is_the_peak_between_the_samples(float64):
         missed = samples.max(axis=1) - samples[:, ::finer].max(axis=1)
         off = np.abs(greatest[limit] - samples.max(axis=1))
         assert missed.max() > 1e-3 and off.max() < 0.15 * missed.max()
-    assert slope[0] < 0.0 and slope[1] == 0.0  # slower is less
+    assert slope[0] < 0.0 and slope[1] == 0.0  # A longer first segment has a smaller speed.
 
 
 def test_the_crest_is_the_peak_of_a_parabola_between_three_samples(float64):
-    """For unequal steps, also near an outer sample; a peak outside adds nothing."""
+    """Check samples at unequal distances. A peak outside of the three samples adds nothing."""
     before, after = 0.3, 0.5
     for peak, height in ((0.02, 1.0), (-0.29, 2.0), (0.49, 0.5), (-0.31, 3.0), (0.51, 1.0)):
         left, middle, right = (height - 7.0 * (t - peak) ** 2 for t in (-before, 0.0, after))
@@ -142,14 +148,14 @@ def test_worst_has_no_derivative():
 
 
 def reference(mode):
-    """Return the function of one lane that a kernel computes, by `integrate_along` alone."""
+    """Return what a kernel must compute for one trajectory, as a function without a kernel."""
 
     def value(*x):
         penalties, worst = integrate_along(ALONG, *x)
         return jnp.sum(penalties), (penalties, worst)
 
     def slopes(*x):
-        """Return slopes for each segment, also by the parameters."""
+        """Return the derivatives of each segment's penalties, also by gravity and limits."""
         num = range(3 if mode != "slopes" else 2)
 
         def segment(c, h, given):
@@ -197,7 +203,10 @@ def test_the_kernel_gives_the_same_numbers(mode):
 
 @pytest.mark.slow
 def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
-    """Slopes and curvature by kernels, `vmap` of them, and reverse mode through them."""
+    """Compare gradients and second derivatives by kernels with those by automatic differentiation.
+
+    Kernels are also batched by `vmap`, and differentiated in reverse mode.
+    """
     used = []
 
     def in_lanes(along, mode):
@@ -212,7 +221,7 @@ def test_derivatives_in_lanes_are_those_without_a_kernel(monkeypatch):
     monkeypatch.setattr("planner_jax.cost.along_kernel.along_kernel", in_lanes)
     monkeypatch.setattr("planner_jax.lanes.kernels.has_gpu", lambda: True)
     monkeypatch.setattr(jax.lax, "platform_dependent", lambda *x, cuda, default: cuda(*x))
-    along = dataclasses.replace(ALONG, hinge_width=0.25)  # new constants, for new kernels
+    along = dataclasses.replace(ALONG, hinge_width=0.25)  # Other constants need other kernels.
     args = cases()
     lanes = jax.tree.map(lambda x: jnp.moveaxis(jnp.asarray(x), 0, -1), args)
 
@@ -257,7 +266,10 @@ def test_the_kernel_declines_types_and_sizes_that_it_does_not_support():
 
 
 def test_the_name_of_a_kernel_does_not_depend_on_earlier_kernels(monkeypatch):
-    """Otherwise another process would not find the programs in the compile cache."""
+    """Check names of kernels, on which the keys of compiled programs in JAX's cache depend.
+
+    If names depended on the order of creation, another process would not find the programs.
+    """
     lane = jax.tree.map(lambda leaf: leaf[0], cases())
     others = [dataclasses.replace(ALONG, margins=(0.1, 0.1, 0.1, margin)) for margin in (0.2, 0.3)]
 

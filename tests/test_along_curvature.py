@@ -70,7 +70,7 @@ def test_all_derivatives_are_those_of_the_integrated_penalties(name, given):
 
 
 def greedy_catch(suite, num_targets):
-    """Return one case in the greedy order, with space for a number of targets."""
+    """Draw one catching case with the greedy order, in arrays with space for `num_targets`."""
     cases = pj.catch.draw(1, suite, 3, num_targets=num_targets)
     return pj.take(first_choice(Greedy(), cases), 0)
 
@@ -118,12 +118,14 @@ def test_second_derivatives_of_a_plan_are_those_of_its_objective(make):
         for mine, expected in zip(found[2:], exact[2:], strict=True):
             greatest = np.abs(expected).max()
             np.testing.assert_allclose(mine, expected, rtol=1e-9, atol=1e-11 * greatest)
-        # The preconditioner is the inverse of the block of end variables and of the diagonal.
+        # The preconditioner inverts this part of the Hessian: the block of all variables at the
+        # ends of segments, and only the diagonal for all other variables.
         hessian = np.asarray(hessian)
         kept = np.diag(np.abs(np.diag(hessian)))
         ends = np.arange(size).reshape(num, -1)[:, -num_own:].ravel()
         kept[np.ix_(ends, ends)] = hessian[np.ix_(ends, ends)]
         kept += damping * np.eye(size)
         assert np.linalg.eigvalsh(kept)[0] > 0.0
-        # Variables without curvature, of the absent target, have a millionth of the greatest.
+        # The variables of an absent target have zero curvature. The preconditioner uses a millionth
+        # of the greatest curvature for them, hence the tolerance.
         np.testing.assert_allclose(kept @ solved, direction, rtol=2e-6)

@@ -1,6 +1,7 @@
-"""A six-axis arm with a shield: kinematics, inverse kinematics, dynamics, and its MJCF file.
+"""Tests of the six-axis arm with a shield: kinematics, dynamics, and its MJCF file.
 
-References are closed forms of the IRB 1600-6/1.2, and MuJoCo, also for an arm with askew frames.
+The results are compared with closed forms for the robot IRB 1600-6/1.2, and with MuJoCo, also for
+an arm whose frames are rotated arbitrarily.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ of_each_arm = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 
 
 def some_angles(arm, num, seed=0):
-    """Draw angles (num, 6) within the limits and within the range of inverse kinematics."""
+    """Draw joint angles (num, 6) [rad] within the limits and at most pi from their middle."""
     share = np.random.default_rng(seed).uniform(0.01, 0.99, size=(num, 6))
     middle = 0.5 * (arm.lower + arm.upper)
     half = np.minimum(0.5 * (arm.upper - arm.lower), np.pi)
@@ -40,14 +41,14 @@ def some_angles(arm, num, seed=0):
 
 
 def without_capsules(arm):
-    """Return the arm without capsules, so that all arms share their compiled programs."""
+    """Return the arm without collision capsules, so that all arms use the same programs."""
     none = {"capsule_ends": arm.capsule_ends[:0], "capsule_radius": arm.capsule_radius[:0]}
     return dataclasses.replace(arm, **none, capsule_link=())
 
 
 @struct.dataclass
 class Everything:
-    """All results for an arm at angles; for N angles the leaves are (N, ...)."""
+    """All results of kinematics and dynamics for an arm at N joint positions, leaves (N, ...)."""
 
     frames: tuple
     pose: tuple
@@ -55,7 +56,7 @@ class Everything:
     torques: jax.Array
     branches: jax.Array
     found: jax.Array
-    off: jax.Array  # largest difference of the branches' poses from the pose
+    off: jax.Array  # largest deviation of the poses of all inverse solutions from the given pose
 
 
 def everything_at(arm, angles, velocity, acceleration):
@@ -74,7 +75,10 @@ many_at = jax.jit(jax.vmap(everything_at, in_axes=(None, 0, 0, 0)))
 
 
 def everything(arm, angles, velocity=0.0, acceleration=0.0):
-    """Compute `Everything` of an arm without capsules at N <= NUM angles, by one program."""
+    """Compute `Everything` for an arm without capsules at N <= NUM joint positions (N, 6).
+
+    The inputs are repeated to NUM positions, so that all calls use one compiled program.
+    """
     motion = np.broadcast_arrays(angles, velocity, acceleration)
     rows = (np.resize(each, (NUM, 6)).astype(angles.dtype) for each in motion)
     found = many_at(without_capsules(arm), *rows)
@@ -83,7 +87,11 @@ def everything(arm, angles, velocity=0.0, acceleration=0.0):
 
 @jax.jit
 def move_branches(arm, rotation, middle, velocity, spin):
-    """Return the branches of poses (N, ...), and their rates as the poses move and turn."""
+    """Return the inverse kinematics of N moving poses, and their joint rates [rad/s].
+
+    The poses move with `velocity` (N, 3) [m/s] and turn with `spin` (N, 3) [rad/s]. A branch is one
+    of up to eight solutions of the inverse kinematics.
+    """
 
     def move(rotation, middle, velocity, spin):
         solve = lambda rotation, middle: inverse_kinematics(arm, rotation, middle)  # noqa: E731
@@ -115,7 +123,10 @@ def test_at_home_the_shield_is_low_in_front_and_the_motors_hold_the_weight():
 @float64
 @of_each_arm
 def test_the_jacobian_is_that_of_the_moving_shield(model):
-    """Compare with central differences; the angular velocity is from  omega^ = dR/dq R^T."""
+    """Compare the Jacobian with central differences of the shield's pose.
+
+    The angular velocity omega of a joint rate follows from the skew matrix [omega] = dR/dq R^T.
+    """
     arm, step = read_arm(model, dtype=np.float64), 1e-6
     angles = some_angles(arm, 1)[0]
     steps = step * np.concatenate([np.zeros((1, 6)), np.eye(6), -np.eye(6)])
@@ -129,7 +140,10 @@ def test_the_jacobian_is_that_of_the_moving_shield(model):
 
 @pytest.fixture(scope="module", params=MODELS.values(), ids=MODELS)
 def simulated(request):
-    """Return MuJoCo, its model, the arm, and angles, velocities and accelerations (9, 6)."""
+    """Load an arm in MuJoCo and in this library, and draw nine states of its joints.
+
+    Returns the module mujoco, its model, the arm, and angles, velocities, accelerations (9, 6).
+    """
     mujoco = pytest.importorskip("mujoco", reason="the extra `sims` is not installed")
     arm, rng = read_arm(request.param, dtype=np.float64), np.random.default_rng(1)
     motion = some_angles(arm, 9), *rng.normal(scale=(3.0, 20.0), size=(9, 6, 2)).transpose(2, 0, 1)
@@ -174,7 +188,7 @@ def test_the_torques_of_a_motion_are_those_of_mujoco(simulated):
 
 
 def from_the_nearest(at, angles):
-    """Return the distances (N,) [rad] of the original angles (N, 6) from the nearest branch."""
+    """Return distances (N,) [rad] of joint angles (N, 6) from the nearest inverse solution."""
     distance = np.max(np.abs(at.branches - angles[:, None]), axis=2)
     return np.min(np.where(at.found, distance, np.inf), axis=1)
 
@@ -199,7 +213,8 @@ def test_inverse_kinematics_is_right_to_rounding_in_float32():
     angles = some_angles(arm, NUM)
     at = everything(arm, angles)
     assert at.branches.dtype == np.float32 and np.max(at.off[at.found]) < 2e-6
-    # If the arm is stretched or the wrist straight, angles are roots of rounded numbers.
+    # The tolerance is large, because near a stretched arm or a straight wrist the angles are square
+    # roots of small differences, in which rounding errors are large.
     assert np.max(from_the_nearest(at, angles)) < 1e-2
 
 
@@ -213,7 +228,8 @@ def test_the_branches_move_as_the_jacobian_says():
     np.testing.assert_allclose(driven, expected[np.nonzero(found)[0]], atol=1e-3)
 
 
-# Positions [m] of the wrist centre of the IRB 1600 with its shield facing +x; whether it reaches.
+# Positions [m] of the wrist centre of the IRB 1600 at singularities and at the edge of its
+# workspace, with the shield facing +x, and whether the arm reaches the position.
 EDGES = {
     "straight wrist": ((0.75, 0.0, 0.9615), True),
     "straight arm": ((1.225, 0.0, 0.4865), True),

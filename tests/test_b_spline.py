@@ -14,7 +14,8 @@ from planner_jax.trajectory.polynomial import evaluate
 
 SHARES = np.linspace(0.0, 1.0, 98)
 DURATION = 0.6
-# (degree, control points): one span, which is a Bezier curve, and several spans.
+# (degree, number of control points) of curves with one span, which are Bezier curves, and of curves
+# with several spans.
 SIZES = [(1, 4), (2, 3), (3, 4), (3, 7), (5, 9)]
 every_size = pytest.mark.parametrize("degree, num", SIZES)
 
@@ -24,14 +25,17 @@ def control_points(num):
 
 
 def scipy_curve(degree, points):
-    """Return the same curve by SciPy, as a function of the position from 0 to 1."""
+    """Return SciPy's clamped uniform B-spline with these control points, a function on [0, 1]."""
     inner = np.linspace(0.0, 1.0, len(points) - degree + 1)
     return BSpline(np.r_[[0.0] * degree, inner, [1.0] * degree], points, degree)
 
 
 @functools.partial(jax.jit, static_argnums=(0, 3))
 def sample(degree, points, duration, order):
-    """Evaluate a time derivative of the piecewise polynomial at SHARES of its duration."""
+    """Convert a B-spline to a piecewise polynomial; evaluate its derivative of the given order.
+
+    The times are the fractions `SHARES` of the duration.
+    """
     trajectory = b_spline(degree, points, duration)
     times = jnp.asarray(SHARES, points.dtype) * duration
     return jax.vmap(lambda time: evaluate(trajectory, time, order))(times)
@@ -44,7 +48,7 @@ def test_the_basis_is_a_partition_of_unity_and_gives_the_curve(degree, num):
     assert (values >= 0.0).all()
     np.testing.assert_allclose(values.sum(axis=-1), 1.0, atol=1e-14)
     np.testing.assert_array_equal(basis(degree, num, np.arange(2)), np.eye(num)[[0, -1]])
-    # A single position, or any array of positions.
+    # The position may be a single number or an array of any shape.
     single, grid = basis(degree, num, 0.3), basis(degree, num, np.full((1, 1), 0.3))
     np.testing.assert_allclose(single, grid[0, 0])
 
@@ -55,7 +59,8 @@ def test_a_derivative_is_the_spline_of_the_hodograph_between_whose_points_it_lie
     for order in range(1, degree + 1):
         of_derivative = hodograph(degree, order, num) @ points
         value = basis(degree - order, num - order, SHARES) @ of_derivative
-        # At the end SciPy returns only the left derivative, which is wrong for straight lines.
+        # The end is not compared, because SciPy's derivative of piecewise linear curves is wrong
+        # there.
         expected = scipy_curve(degree, points)(SHARES, order)[:-1]
         scale = np.abs(expected).max()
         np.testing.assert_allclose(value[:-1], expected, atol=1e-12 * scale)

@@ -1,4 +1,4 @@
-"""The published hit baselines: their equations hold, and failures carry a status."""
+"""Tests of the published planners of hits: their equations hold, and failures have a status."""
 
 import dataclasses
 import functools
@@ -34,7 +34,7 @@ float64 = pytest.mark.usefixtures("float64")
 
 @pytest.fixture(scope="module")
 def cases():
-    """Return NumPy arrays, so that one program plans batches of all sizes up to 16."""
+    """Draw NUM hits, in NumPy arrays, for which one program plans all batches of up to 16 cases."""
     return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 5)))
 
 
@@ -49,10 +49,11 @@ def juggle_plans(cases):
 
 
 def serves_gone_wrong():
-    """Return cases in which a paper's equation divides by zero or has no root, then a good one.
+    """Return cases in which a paper's equation divides by zero or has no root, then a usual case.
 
-    The target is straight above or straight below the falling ball, so that xi_x = xi_y = 0; the
-    ball falls straight down, is already below the height of `juggle`, lands at once, or is at rest.
+    In the first two cases the target is straight above or straight below the falling ball, so that
+    xi_x = xi_y = 0. In the next cases the ball falls straight down, is already below the height at
+    which `juggle` hits, lands immediately, or is at rest.
     """
     pos = [[-2.0, 0.0, 2.0]] * 3 + [[-2.0, 0.0, 1.0], [-2.0, 0.0, 0.01], [-2.0, 0.0, 3.0]]
     vel = [[0.0, 0.0, 7.0]] * 3 + [[0.0, 0.0, -4.0], [-3.0, 0.0, -8.0], [0.0, 0.0, 0.0]]
@@ -62,7 +63,10 @@ def serves_gone_wrong():
 
 
 def generic_hits():
-    """Return 32 balls, targets and pairs of components, away from every singularity."""
+    """Draw 32 impacts without a singularity: balls, targets, and two given components.
+
+    The components are of the racket's velocity [m/s] and of the thrust [m/s^2], (32, 2) each.
+    """
     rng = np.random.default_rng(1)
     ball = BallState(
         pos=rng.uniform([-4.0, -2.0, 0.5], [-1.0, 2.0, 2.5], (32, 3)),
@@ -160,7 +164,11 @@ def test_a_ball_aimed_at_an_angle_leaves_at_it_and_arrives():
 
 
 def test_transition_point_of_an_example_by_hand():
-    """s_mid = (2,0,0); the ray to p_h runs along -x; p_alpha = (-3,1.5,0), its foot (-3,0,0)."""
+    """Compare with a transition point that was computed by hand, in the symbols of [Yu2023bat].
+
+    Here s_mid = (2, 0, 0), the ray to p_h is along -x, p_alpha = (-3, 1.5, 0), and the foot of
+    p_alpha on the ray is (-3, 0, 0).
+    """
     points = jnp.array([[-4.0, 3.0, 0.0], [-2.0, 0.0, 0.0], [4.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
     point = transition_point(**dict(zip(("start", "hit", "origin", "target"), points, strict=True)))
     np.testing.assert_allclose(point, [-3.0, 1.0, 0.0], atol=1e-6)
@@ -179,7 +187,7 @@ def test_the_serve_comes_from_where_its_flight_began(cases):
 
 
 def first_guess(transition, case):
-    """Return waypoints, impact, its defect and the transition state of the initial guess."""
+    """Return the initial guess of `BatHit`: waypoints, impact, its residual, transition state."""
     bat = BatHit(transition=transition)
     context = bat.prepare(case)
     natural = bat.guesses(context, 1)[0] * jnp.asarray(bat.scale)
@@ -236,7 +244,7 @@ def test_a_short_ease_leaves_the_minimum_jerk_primitive_and_joins_it_up_to_the_j
     eased_primitive = jax.jit(minimum_jerk_after_ramp, static_argnums=3)
 
     def derivatives(coeffs, t, num):
-        """Return derivatives 0 to num - 1 of one piece at t, (num, 3)."""
+        """Return value and derivatives up to order num - 1 of one polynomial at t, (num, 3)."""
         value = [np.polynomial.polynomial.polyder(coeffs, n) for n in range(num)]
         return np.stack([np.polynomial.polynomial.polyval(t, c) for c in value])
 

@@ -1,4 +1,4 @@
-"""Benchmarks write run folders, and measure throughput of tasks from outside."""
+"""Tests of the benchmarks: they write run folders, and measure tasks that a user registered."""
 
 import csv
 import dataclasses
@@ -93,7 +93,7 @@ def test_a_run_that_fails_says_so_and_no_run_is_overwritten(tmp_path):
 
 @struct.dataclass
 class Number:
-    """A case of a task without quadrotors."""
+    """A case of the simplest possible task, as a user may register it: one number."""
 
     value: jax.Array
 
@@ -105,7 +105,7 @@ class Number:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Half(pj.Planner):
-    """A planner that minimises nothing."""
+    """A planner without a search, whose cost is half of the case's number."""
 
     def solve(self, case, attempt):
         violation = jnp.where(case.value < 3.0, -1.0, 1.0)
@@ -119,7 +119,7 @@ def draw(num, suite=None, seed=0, *, first=0):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Third(Half):
-    """Costs two thirds of `Half`."""
+    """A planner whose plans cost two thirds of the plans of `Half`."""
 
     def solve(self, case, attempt):
         plan = super().solve(case, attempt)
@@ -158,7 +158,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
     card = registry.Task("halve", "halves numbers", __name__, {"half": ""}, {}, yardstick="third")
     cases = draw(4, first=1)
     plans = pj.plan(Half(), cases)
-    # Of 1 and 2, which both solve.
+    # Both planners solve the cases 1 and 2, so that two relative costs are compared.
     np.testing.assert_allclose(cost_gaps(Half(), cases, plans, card=card), [0.5, 0.5], rtol=1e-6)
     no_yardstick = dataclasses.replace(card, yardstick=None)
     assert cost_gaps(Half(), cases, plans, card=no_yardstick) is None

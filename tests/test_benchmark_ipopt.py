@@ -32,7 +32,7 @@ def setup(name):
 
 @functools.cache
 def points(name):
-    """Return points near first guesses; some exceed limits."""
+    """Return decision variables near the initial guesses; some of their plans exceed limits."""
     starts = setup(name).batches["smooth"].starts
     return starts + 0.6 * np.random.default_rng(0).normal(size=starts.shape)
 

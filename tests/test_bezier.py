@@ -22,7 +22,7 @@ float64 = pytest.mark.usefixtures("float64")
 
 
 def of_polynomial(polynomial):
-    """Solve for the control points (K, n + 1) of a polynomial in time."""
+    """Return control points (K, n + 1) of the K Bezier pieces that equal a polynomial in time."""
     shares = np.linspace(0.0, 1.0, DEGREE + 1)
     starts = np.arange(PIECES)[:, None]
     values = polynomial((starts + shares) * HORIZON / PIECES)
@@ -31,7 +31,10 @@ def of_polynomial(polynomial):
 
 @jax.jit
 def values(points, times):
-    """Return the curve and three derivatives at times (M,), and their slopes, (4, M) each."""
+    """Return the curve and its first three derivatives at times (M,) [s], (4, M).
+
+    Their derivatives by time, from automatic differentiation, are returned too, (4, M).
+    """
     curve = BezierCurve(points=points, horizon=jnp.asarray(HORIZON, points.dtype))
     both = [jax.vmap(jax.value_and_grad(lambda t, k=k: curve.at(t, k)))(times) for k in range(4)]
     return tuple(jnp.stack(each) for each in zip(*both, strict=True))

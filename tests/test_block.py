@@ -1,4 +1,4 @@
-"""Blocks: throws, motions of joints, least squares, and plans that the referee confirms."""
+"""Tests of blocks by an arm: throws, joint motions, least squares, and plans that block."""
 
 import dataclasses
 from typing import Any
@@ -28,7 +28,8 @@ from tests.derivatives import double
 SMALL = OnlineBlock(
     pieces=6, points=10, searches=(Search(straight=12, tries=3, solver=LevenbergConfig(8)),)
 )
-# Without least squares, whose compilation takes the most time.
+# A planner that tries only straight motions of the joints. It compiles much faster than the planner
+# with a search by least squares.
 STRAIGHT = dataclasses.replace(SMALL, searches=(Search(straight=60, tries=0),))
 
 
@@ -59,7 +60,10 @@ def test_balls_come_into_both_boxes_past_the_pole(suite, farthest):
 
 
 def test_a_ball_gets_into_a_box_when_it_is_there(float64):
-    """Check entries through a side and the top, and balls that do not enter."""
+    """Check the time at which a ball enters a box through a side or the top.
+
+    Three other balls do not enter: they pass the box, fly away, or come from below.
+    """
     box = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), paper_scene().outer)
 
     def entry(pos, vel):
@@ -136,7 +140,10 @@ def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
 
 
 def test_no_pose_is_freer_than_the_referee_says(float64):
-    """Check random positions of pole, floor and beams, for poses with the planner's margin."""
+    """Compare the planner's clearance with the referee's, at random poses and obstacle positions.
+
+    A pose that keeps the planner's margin must not collide according to the referee.
+    """
     rng, num = np.random.default_rng(3), 2000
     arm, scene = irb1600(), paper_scene()
     moved = {"pole": rng.uniform(-1.2, 1.2, (num, 2)), "floor": rng.uniform(-0.6, -0.3, num)}
@@ -159,7 +166,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
 
 
 def test_end_poses_meet_the_ball(float64):
-    """Check that contacts are frontal, at the middle, and between the boxes."""
+    """Check that end poses meet the ball frontally, at the shield's middle, between the boxes."""
     case = throw(dtype=jnp.float64)
 
     @jax.jit
@@ -178,14 +185,18 @@ def test_end_poses_meet_the_ball(float64):
 @pytest.mark.slow
 @pytest.mark.parametrize("regime", ["R1", "R2"])
 def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
-    """Compare with central differences, for rates other than zero and a contact too late."""
+    """Compare the gradient of the least-squares cost with central differences.
+
+    The joints have an initial velocity, and the contact is too late, so that all residuals count.
+    """
     case = throw(regime=regime, rates=(0.3, -0.2, 0.1, 0.2, -0.4, 0.5), dtype=jnp.float64)
     flight = flight_of(case)
     poses = end_poses(case, flight, SMALL.points, SMALL.pieces)
     nearest = rank_poses(poses, 1, 1.0 - SMALL.slack)[0]
     start = SMALL.encode_straight(case, poses, nearest)
     rng = np.random.default_rng(0)
-    # Small changes: the model uses the derivative of an angle for the derivative of its sine.
+    # The changes are small, because the model approximates the derivative of the sine of an angle
+    # by the derivative of the angle.
     point = start + jnp.asarray(rng.normal(0.0, 0.02, start.shape)).at[-1].set(0.0)
     point = point.at[-1].set(flight.latest + 0.01)
     model = jax.jit(lambda point: SMALL.model(point, case, flight))
@@ -197,7 +208,10 @@ def test_slopes_of_least_squares_are_those_of_the_cost(regime, float64):
 
 @pytest.mark.slow
 def test_claims_are_confirmed_by_the_referee():
-    """Check all three regimes: most balls are blocked, and every claim is true."""
+    """Check that most balls are blocked, for three kinds of joint limits.
+
+    The referee must accept exactly the plans that the planner reports as solved.
+    """
     planner = pj.block.planner()
     for regime, wide, least in (("R1", True, 0.95), ("R2", False, 0.8), ("R3", False, 0.9)):
         cases = pj.block.draw(60, seed=5, regime=regime, wide=wide)
@@ -232,7 +246,11 @@ def test_plans_of_a_batch_say_what_became_of_each_ball():
 
 
 def test_brisk_motions_end_before_the_ball_is_there():
-    """Motions to rest are as fast as one limit allows; the referee confirms them."""
+    """Check the planner option `brisk`, with which a motion to rest takes the least time.
+
+    Such a motion reaches a limit of velocity or acceleration, ends before the contact, and is
+    accepted by the referee.
+    """
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8))
     cases.ends_at_rest[4] = False
     plans, quick = (pj.plan(dataclasses.replace(STRAIGHT, brisk=b), cases) for b in (False, True))

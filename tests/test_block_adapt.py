@@ -1,4 +1,4 @@
-"""Motions of a library that are warped to a given ball."""
+"""Tests of the planner that warps stored motions of a library until they meet a given ball."""
 
 import dataclasses
 from typing import Any
@@ -30,7 +30,7 @@ BALL = ((9.0, 0.5, 0.3), (-8.0, -0.4, 5.4))
 
 
 def library(pieces=6, has_pole=True):
-    """Build a library of straight motions to poses at which the shield meets one ball."""
+    """Build a library whose stored motions are straight, to poses that block the ball `BALL`."""
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=has_pole))
     found = jax.jit(lambda case: end_poses(case, flight_of(case), 10, 6))(case)
     good = np.flatnonzero(np.asarray(found.effort) <= 0.99)
@@ -75,7 +75,10 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
 
 @pytest.mark.slow
 def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
-    """The ball differs from the ball of the stored motions; limits at knots are exact."""
+    """Warp motions that were stored for another ball, and check contact and joint limits.
+
+    Candidates that are marked as open must keep the joint limits at all knots.
+    """
     own = planner(has_pole=False)
     scene = paper_scene(has_pole=False)
     case = pj.block.case((9.0, 0.45, 0.35), BALL[1], scene=scene)
@@ -104,7 +107,7 @@ def test_warped_motions_meet_the_ball_and_open_ones_keep_their_limits():
 
 @pytest.mark.slow
 def test_a_stored_motion_for_the_same_ball_is_not_warped():
-    """The plan is one of the stored straight motions, in the available time."""
+    """Check that a motion stored for this ball is used unchanged, except for its duration."""
     own = planner(has_pole=False)
     case = pj.block.case(*BALL, scene=paper_scene(has_pole=False))
     same = dataclasses.replace(EFFORT, points=10)
@@ -118,7 +121,7 @@ def test_a_stored_motion_for_the_same_ball_is_not_warped():
 
 @pytest.fixture(scope="module")
 def planned():
-    """Return a planner, a batch of balls, and their plans; three balls can be blocked."""
+    """Return a planner, eight cases, and their plans. Only three of the cases can be planned."""
     own = planner(has_pole=False)
     rng = np.random.default_rng(2)
     num = 8
@@ -164,7 +167,10 @@ def test_invalid_files_and_cases_are_rejected(tmp_path):
 
 @pytest.mark.slow
 def test_the_referee_confirms_warped_and_refined_motions(tmp_path):
-    """Both efforts make only true claims, and the longer one blocks more balls."""
+    """Check that the referee accepts every solved plan, with the short and with both searches.
+
+    With both searches more balls are blocked than with the short search alone.
+    """
     path = tmp_path / "a.lib"
     layout = Layout((Face(0, 1, (4, 4)),), (Face(0, 1, (3, 3)),))
     building.build(path, setting(), irb1600().home, layout, progress=False)

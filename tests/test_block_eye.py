@@ -1,4 +1,4 @@
-"""Camera observations of throws, and their effect on planner and referee."""
+"""Tests of simulated camera observations of throws, and of plans for the observed balls."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ def test_the_camera_on_the_mast_sees_all_throws_nearly_until_they_can_be_met(sui
 
 
 def test_one_fit_after_a_quarter_of_a_second_is_within_reach_of_the_shield():
-    """At 60 Hz with 2 cm noise per coordinate, nine of ten throws are within 0.1 m."""
+    """Fit flights after 0.25 s at 60 Hz with 2 cm of noise; 90 % of the errors are below 0.1 m."""
     cases = pj.block.draw(1000, "short", seed=11)
     seen = see(cases, eye(std=0.02), 0.25)
     assert (seen.fits.num == 16).all() and (seen.fits.status == Sight.SEEN).all()
@@ -55,7 +55,7 @@ def test_planners_get_the_fitted_ball_and_the_delay():
 
 
 def test_an_unseen_ball_is_a_status_of_fit_and_plan():
-    """The fit and the plan carry a status, and the referee rejects the plan."""
+    """Let the camera look away: fit and plan report a failure, and the referee rejects the plan."""
     cases = pj.block.draw(6, seed=5, regime="R1", wide=True)
     away = looking_at((0.0, 0.0, 1.0), (-5.0, 0.0, 1.0), size=(64, 64), field_of_view=1.0)
     seen = see(cases, eye(camera=away), 0.25)
@@ -80,7 +80,7 @@ def test_the_referee_agrees_on_plans_for_the_true_ball(regime):
 
 
 def test_a_late_ball_meets_the_braking_arm():
-    """A ball 10 ms later moves the contact by about 10 ms, to the shield's position then."""
+    """Delay a ball by 10 ms: the contact is about 10 ms later, where the shield is at that time."""
     cases = jax.tree.map(np.asarray, pj.block.draw(6, seed=8, regime="R1", wide=True))
     near_middle = cautious(cases, offset=0.01)
     plans = pj.plan(SMALL, jax.tree.map(np.asarray, near_middle))

@@ -1,4 +1,4 @@
-"""Libraries of blocks: cells, lookups, files, builds, resumed builds and repairs."""
+"""Tests of the library of stored block motions: cells, lookups, files, builds and repairs."""
 
 import dataclasses
 from typing import Any
@@ -52,7 +52,11 @@ def setting(regime="R2", **scene):
 
 
 def make_library(layout=TINY, regime="R2", homes=1):
-    """Build a library whose steps encode pair and home, with shields that face +x at x = 0.7 m."""
+    """Build a library without planning, whose entries tell the pair of cells and the home pose.
+
+    Each stored motion turns all joints by an angle that encodes pair and home. All shields face +x
+    at x = 0.7 m. The last pair has no motion.
+    """
     num = layout.num_pairs
     shape = profiles(PIECES, True)[0]
     turn = 1e-4 * (1.0 + np.arange(homes)[:, None] * num + np.arange(num))
@@ -76,7 +80,10 @@ def tunnels_of(layout):
 
 
 def ball_through(outer, inner, speed=8.0, before=0.6):
-    """Return a ball through two points, first seen `before` [s] ahead of the first point."""
+    """Return position and velocity of a ball that flies through two points.
+
+    The ball is first seen `before` [s] before it passes the first point.
+    """
     outer, inner = np.asarray(outer), np.asarray(inner)
     span = np.linalg.norm(inner - outer) / speed
     vel = (inner - outer) / span + (0.0, 0.0, 0.5 * GRAVITY * span)
@@ -88,7 +95,7 @@ def ball_through(outer, inner, speed=8.0, before=0.6):
 def test_a_point_of_a_cell_is_in_that_cell(name):
     layout, scene, tunnel = LAYOUTS[name], paper_scene(), tunnels_of(LAYOUTS[name])
     rng = np.random.default_rng(0)
-    # An inner box whose back does not cut the outer box's cells.
+    # All cells of the outer box are in front of this inner box's face, so no tunnel is cut off.
     behind: Any = Box(np.array([3.0, 0.0, 0.0]), np.array([4.0, 1.0, 1.0]))
     whole = tunnels(dataclasses.replace(layout, inner=(Face(0, -1, (1, 1)),)), behind, scene.outer)
     sides = (
@@ -118,7 +125,7 @@ def test_points_on_edges_are_in_exactly_one_cell():
 
 
 def test_tunnels_are_cut_off_where_no_ball_can_come_from():
-    """Every point of a tunnel sees the inner cell from in front, and no other point does."""
+    """Check that a tunnel has exactly the points of the outer cell in front of the inner cell."""
     layout, tunnel = LAYOUTS["full"], tunnels_of(LAYOUTS["full"])
     assert len(tunnel.outer) == layout.num_pairs == 21504
     assert (tunnel.is_feasible | ~tunnel.is_centred).all()
@@ -130,7 +137,7 @@ def test_tunnels_are_cut_off_where_no_ball_can_come_from():
         assert np.all(
             side * tunnel.outer[~tunnel.is_feasible & (face == place)][..., axis] <= 0.4 + 1e-6
         )
-    # 37.5 and 45.8 % of the pairs of A and B are feasible from the middle of the outer cell.
+    # For these shares of pairs, a ball from the middle of the outer cell can pass the inner cell.
     for name, share in (("A", 0.375), ("B", 11 / 24)):
         assert tunnels_of(LAYOUTS[name]).is_centred.mean() == pytest.approx(share)
 
@@ -163,7 +170,7 @@ def test_a_shield_as_large_as_the_farthest_crossing_blocks_the_tunnel():
 
 
 def test_a_lookup_returns_the_stored_motion_and_its_contact():
-    """From both homes; contact time and position follow the parabola."""
+    """Look up balls from both home poses; check motions, and contacts on the ball's parabola."""
     library, tunnel = make_library(homes=2), tunnels_of(TINY)
     pairs = np.flatnonzero(tunnel.is_feasible)[:-1]
     shots = [ball_through(tunnel.outer[p].mean(0), tunnel.inner[p].mean(0)) for p in pairs]
@@ -202,7 +209,8 @@ def test_one_ball_gets_the_answer_of_a_batch():
 
 def test_statuses_name_the_reason_of_a_failure():
     library = make_library()
-    # Balls through the cell y, z > 0 of both boxes, and balls that fail.
+    # The first ball passes the cells y, z > 0 of both boxes. The other balls have no stored motion,
+    # for the reasons in the comments.
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     shots = [
         good,
@@ -293,7 +301,10 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
 
 @pytest.fixture
 def counted(monkeypatch):
-    """Replace planning by rows that encode pair, home and number of the call."""
+    """Replace planning by a stub, whose rows tell the pair of cells and the home pose.
+
+    Returns a list to which every call appends its pairs.
+    """
     calls = []
 
     def plan_pairs(setting, home, tunnel, pairs, old=None):
@@ -446,9 +457,9 @@ def test_a_planner_of_a_file_needs_the_file_and_others_take_none():
 @pytest.mark.slow
 @pytest.mark.parametrize("regime, starts", [("R1", 1), ("R2", 1), ("R2", 16)])
 def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypatch):
-    """Every pair has a motion, shields block nearly all balls, and all claims are true.
+    """Build a small library; check its coverage, and that every claimed block is accepted.
 
-    Starts are tried one after another, as on a CPU, or at once.
+    The starting points of the search are tried one after another, as on a CPU, or all at once.
     """
     monkeypatch.setattr(building, "_ON_CPU", building.Portions(256, (16, 16), starts))
     path = tmp_path / "a.lib"
@@ -463,7 +474,7 @@ def test_the_referee_confirms_a_built_library(regime, starts, tmp_path, monkeypa
     planner = pj.block.planner(f"library:{path}")
     plans = pj.plan(planner, found.cases)
     np.testing.assert_array_equal(pj.are_solved(plans), found.claimed)
-    # 0.1 m farther, where some of the motions pass and the arm at home is free.
+    # The pole is moved by 0.1 m, so that some motions collide and the home pose does not.
     shifted: Any = np.array([0.8926, 0.05], np.float32)
     scene = dataclasses.replace(paper_scene(), pole=shifted)
     fixed, touched = building.repair(library, scene, progress=False)

@@ -1,4 +1,4 @@
-"""Published baselines of blocks: bang-bang motions, torques, plans that the referee confirms."""
+"""Tests of published planners of blocks: bang-bang motions, torques, and accepted plans."""
 
 import re
 import sys
@@ -33,7 +33,10 @@ def require_peers(*packages):
 
 @jax.jit
 def quickest(turn, rate, stretch):
-    """Return samples of the motion in `stretch` times the least duration, and the least times."""
+    """Sample the bang-bang motion that takes `stretch` times the least duration of all joints.
+
+    Returns angles, rates and accelerations (400, 3, 6), and the least time of each joint (6,) [s].
+    """
     times = least_times(turn, rate, LIMITS.velocity, LIMITS.acceleration)
     duration = stretch * jnp.max(times)
     motion = bang_bang(jnp.zeros(6), rate, turn, duration, jnp.asarray(LIMITS.acceleration))
@@ -44,7 +47,7 @@ def quickest(turn, rate, stretch):
 
 
 def test_joints_from_rest_take_the_times_of_closed_forms(float64):
-    """The time is 2 sqrt(d / a) below the velocity limit v, else d / v + v / a."""
+    """Check the least time for an angle d: 2 sqrt(d / a), or d / v + v / a if v is reached."""
     v, a = LIMITS.velocity.astype(float), LIMITS.acceleration.astype(float)
     turn = np.array([0.1, -0.2, 0.0, 1.5, -2.5, 4.0])
     times = quickest(turn, np.zeros(6), 1.0)[1]
@@ -56,7 +59,10 @@ def test_joints_from_rest_take_the_times_of_closed_forms(float64):
 
 @pytest.mark.parametrize("stretch", [1.0, 1.3, 3.0])
 def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
-    """Joints start at rest, towards the goal, away from it, or too fast to stop before it."""
+    """Check ends and limits of motions of several joints that arrive at the same time.
+
+    The joints start at rest, towards the goal, away from it, or too fast to stop before it.
+    """
     rng = np.random.default_rng(0)
     for scale in (0.0, 1.0):
         turn = rng.uniform(-1.5, 1.5, 6) * np.array([1, 1, 1, 1, 0.01, 0.0])
@@ -88,7 +94,10 @@ def test_an_arm_at_rest_exerts_the_torque_of_gravity(float64):
 
 
 def test_constant_acceleration_takes_the_torque_of_inertia(float64):
-    """Only joint 1 moves, half of the time forwards and half backwards, without gravity."""
+    """Compare the torque of joint 1 with its inertia times its acceleration, without gravity.
+
+    The joint accelerates during the first half of the motion and brakes during the second half.
+    """
     arm: Any = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), irb1600())
     acceleration, half = 3.0, 0.2
     rows = np.zeros((2, 3, 6))
@@ -204,12 +213,12 @@ def test_without_the_extra_the_error_names_it(name, package, monkeypatch):
     assert name not in others and {"direct", "insat"} <= others.keys()
 
 
-# Throws of an open scene, in which the first tried path is free.
+# Planner options for throws in a scene without a pole, in which the first path is collision-free.
 QUICK = {"points": 6, "budget": 20.0, "longest": 20.0}
 
 
 def plan_and_confirm(name, regime, **options):
-    """Return cases of two throws, plans that the referee confirms, and verdicts."""
+    """Plan two throws, check that the referee accepts the plans; return cases, plans, verdicts."""
     cases = jax.tree.map(np.array, pj.block.draw(2, "open", seed=8, regime=regime))
     plans = pj.plan(pj.block.planner(name, **QUICK, **options), cases)
     verdict: Any = pj.block.judge(cases, plans)

@@ -1,4 +1,4 @@
-"""Arms that decide while observing: estimates, new plans, and their composition."""
+"""Tests of arms that plan again while they observe the ball: estimates and joined motions."""
 
 import dataclasses
 
@@ -51,7 +51,7 @@ def test_a_perfect_camera_gives_the_plans_of_no_camera(cases):
 
 @pytest.mark.slow
 def test_with_exact_fits_deciding_again_changes_nothing(cases):
-    """A motion that meets the ball continues; an arm without a motion may still get one."""
+    """Check that an arm keeps its motion if later, exact observations confirm the ball's flight."""
     once, again = (
         decide(SMALL, cases, eye(std=1e-6), moments, aims=AIMS[:1])
         for moments in ([0.2], [0.2, 0.3, 0.4])
@@ -68,7 +68,8 @@ def test_composed_pieces_are_one_motion_within_rate_limits(cases):
     done = decide(SMALL, cases, eye(std=0.02), [0.15, 0.25, 0.35, 0.45], aims=AIMS)
     verdict, solved = judge(done)
     assert (done.motions[solved] >= 1).all() and done.motions.max() >= 2
-    # An arm that brakes after a missed contact may exceed a position limit.
+    # Position limits are not in this list, because an arm that brakes after a missed contact may
+    # exceed them.
     of_joints = ("time", "start", "continuity", "velocity", "acceleration", "rest")
     assert not np.isin(verdict.failed_limit[solved], of_joints).any()
     assert verdict.success[done.motions >= 2].any()
@@ -163,7 +164,7 @@ def test_sweeps_report_observations_and_planning_times(tmp_path):
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):
-    """The ball of a replanned case is at its time 0, whatever the delay is."""
+    """Check that the ball's path is the same in both cases, although their times 0 differ."""
     plans = pj.plan(SMALL, cases)
     task = AGAIN.begin(cases, plans, 0.2)
     here = jax.vmap(drag_free_flight)(task.case.ball, task.case.delay, task.case.gravity)

@@ -33,7 +33,7 @@ THROWS = NUM // 2  # lanes of one throw, whose second target is absent; the othe
 
 @pytest.fixture(scope="module")
 def cases():
-    """Throws with an absent second target, then pairs of throws."""
+    """Draw cases with one ball, in arrays with space for two, and then cases with two balls."""
     suites = [draw(THROWS, name, 4, num_targets=2) for name in ("throws", "parabola2")]
     cases = jax.tree.map(lambda *leaves: np.concatenate(leaves), *suites)
     return jax.tree.map(np.asarray, first_choice(Greedy(), cases))
@@ -52,7 +52,7 @@ def test_easy_throws_and_pairs_of_them_are_caught_and_confirmed_by_the_referee(c
 
 
 def test_any_decision_vector_has_every_ball_in_the_net(cases):
-    """Random variables without optimisation put every ball into the net."""
+    """Check that random decision variables, without optimisation, put every ball into the net."""
     pairs = pj.take(cases, slice(THROWS, None))
     random = np.random.default_rng(0)
 
@@ -83,7 +83,10 @@ def test_absent_targets_have_no_flight_and_the_plan_stays_at_the_last_catch(plan
 
 @pytest.mark.slow
 def test_one_throw_planned_alone_equals_its_lane_in_a_batch_for_more_targets(cases, plans):
-    """Without the network, which improves the first guess of single targets only."""
+    """Compare the plan of one case alone with its plan in a batch of cases with two targets.
+
+    The network for initial guesses is switched off, because it is used for single targets only.
+    """
     wide = pj.take(cases, 0)
     each_target = ("targets", "present", "horizon", "order", "times")
     fields = {name: pj.take(vars(wide)[name], slice(1)) for name in each_target}
@@ -109,13 +112,13 @@ def test_pairs_planned_one_by_one_equal_their_lanes_in_the_batch(cases, plans):
 @jax.jit
 @jax.value_and_grad
 def cost_and_slopes(shift, case):
-    """Return the cost at a point beside the first guess, and its derivatives."""
+    """Return the cost at the first guess plus `shift`, and its gradient by `shift`."""
     context = PLANNER.prepare(case)
     return PLANNER.objective(PLANNER.guesses(context, 1)[0] + shift, context).cost
 
 
 def test_absent_targets_cost_nothing_and_have_no_slope(float64):
-    """With random variables of the absent target."""
+    """Check that random decision variables of an absent target change neither cost nor gradient."""
     size = len(PLANNER.scale)
     shifts = 0.5 * np.random.default_rng(2).normal(size=(2, 2 * size))
     shifts[1, :size] = shifts[0, :size]
@@ -173,7 +176,7 @@ def test_all_products_of_the_objective_are_in_full_precision(cases):
     assert assert_full_precision(lambda x: PLANNER.decode(x, context), start) > 0
 
 
-# Stages, on a planner without any physics.
+# The following tests check the stages of a search with a simple planner without physics.
 
 
 @struct.dataclass
@@ -184,7 +187,7 @@ class Reached(Plan):
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Bowl(OptimisedPlanner):
-    """Minimises the distance from `goal`; every point is feasible."""
+    """A planner that minimises the squared distance of a number from `goal`, without limits."""
 
     goal: float = 0.0
     rounds: tuple[Round, ...] = (Round(),)
@@ -207,7 +210,7 @@ SEARCH, STAND = LbfgsConfig(max_steps=30, memory=2), LbfgsConfig(max_steps=0)
 
 
 def solve(starts, solver, *, settings=(), goals=()):
-    """Solve the bowl by a round after stages with other goals."""
+    """Run one round of the planner `Bowl`, after stages of the search with other goals."""
     stages = tuple(Stage(SEARCH, (("goal", goal),)) for goal in goals)
     attempt = Round(starts, solver, settings, stages)
     return jax.jit(functools.partial(solve_round, Bowl(), attempt))(np.zeros((), np.float32))
@@ -217,7 +220,7 @@ def test_a_round_starts_where_its_last_stage_ended():
     early, late = solve(1, STAND, goals=(5.0,)), solve(1, STAND, goals=(5.0, 3.0))
     np.testing.assert_allclose([early.point[0], late.point[0]], [5.0, 3.0], atol=1e-3)
     assert 0 < early.iterations < late.iterations  # iterations of stages count
-    # The cost is the planner's, not the stages'.
+    # The reported costs are for the planner's own goal, not for the goals of the stages.
     np.testing.assert_allclose([early.cost, late.cost], [25.0, 9.0], atol=1e-2)
 
 
@@ -228,7 +231,10 @@ def test_a_round_after_stages_solves_the_problem_of_its_own_settings():
 
 
 def test_axes_nearest_to_upright_lean_from_the_way_back_as_far_as_they_may():
-    """Check a target that falls steeply, flies level, is in between, rises, or rests."""
+    """Check the thrust directions for catching targets that fall, fly level, rise, or rest.
+
+    The direction is as upright as possible within 0.5 rad of the target's reversed velocity.
+    """
     vel = jnp.array(
         [[0.1, 0.0, -2.0], [2.0, 0.0, 0.0], [1.0, 1.0, -1.0], [0.0, 1.0, 3.0], [0.0] * 3]
     )

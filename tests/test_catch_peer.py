@@ -24,7 +24,8 @@ def test_guess_and_optimum_are_the_published_ones(program, name, search):
     assert found.guess_error <= 1e-8
     assert found.share_within >= 0.95
     assert abs(found.median_gap) <= 1e-4
-    # The penalties are soft: nets miss in some of the hard cases, as published.
+    # Penalties permit small excesses, so the net misses the ball in some cases of the hard set. The
+    # published program misses in some cases, too.
     assert found.success_rate >= 0.97
 
 

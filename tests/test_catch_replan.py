@@ -23,7 +23,7 @@ UNCHANGED = ReplanCatch(rounds=(Round(starts=1, solver=LbfgsConfig(max_steps=0))
 
 
 def plan_first(name, num):
-    """Return the first cases of a suite and their plans."""
+    """Draw `num` cases of a suite, choose the times of the catches, and plan from scratch."""
     cases = draw(num, name)
     times = np.linspace(0.7, 0.9, cases.num_targets) * np.asarray(cases.horizon)
     cases = jax.tree.map(np.asarray, dataclasses.replace(cases, times=times))
@@ -44,7 +44,7 @@ def states_of(targets, time):
 
 
 def ahead(cases, elapsed, noise=0.0):
-    """Return the targets `elapsed` (B,) [s] later, with noise on position and velocity."""
+    """Return the targets' states `elapsed` (B,) [s] later, with noise on position and velocity."""
     ball = states_of(cases.targets, np.asarray(elapsed, np.float32))
     random = np.random.default_rng(1)
     disturb = lambda x: np.asarray(x + noise * random.standard_normal(x.shape), np.float32)  # noqa: E731
@@ -52,7 +52,10 @@ def ahead(cases, elapsed, noise=0.0):
 
 
 def assert_same_flight(old, new, elapsed, until, atol):
-    """Assert equal position, velocity and acceleration of plans and their remainders."""
+    """Assert that `new` plans continue the `old` plans from the time `elapsed` for `until` [s].
+
+    Position, velocity and acceleration are compared.
+    """
     for share in np.linspace(0.0, 1.0, 23):
         times = share * until
         found, expected = (

@@ -1,4 +1,4 @@
-"""The suites of catches: the ranges in the docstring of their module hold for every draw."""
+"""Tests of the suites of catches: every draw is within the ranges that their module documents."""
 
 import jax
 import jax.numpy as jnp
@@ -13,14 +13,15 @@ from tests.trees import assert_same
 NUM = 64
 THROWS = ("throws", "hard", "parabola1", "parabola2")
 PARALLEL = ("square4", "pentagon5", "hexagon6", "heptagon7")
-# Half sides of the landing rectangle, flight times [s], seconds from launch to planning.
+# Suite -> for each target: half sides of the landing rectangle [m], range of flight times [s], and
+# time [s] from the launch to the start of planning.
 RANGES = {
     "throws": [((1.0, 0.4), (1.4, 1.78), 0.3)],
     "hard": [((2.0, 1.5), (1.4, 1.78), 0.5)],
     "parabola1": [((1.0, 0.4), (1.4, 2.0), 0.3)],
     "parabola2": [((1.0, 0.4), (1.4, 1.6), 0.3), ((1.0, 0.4), (1.7, 2.0), 0.0)],
 }
-# Farthest from the vertical axis through the origin, and heights [m].
+# Suite -> greatest horizontal distance of targets from the origin [m], and range of heights [m].
 VOLUMES = {
     "harmonic2": (9.0, (1.0, 3.5)),
     "triangle3": (7.3, (1.5, 2.5)),
@@ -32,7 +33,7 @@ float64 = pytest.mark.usefixtures("float64")
 
 @jax.jit
 def states(targets, times):
-    """Return states of targets (B, N) at times (B, N, T), leaves (B, N, T, 3)."""
+    """Return the states of targets (B, N) at times (B, N, T) [s], leaves (B, N, T, 3)."""
     return jax.vmap(jax.vmap(lambda path, t: jax.vmap(path.at)(t)))(targets, times)
 
 
@@ -45,12 +46,15 @@ def draw_doubles(name, num=NUM, seed=3):
 
 
 def away(pos):
-    """Return distances from the vertical axis through the origin."""
+    """Return horizontal distances [m] of positions (..., 3) from the origin."""
     return np.linalg.norm(np.asarray(pos)[..., :2], axis=-1)
 
 
 def test_a_suite_is_a_matter_of_its_name_and_the_seed_alone():
-    """Some numbers of three suites: a change here is a change of published cases."""
+    """Compare some drawn numbers of three suites with fixed values.
+
+    If such a number changes, then the published benchmark cases change.
+    """
     np.testing.assert_allclose(draw(1, "throws").targets.ball.vel[0, 0, 1], -0.10602945, rtol=1e-5)
     np.testing.assert_allclose(draw(1, "hexagon6").targets.ball.pos[0, 0, 2], 2.3829162, rtol=1e-5)
     heptagon = draw(1, "heptagon7").targets.ball.pos[0, 0]
@@ -167,7 +171,7 @@ def test_targets_of_a_rush_are_due_one_after_the_other_in_any_order(name, first,
     middle = first + 0.9 * np.arange(due.shape[1])
     assert (np.abs(in_order - middle) <= 0.5 * spread + 1e-9).all()
     assert np.abs(in_order - middle).max() > 0.45 * spread
-    # Every target comes first as often as any other.
+    # Each target is the first to be due with the same probability.
     share = np.bincount(each[:, 0]) / len(due)
     np.testing.assert_allclose(share, 1.0 / due.shape[1], atol=0.08)
     start = states(cases.targets, until_horizon(cases))

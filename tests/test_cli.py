@@ -1,4 +1,4 @@
-"""The command line: its output, its exit codes, and one line for every bad argument."""
+"""Tests of the command line: output, exit codes, and a one-line error for every bad argument."""
 
 import subprocess
 import sys
@@ -15,7 +15,7 @@ GOOD, GONE = "2.5 -0.3 2,-4.3 0.02 7.3", "2.5 -0.3 2,4.3 0.02 7.3"
 
 
 def trial_file(folder, serve, name="1_1_1_p.csv"):
-    """Write a folder with one trial file of one serve."""
+    """Write a folder with one file in the format of the published trials, with one serve."""
     folder.mkdir(exist_ok=True)
     row = f"1,{serve},-2.9 -0.3 0,1.75 0 0,failed,failed,failed"
     (folder / name).write_text(f"{HEADER}\n{row}\n")
@@ -31,7 +31,7 @@ def expect_one_line(arguments, *parts):
 
 @pytest.fixture
 def elsewhere(tmp_path, monkeypatch):
-    """Enter an empty folder."""
+    """Change the working directory to an empty folder; return the folder."""
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     monkeypatch.chdir(folder)

@@ -1,4 +1,4 @@
-"""The number of files of the library that a reader of one hit must know."""
+"""Test how many files of the library are needed to plan a hit, which a reader must understand."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Sweeps with a Ray cluster: a stand-in for Ray by default, Ray itself in slow tests."""
+"""Tests of sweeps with a Ray cluster. Slow tests use Ray, the other tests a stand-in for it."""
 
 import dataclasses
 import os
@@ -26,17 +26,17 @@ from tests.faults.quick import quick_sweeps
 from tests.sweeps import rows_of, stop_after
 
 TASK = pj.task_named("hit")
-NUM, BATCH = 64, 13  # five chunks
+NUM, BATCH = 64, 13  # Numbers of cases and of cases in a chunk, which give five chunks.
 SETTINGS = HitSettings(num=NUM, batch=BATCH, seed=3)
 COMMAND = f"sweep hit --num {NUM} --batch {BATCH} --seed 3".split()
 
 
 class RayError(Exception):
-    """Ray's error if a worker dies too often."""
+    """Stand-in for the error that Ray raises if a worker process dies too often."""
 
 
 class RayTaskError(RayError):
-    """Ray's error if a task raises."""
+    """Stand-in for the error that Ray raises if a task raises an exception."""
 
     def __init__(self, cause):
         super().__init__("a long traceback\nof many lines")
@@ -44,9 +44,10 @@ class RayTaskError(RayError):
 
 
 class StandIn:
-    """Ray as a sweep uses it, in this process; tasks are done in reverse order.
+    """Stand-in for the module ray, with the functions that a sweep uses.
 
-    `deaths` holds the number of workers that die in a chunk.
+    Tasks run in this process, in reverse order. `deaths` maps a chunk to the number of workers that
+    die while they compute it.
     """
 
     exceptions = SimpleNamespace(RayError=RayError, RayTaskError=RayTaskError)
@@ -119,7 +120,10 @@ def quick():
 
 @pytest.fixture(autouse=True)
 def ray(monkeypatch, request):
-    """Replace Ray by the stand-in, except in slow tests; leave the report out."""
+    """Replace the module ray by the stand-in, except in tests of a real cluster.
+
+    Sweeps write no report, and changed environment variables are restored after the test.
+    """
     monkeypatch.delenv("RAY_ADDRESS", raising=False)
     told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
     changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
@@ -248,7 +252,7 @@ def test_the_process_that_asks_sees_the_first_gpu_of_those_it_may(
 
 @pytest.fixture
 def gpus(monkeypatch, ray):
-    """Let JAX claim a GPU, and the cluster two GPUs."""
+    """Pretend that JAX computes on a GPU and that the cluster has two GPUs."""
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
     ray.resources = {"CPU": 8.0, "GPU": 2.0}
     return ray
@@ -311,7 +315,7 @@ def test_a_worker_whose_jax_has_no_device_ends_a_run_that_can_be_finished(
 
 @pytest.mark.slow
 def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
-    """A worker is killed with the first part."""
+    """Kill a worker process after the first chunk is written; the rows must not change."""
     pytest.importorskip("ray")
     plain, out = tmp_path / "plain", tmp_path / "run"
     options = "--num 64 --batch 2 --planner juggle --out".split()
@@ -339,9 +343,9 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
 def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     tmp_path, monkeypatch
 ):
-    """The cluster claims one GPU and four cores for two workers, which compute on the CPU.
+    """Let the cluster pretend that it has one GPU, shared by two workers; the rows must not change.
 
-    They compute with four threads each, and so do the run and the plain sweep.
+    The workers compute on the CPU with four threads each, as does the sweep without a cluster.
     """
     ray = pytest.importorskip("ray")
     init = ray.init
@@ -364,7 +368,7 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
 
 @pytest.mark.slow
 def test_a_bad_case_of_a_worker_of_a_real_cluster_is_one_line_and_leaves_nothing(tmp_path):
-    """The serves of a later chunk have landed before the planning starts."""
+    """Plan so late that serves of a later chunk have landed; the sweep must report one error."""
     pytest.importorskip("ray")
     options = "--num 40 --batch 4 --delay 1.56 --planner juggle --workers ray --out run".split()
     command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options]

@@ -1,4 +1,4 @@
-"""Comparison of runs: what is compared and rejected, and the numbers."""
+"""Tests of the comparison of two runs: which runs can be compared, and the reported numbers."""
 
 import csv
 
@@ -16,7 +16,10 @@ FAILED = {0: "", 1: "speed", 2: "landing"}
 
 
 def write_run(folder, outcomes, *, kind="sweep hit", **settings):
-    """Write a finished run with outcomes: 0 for a success, else the limit that fails."""
+    """Write the folder of a finished run, whose case k has the result `outcomes[k]`.
+
+    The result 0 is a success. Any other number is the index of the failed limit in FAILED.
+    """
     outcomes = np.array(outcomes)
     num, successes = len(outcomes), int((outcomes == 0).sum())
     rows = pa.table(

@@ -1,4 +1,4 @@
-"""The contract that planners of every kind and task keep, and two planners of a user."""
+"""Tests of properties that every planner of every task must have, and of two user's planners."""
 
 import dataclasses
 import functools
@@ -33,15 +33,15 @@ from tests.trees import assert_same
 
 NUM = 6  # cases of a batch; no more than one bucket
 
-# A task of a user: approach a point in the plane.
+# The following classes define a task as a user would: approach a point in the plane.
 
 
 @struct.dataclass
 class Place:
-    """A point in the plane."""
+    """A case of the user's task: a goal in the plane, to be approached within a distance."""
 
-    goal: Array  # (2,)
-    reach: Array  # (), greatest distance
+    goal: Array  # (2,), position of the goal
+    reach: Array  # (), greatest permitted distance from the goal
 
     @property
     def batch_shape(self):
@@ -50,9 +50,9 @@ class Place:
 
 @struct.dataclass
 class Stand(Plan):
-    """The point that is reached."""
+    """A plan of the user's task: the point that is reached."""
 
-    point: Array  # (2,)
+    point: Array  # (2,), position of the point
 
 
 def places(num):
@@ -62,9 +62,12 @@ def places(num):
 
 @struct.dataclass
 class LibraryPlanner(pj.Planner):
-    """Selects the nearest of stored points, in the first attempt of only a few of them."""
+    """A planner that selects the stored point nearest to the goal.
 
-    points: Array  # (K, 2)
+    The first attempt searches only the first 8 points, the second attempt 64 points.
+    """
+
+    points: Array  # (K, 2), stored points
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
     case_type: ClassVar[type] = Place
 
@@ -79,7 +82,10 @@ class LibraryPlanner(pj.Planner):
 
 @dataclasses.dataclass(frozen=True)
 class NumpyPlanner(pj.Planner):
-    """Makes a step towards the goal, of a length by attempt, in NumPy."""
+    """A planner in NumPy, which makes a step towards the goal, of 0.5 in the first attempt.
+
+    The step of the second attempt has a length of 1. No step goes beyond the goal.
+    """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(1), Attempt(2))
     case_type: ClassVar[type] = Place
@@ -97,10 +103,12 @@ def library(seed):
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (64, 2)).astype(np.float32)
 
 
-# All planners in small sizes. Compilation dominates the time: two iterations, or none.
+# Settings with which each planner compiles quickly, because compilation takes most of the tests'
+# time: two iterations of the optimiser, or none.
 FEW = {"rounds": (Round(solver=LbfgsConfig(max_steps=2, memory=1, trial_steps=(1.0,))),)}
 NONE = {"rounds": (Round(solver=LbfgsConfig(max_steps=0)),)}
-# Of test_block, test_block_peers and test_block_library.
+# These settings are also used in test_block, test_block_peers and test_block_library, so that the
+# compiled programs can be used again.
 SMALL_SEARCH = {
     "pieces": 6,
     "points": 10,
@@ -111,12 +119,12 @@ SHORT = {"proportions": (0.2, 0.5, 1.0, 1.0, 1.0, 1.0), "nodes": 3, "num_table_n
 
 @dataclasses.dataclass(frozen=True)
 class Entry:
-    """A planner with its cases."""
+    """A planner that is tested, with a function that draws its cases."""
 
     planner: Any
-    cases: Any  # of a number of them
-    broken: str  # name of a leaf of floats in the case
-    gradient: dict[str, Any] | None = None  # arguments of `pj.gradient`
+    cases: Any  # function that draws a given number of cases
+    broken: str  # name of a floating-point array of the case, which tests fill with NaN
+    gradient: dict[str, Any] | None = None  # arguments of `pj.gradient`; None without a gradient
 
     @functools.cached_property
     def batch(self):
@@ -158,7 +166,8 @@ def block(name, suite="pole", **options):
 
 
 ENTRIES = {
-    # The gradient of the cost needs no adjoint, whose program takes three times as long.
+    # The gradient of the cost needs no adjoint solver, with which compilation takes three times as
+    # long.
     "hit exact": hit("exact", {"of": "cost", "by": "racket_height", "steps": 0}, **SHORT, **NONE),
     "hit bat": hit("bat", {"of": "cost", "by": ["target", "gravity"]}, nodes=6, **NONE),
     "hit bat-lite": hit("bat-lite", {"of": "stroke.time", "by": "limits"}, nodes=6, **NONE),
@@ -194,7 +203,7 @@ ENTRIES = {
     "block online": block("online", **SMALL_SEARCH),
     "block brisk": block("brisk", **SMALL_SEARCH),
     "block direct": block("direct", points=6),
-    # Without a pole the first spline is found long before the time limit of a search.
+    # In the suite `open`, which has no pole, the search finds a spline long before its time limit.
     "block insat": block("insat", "open", points=6, budget=20.0, longest=20.0),
     "block library": Entry(
         LibraryBlock(make_library(regime="R1")),
@@ -204,8 +213,8 @@ ENTRIES = {
     "library": Entry(LibraryPlanner(library(1)), places, "goal"),
     "NumPy": Entry(NumpyPlanner(), places, "goal"),
 }
-# Planners that are slow here, because they share a solver with others, or because the modules of
-# their tasks make the same checks.
+# Planners that only slow tests include. They use the same solver as another tested planner, or the
+# test module of their task makes the same checks.
 LIKE_OTHERS = (
     *("hit bat", "hit bat-lite", "hit juggle", "catch exact", "catch catch"),
     *("intercept lattice", "intercept em", "intercept constant"),
@@ -214,7 +223,10 @@ LIKE_OTHERS = (
 
 
 def entries(*, on_host=True, slow=()):
-    """Parametrise a test by planners."""
+    """Return a decorator that runs a test for every planner.
+
+    `on_host` includes planners in NumPy. The planners named in `slow` run in slow tests only.
+    """
     rows = [
         pytest.param(entry, id=name, marks=[pytest.mark.slow] if name in slow else [])
         for name, entry in ENTRIES.items()
@@ -224,12 +236,16 @@ def entries(*, on_host=True, slow=()):
 
 
 every, pure = entries(slow=LIKE_OTHERS), entries(on_host=False, slow=LIKE_OTHERS)
-# By default test_exact and test_intercept check these claims, with programs of other tests.
+# For these planners test_exact and test_intercept make some of the checks, with programs that are
+# compiled there anyway, so that the checks here are slow tests.
 OF_THEIR_OWN = ("hit exact", "intercept spacetime")
 
 
 def assert_close(ours, theirs, tolerance=1e-3):
-    """Assert equal statuses, and equal leaves relative to the largest number of each."""
+    """Assert that plans have equal statuses and nearly equal arrays.
+
+    The tolerance is relative to the largest finite number of each array.
+    """
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
         size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))  # others must be equal
@@ -237,7 +253,7 @@ def assert_close(ours, theirs, tolerance=1e-3):
 
 
 def with_nan(tree, name, k):
-    """Return the batch with NaN in lane k of one leaf."""
+    """Return a copy of a batch with NaN in the array `name` of case k."""
     first, _, rest = name.partition(".")
     leaf = getattr(tree, first)
     if rest:
@@ -302,7 +318,10 @@ def test_every_matrix_product_asks_for_full_precision(entry, monkeypatch):
 
 @pytest.fixture
 def traces(monkeypatch):
-    """Return a function that lists, from the call on, the traces of a planner."""
+    """Return a function that counts how often JAX traces a planner.
+
+    The function takes a planner, and returns a list to which every later trace is appended.
+    """
     found = []
 
     def count(planner):

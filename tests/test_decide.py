@@ -1,4 +1,4 @@
-"""Orders and times: hand-made cases whose answer is known, and what holds of all decisions."""
+"""Tests of decisions on catching orders and times: cases with known answers, and invariants."""
 
 import dataclasses
 
@@ -38,26 +38,26 @@ NUM = 8
 @jax.jit
 @jax.vmap
 def greedy(case):
-    """Return the only choice of `Greedy`, leaves (N,)."""
+    """Return the order and times that `Greedy` chooses for a case, leaves (N,)."""
     return pj.take(Greedy().propose(case), 0)
 
 
 @jax.jit
 @jax.vmap
 def best(case):
-    """Return the six choices of `Best`, best first, leaves (6, N)."""
+    """Return the six orders, with times, that `Best` estimates to be best, leaves (6, N)."""
     return Best(finalists=6).propose(case)
 
 
 @jax.jit
 @jax.vmap
 def estimate(case, orders):
-    """Return the sums of shortfalls (K,) of orders (K, N)."""
+    """Return for K orders (K, N) the sum of the estimated distances by which targets are missed."""
     return jax.vmap(lambda order: follow(case, timetable(case), order)[1])(orders)
 
 
 def shortfall(cases, choices):
-    """Return the sum of shortfalls of each choice, (B,) or (B, K)."""
+    """Return for each choice, (B,) or (B, K), the sum of estimated distances to missed targets."""
     shape = choices.order.shape
     orders = choices.order.reshape(shape[0], -1, shape[-1])
     return np.asarray(estimate(cases, orders)).reshape(shape[:-1])
@@ -68,7 +68,7 @@ def by(decision, planner=PLANNER):
 
 
 def hanging(places, horizons):
-    """Make cases with targets at rest at positions (B, N, 3) until their horizons (B, N)."""
+    """Return cases whose targets rest at positions (B, N, 3) [m] for the times (B, N) [s]."""
     pos = jnp.asarray(places, jnp.float32)
     ball = BallState(pos, jnp.zeros_like(pos))
     targets = BallPath(ball, jnp.zeros_like(pos), jnp.zeros(pos.shape[:2]))
@@ -80,7 +80,10 @@ NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # targets of a quadrotor at (0, 0
 
 @pytest.fixture(scope="module")
 def pairs():
-    """Return a near target, and one that is far, due soon, too far away, too low, or rising."""
+    """Return five cases with a near target and a second target.
+
+    The second target is farther, due soon, too far away, too low, or rising.
+    """
     places = [(FAR, NEAR), (NEAR, FAR), ((100.0, 0.0, 1.2), NEAR), ((2.0, 0.0, 0.3), NEAR)]
     cases = hanging([*places, (FAR, NEAR)], [(4.0, 4.0), (4.0, 1.15)] + 3 * [(4.0, 4.0)])
     ball = cases.targets.ball
@@ -94,7 +97,7 @@ def triangles():
 
 
 def rank(cases, choices):
-    """Return the last catch [s] plus 10 s for each metre of shortfall."""
+    """Return an estimated cost of choices: the last catch [s], plus 10 s for each missing metre."""
     return np.asarray(choices.times[..., -1]) + 10.0 * shortfall(cases, choices)
 
 
@@ -114,7 +117,10 @@ def test_best_catches_first_what_is_due_first(pairs):
 
 
 def test_times_are_those_of_a_point_that_accelerates_evenly(pairs):
-    """Check one metre from hover at 7 m/s^2 after 0.2 s, rounded up to one of 64 times."""
+    """Compare a chosen time with 0.2 s plus the time for one metre at 7 m/s^2 from standstill.
+
+    The chosen time is the next of 64 equally spaced times.
+    """
     found = greedy(pairs)
     arrival = 0.2 + np.sqrt(2.0 * 1.0 / 7.0)
     assert arrival <= found.times[0, 0] <= arrival + 4.0 / 64.0 + 1e-6
@@ -201,7 +207,7 @@ def test_one_case_alone_is_decided_on_and_planned_as_in_its_batch(decide, pairs)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class LongFirst(ExactCatch):
-    """Makes only its first attempt for every order."""
+    """A planner that makes its first attempt for every order, and later attempts for few orders."""
 
     def starts_long(self, case):
         return True
@@ -212,9 +218,10 @@ class LongFirst(ExactCatch):
     [(ExactCatch, 2, [(1, 10), (1, 2)]), (LongFirst, 3, [(1, 10), (1, 2), (1, 2)])],
 )
 def test_later_rounds_are_for_cases_without_any_solved_order(kind, num, calls, pairs, monkeypatch):
-    """Later rounds are the last one, or all but the first of a planner that `starts_long`.
+    """Check which cases are planned again with the planner's later rounds.
 
-    Case 0 is solved in one order and case 2 is too far away, so that only case 1 is tried again.
+    Case 0 is solved in one order, and case 2 is too far away. Therefore only case 1 is planned
+    again: with the last round, or with all rounds but the first if the planner `starts_long`.
     """
     horizon = np.array(pairs.horizon)
     horizon[1, 1] = 0.7
@@ -262,7 +269,10 @@ def test_fewer_finalists_are_the_first_of_more_and_one_is_needed(triangles):
 
 
 def test_the_time_ratio_is_that_of_the_present_targets(pairs):
-    """Evaluate [Yu2023catch, eq. 29] by hand; the last case lacks the second target."""
+    """Compare the optimal time ratio with [Yu2023catch, eq. 29], evaluated by hand.
+
+    The second target of the last case is absent and must not count.
+    """
     present = np.ones((5, 2), bool)
     present[4, 1] = False
     order = np.array([[0, 1], [1, 0], [0, 1], [1, 0], [0, 1]])
@@ -287,7 +297,10 @@ def test_a_given_order_that_is_no_permutation_is_refused(pairs, order):
 
 
 def test_closest_approach_is_what_the_greatest_speed_leaves(pairs):
-    """Check a target at 100 m after 4 s at 5 m/s, with the net's size and a 64th of the time."""
+    """Compare the closest approach to a target 100 m away with a formula.
+
+    The robot flies 4 s at 5 m/s. The net's size and a 64th of the way are subtracted as reserves.
+    """
     gap = np.array(jax.jit(closest_approach)(pairs))
     left = np.hypot(100.0, 0.2) - 5.0 * 4.0 - (0.2 + 0.125) - 5.0 * 4.0 / 64.0
     assert gap[2, 0] == pytest.approx(left, rel=1e-4)
@@ -307,20 +320,20 @@ def test_a_target_out_of_reach_is_named_and_its_neighbours_are_not(array, kind, 
 
 @pytest.fixture(scope="module")
 def swarm():
-    """Return cases of eight optional balls, NumPy leaves."""
+    """Draw cases with eight optional balls each, in NumPy arrays."""
     return jax.tree.map(np.asarray, draw(NUM, "swarm8", 2))
 
 
 @pytest.fixture(scope="module")
 def caught(swarm):
-    """Return plans for the targets that `Greedy` takes."""
+    """Return plans for the cases `swarm`, with the targets and times that `Greedy` chooses."""
     return plan(by(Greedy()), swarm)
 
 
 @jax.jit
 @jax.vmap
 def beams(case):
-    """Return the orders (64, N) of the beam search."""
+    """Return the 64 choices that the beam search finds for a case, leaves (64, N)."""
     return beam(case, timetable(case), 64)
 
 
@@ -369,7 +382,10 @@ def test_a_claimed_catch_of_an_optional_target_has_to_hold(swarm, caught):
 
 
 def test_a_search_takes_more_of_a_swarm_than_greed(swarm):
-    """The search takes more by the estimate, and plans of more targets rank before others."""
+    """Check that the beam search chooses more targets of a swarm than the greedy decision.
+
+    Plans that catch more targets must have a better rank.
+    """
     found = beams(swarm)
     number = np.asarray(found.taken.sum(axis=2))
     assert (number == number[:, :1]).all()

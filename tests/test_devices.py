@@ -1,6 +1,7 @@
-"""A batch on several devices has the plans of one device.
+"""Test that a batch has the same plans on several devices as on one device.
 
-The test runs this module as a script, because the number of devices is set before JAX starts.
+The test runs this module as a script in a new process, because the number of simulated devices
+must be set before JAX starts.
 """
 
 import os
@@ -37,7 +38,7 @@ def require_equal(found, expected):
 
 
 def compare_devices():
-    """Compare plans on all of four devices, on three, and on one other than the first."""
+    """Check that plans on four, on three, and on the third device equal plans on the first."""
     devices = jax.local_devices()
     assert len(devices) == 4
     alone = plan(WellPlanner(), Well(GOALS), devices=devices[:1])

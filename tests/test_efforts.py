@@ -1,4 +1,4 @@
-"""Efforts: the rounds that they make, and planners without efforts."""
+"""Tests of efforts, which state how long a planner continues to search after all limits hold."""
 
 import pytest
 

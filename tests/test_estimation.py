@@ -1,4 +1,4 @@
-"""Ball estimation: the Kalman filter, energy, and recursive least squares."""
+"""Tests of ball estimation: Kalman filter, drag from lost energy, and recursive least squares."""
 
 import functools
 
@@ -17,7 +17,8 @@ NUM = 121
 PERIOD = 0.01  # [s]
 NOISE = 0.02  # [m]
 
-# Compiled once for all tests of equal shapes and dtype; "many" means many balls.
+# These functions are compiled once for all tests with equal shapes and types. Functions with "many"
+# in their names take a batch of balls.
 predict_one = jax.jit(ekf_predict, static_argnames="flight")
 update_one = jax.jit(ekf_update)
 fly_one = jax.jit(fly, static_argnames="num_steps")
@@ -25,7 +26,10 @@ fly_many = jax.jit(jax.vmap(functools.partial(fly, num_steps=80), in_axes=(0, No
 
 
 def filter_path(initial, times, observations, model, *, flight=linear_drag_flight):
-    """Return the belief after each of N observations (N, 3) at `times` (N,)."""
+    """Run the Kalman filter; return its state after each of N observations (N, 3) [m].
+
+    The observations are made at `times` (N,) [s], the first one without a prediction before it.
+    """
 
     def advance(state, seen):
         duration, observation = seen
@@ -49,7 +53,7 @@ def linear_flight(ball, elapsed, drag):
     return jax.vmap(lambda t: linear_drag_flight(ball, t, drag, GRAVITY))(elapsed)
 
 
-# The data are NumPy arrays, so operations on them are not compiled.
+# The functions below return NumPy arrays, so that operations on them need no compilation.
 
 
 def times(dtype=np.float32):
@@ -73,14 +77,17 @@ def drag_prior(estimate, variance, dtype=np.float32):
 
 
 def linear_path(dtype=np.float32, ball=None):
-    """Return the ball at all `times`, with linear drag."""
+    """Return the states of a ball with linear drag at all `times`."""
     ball = serve(dtype) if ball is None else ball
     path = linear_flight(ball, times(dtype) - times(dtype)[0], LINEAR_DRAG.astype(dtype))
     return jax.tree.map(np.asarray, path)
 
 
 def quadratic_path(dtype=np.float32):
-    """Return the ball at all `times`, with quadratic drag, by eight Runge-Kutta steps each."""
+    """Return the states of a ball with quadratic drag at all `times`.
+
+    Eight Runge-Kutta steps lead from each time to the next.
+    """
     ball = serve(dtype)
     _, fine = fly_one(ball, PERIOD * (NUM - 1), DRAG, GRAVITY, num_steps=8 * (NUM - 1))
     return jax.tree.map(lambda x0, x: np.concatenate([x0[None], x[7::8]]), ball, fine)
@@ -102,7 +109,10 @@ def without(positions, *rows):
 
 
 def textbook_kalman(mean, covariance, observations, drag, density, std):
-    """Filter a flight with linear drag by an affine Kalman filter in NumPy, with inverses."""
+    """Run a textbook Kalman filter in NumPy, with matrix inverses, for a ball with linear drag.
+
+    Returns mean (6,) and covariance (6, 6) of position and velocity after the last observation.
+    """
     e, K = np.exp(-drag * PERIOD), drag
     ramp = (1.0 - e) / K
     F = np.block([[np.eye(3), np.diag(ramp)], [np.zeros((3, 3)), np.diag(e)]])
@@ -152,7 +162,10 @@ def test_exact_observations_give_the_state_in_float32():
 
 
 def test_errors_agree_with_the_covariances():
-    """Check the mean NEES, 6 for 6 degrees of freedom, over 100 balls from the prior."""
+    """Check that the squared error, normalised by the covariance, is 6 on average.
+
+    The expected value is the number of dimensions. The balls are drawn from the filter's prior.
+    """
     rng = np.random.default_rng(2)
     balls = jax.tree.map(lambda x: (x + rng.normal(size=(100, 3))).astype(x.dtype), serve())
     prior = ekf_init(serve().pos, serve().vel, pos_std=1.0, vel_std=1.0)
@@ -166,7 +179,7 @@ def test_errors_agree_with_the_covariances():
         return np.mean(np.sum(error * np.linalg.solve(covariance, error[..., None])[..., 0], -1))
 
     error = np.concatenate([path.pos, path.vel], axis=-1) - np.asarray(states.mean)
-    # The standard deviation of the mean over 100 balls is 0.35.
+    # The mean over 100 balls has a standard deviation of sqrt(2 * 6 / 100) = 0.35.
     assert mean_square(error[:, -1], states.covariance[:, -1]) == pytest.approx(6.0, abs=1.0)
     raw = np.sqrt(np.mean((observations - path.pos)[:, -1] ** 2))
     filtered = np.sqrt(np.mean(error[:, -1, :3] ** 2))
@@ -226,7 +239,10 @@ def test_prediction_error_grows_with_the_horizon_and_stays_finite():
 @pytest.mark.slow
 @float64
 def test_filter_gradient_is_finite_from_rest_and_matches_finite_differences():
-    """Differentiate by the model and the observations, the first three of them missing."""
+    """Compare the gradient of the filter's last mean with finite differences.
+
+    The gradient is by the model's parameters and by the observations, of which three are missing.
+    """
     observations = without(noisy(quadratic_path(np.float64).pos, seed=4), slice(3))
     belief = model(DRAG, density=0.1, dtype=np.float64)
 
@@ -271,7 +287,7 @@ def test_batch_equals_loop():
     states = filter_many(wide_prior(), times(), observations, model())
     for k in range(3):
         state = filter_one(wide_prior(), times(), observations[k], model())
-        # The first velocities are unknown, and differ by rounding.
+        # The first states are not compared: while the velocity is unknown, rounding changes it.
         np.testing.assert_allclose(states.mean[k, 20:], state.mean[20:], atol=1e-4)
 
 

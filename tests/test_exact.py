@@ -26,14 +26,14 @@ NUM = 16
 
 @jax.jit
 def first_guess(case):
-    """Return the context of one case, and its first guess."""
+    """Return the planner's prepared data of one case, and the initial guess of its variables."""
     context = PLANNER.prepare(case)
     return context, PLANNER.guesses(context, 1)[0]
 
 
 @pytest.fixture(scope="module")
 def cases():
-    """Return cases in NumPy arrays, so that one program plans batches of up to 16."""
+    """Draw NUM hits, in NumPy arrays, for which one program plans all batches of up to 16 cases."""
     return jax.tree.map(np.asarray, to_cases(generate_serves(NUM, 11)))
 
 
@@ -49,7 +49,7 @@ def test_every_easy_serve_is_solved_and_confirmed_by_the_referee(cases, plans):
 
 
 def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
-    """Random variables without optimisation satisfy the equations of the impact."""
+    """Check that random decision variables, without optimisation, satisfy the impact equations."""
     lane = pj.take(cases, 3)
     context, guess = first_guess(lane)
     points = guess[None] + 0.3 * np.random.default_rng(0).normal(size=(8, guess.size))
@@ -62,7 +62,10 @@ def test_any_decision_vector_meets_the_ball_and_reaches_the_target(cases):
 
 
 def test_the_violation_of_a_plan_is_the_excess_that_the_referee_finds(cases):
-    """The violation includes peaks between samples, in infeasible plans."""
+    """Compare the violation of infeasible plans with the excess that the referee measures.
+
+    Excesses between the planner's samples count too.
+    """
     rates = np.linspace(0.2, 0.5, NUM, dtype=np.float32) * cases.limits.body_rate
     limits = cases.limits.replace(speed=0.4 * cases.limits.speed, body_rate=rates)
     found = plan(FIRST_ROUND, cases.replace(limits=limits))
@@ -118,7 +121,7 @@ def test_drag_after_the_impact_is_aimed_for(float64):
 
 @pytest.mark.parametrize("function", [aim_with_drag, apex_with_drag])
 def test_derivatives_with_drag_are_those_of_finite_differences(float64, function):
-    """First and second derivatives, by all arguments."""
+    """Compare the first and second derivatives, by all arguments, with finite differences."""
 
     def value(x):
         if function is aim_with_drag:

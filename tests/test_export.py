@@ -1,4 +1,4 @@
-"""Plans as tables, ROS 2 bags and Crazyflie pieces, each read by its own library."""
+"""Tests of exported plans: tables, ROS 2 bags and Crazyflie files, read by independent software."""
 
 import re
 import sys
@@ -102,7 +102,10 @@ def test_an_arm_in_a_bag_has_its_six_joints_as_they_are_sampled(tmp_path):
 
 @pytest.mark.parametrize("robot", ["car", "arm"])
 def test_where_ros_is_installed_a_plan_is_an_object_of_its_classes(monkeypatch, robot):
-    """Stand-ins of its classes have the fields of the message definitions and no others."""
+    """Convert a plan to message objects of ROS 2, whose classes are replaced by stand-ins.
+
+    The stand-ins have exactly the fields of the message definitions.
+    """
     with pytest.raises(MissingExtra, match="^trajectory_message needs trajectory_msgs of ROS 2"):
         ros2.trajectory_message(arm())
     for kind, definition in ros2.TYPES.items():

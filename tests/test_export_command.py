@@ -1,4 +1,4 @@
-"""Plans of runs and of saved files, and the command that exports them."""
+"""Tests of the command `planner-jax export`, for plans of runs and of saved files."""
 
 import socket
 import threading
@@ -35,7 +35,7 @@ READ |= {"motion_coeffs", "motion_durations"}
 
 
 def batch(robot):
-    """Return three plans that differ, the last of them not solved."""
+    """Return a batch of three different plans for a robot, of which the last is not solved."""
     scale = lambda leaf: np.stack([leaf, leaf * 0.75, leaf * 0.5]).astype(leaf.dtype)  # noqa: E731
     plans = jax.tree.map(scale, PLANS[robot])
     if robot == "quadrotor":  # gravity is the same for all plans of a run
@@ -44,7 +44,10 @@ def batch(robot):
 
 
 def write_run(folder, task="hit", *, finished=True):
-    """Write a run with the columns that determine a plan, for plans without a planner."""
+    """Write the folder of a run with three plans that no planner made.
+
+    The rows have only the columns that are needed to read a plan.
+    """
     robot, columns = TASKS[task]
     plans = batch(robot)
     success, sentence = np.array([True, False, False]), lambda k: f"plan {k} is too fast"
@@ -135,7 +138,7 @@ def test_fields_of_a_task_are_left_out_and_files_of_something_else_are_refused(t
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """Make a working folder with runs, a saved batch and a saved plan."""
+    """Change to a folder with two runs, a saved batch of plans and a saved plan."""
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "run")
     write_run(tmp_path / "arms", "block")
@@ -145,7 +148,7 @@ def here(tmp_path, monkeypatch):
 
 
 def run_export(capsys, words, recovery="none"):
-    """Run the command; return the exit code and the text of the two streams."""
+    """Run `planner-jax export`; return its exit code, and what it wrote to stdout and stderr."""
     try:
         code = main(["export", *words.split(), *(["--recovery", recovery] if recovery else [])])
     except SystemExit as stop:

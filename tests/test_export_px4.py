@@ -1,4 +1,4 @@
-"""Plans in north-east-down: frames, signs, and messages for PX4, read back by pymavlink."""
+"""Tests of plans exported to PX4 in its north-east-down frame, read back by pymavlink."""
 
 import socket
 import struct
@@ -87,7 +87,7 @@ def test_a_bag_of_px4_has_a_message_a_setpoint(tmp_path):
 
 
 def assert_are_setpoints(read, fields):
-    """Check that MAVLink messages are the setpoints of a plan, and that no field is ignored."""
+    """Check that MAVLink messages have the setpoints of a plan, and that no mask ignores fields."""
     assert len(read) == len(fields["timestamp"])
     names = ("x", "y", "z", "vx", "vy", "vz", "afx", "afy", "afz", "yaw", "yaw_rate")
     found = [[getattr(message, name) for name in names] for message in read]

@@ -1,4 +1,7 @@
-"""A user's limits and costs along the trajectory, planned by `exact` and judged by the referee."""
+"""Tests of extras: limits and costs along the trajectory that a user adds to a case.
+
+The planner `exact` plans with them, and the referee judges the limits.
+"""
 
 import dataclasses
 import functools
@@ -16,7 +19,8 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, states_at
 from planner_jax.trajectory.proportional_minco import boundary_rows
 from tests.derivatives import assert_gradient_matches_differences
 
-# Smooth trajectories; obstacles are placed around their middles.
+# This planner starts from smooth trajectories, without the learned guess. Tests place obstacles
+# near the middles of its trajectories.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
 HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
@@ -26,9 +30,9 @@ TRACES = []
 
 @struct.dataclass
 class Gentle:
-    """A limit of this test, which records whether its arguments are NumPy arrays."""
+    """A limit on the horizontal acceleration, which records whether its inputs are NumPy arrays."""
 
-    acceleration: Any  # () [m/s^2], horizontal
+    acceleration: Any  # () [m/s^2], greatest horizontal acceleration
 
     def excess(self, pos, vel, acc):
         TRACES.append(isinstance(pos, np.ndarray))
@@ -47,7 +51,11 @@ def having(
     point=-FAR,
     normal=(0.0, 0.0, 1.0),
 ):
-    """Return cases with five extras without effect by default: all use one compiled program."""
+    """Return cases with five extras, such as a forbidden sphere, set by the arguments.
+
+    By default the extras have no effect. All tests use the same kinds of extras, so that one
+    compiled program suffices.
+    """
     batch = cases.batch_shape
     full = lambda value: np.broadcast_to(np.asarray(value, np.float32), batch)  # noqa: E731
 
@@ -65,14 +73,17 @@ def having(
 
 
 def way(plans, k, num=200):
-    """Return positions (num, 3) of plan k at equal steps, the ends included."""
+    """Return positions (num, 3) [m] of plan k at equally spaced times, including both ends."""
     path = pj.take(plans.trajectory, k)
     many = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], num, axis=0), path)
     return states_at(many, np.linspace(0.0, path.durations.sum(), num))[:, 0]
 
 
 def straight(path, vel):
-    """Return a path (1, M) from the origin at one velocity (3,), with the durations of a path."""
+    """Return a trajectory that flies straight from the origin at a velocity (3,) [m/s].
+
+    It has the pieces' durations of the first trajectory in `path`.
+    """
     coeffs = np.zeros_like(path.coeffs[:1])
     starts = np.cumsum(path.durations[:1], axis=1) - path.durations[:1]
     coeffs[:, :, 0], coeffs[:, :, 1] = starts[..., None] * vel, vel
@@ -80,7 +91,7 @@ def straight(path, vel):
 
 
 def places(plans):
-    """Return for each plan the position (3,) half as far from its start as its end is."""
+    """Return positions (NUM, 3) [m] at which plans have covered half the distance to their end."""
     found = []
     for k in range(NUM):
         flown = way(plans, k)
@@ -106,7 +117,7 @@ def middle(free):
 
 @pytest.fixture(scope="module")
 def blocked(hits, middle):
-    """Return the same hits with a sphere near the middle of each free trajectory."""
+    """Return the hits with a forbidden sphere near the middle of each unconstrained trajectory."""
     return having(hits, middle + np.array([0.0, 0.03, 0.0]), np.array([0.2, 0.25, 0.15, 0.2]))
 
 
@@ -120,7 +131,8 @@ def test_excess_and_cost_have_their_closed_forms():
     vel = np.array([[3.0, 0.0, 4.0], [0.0, 5.0, 0.0], [0.0, 0.0, 5.0]])
     found = pj.KeepOut(AT, 2.0).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.75, -1.5, -0.125], atol=1e-9)
-    # Half a metre outside, half way inside, and on a face; the shortest side is 4 m long.
+    # The positions are half a metre outside the box, half way between face and middle, and on a
+    # face. The excess is the depth divided by half the shortest side, which is 4 m long.
     box = pj.KeepOutBox(np.array([-2.0, -2.0, 0.0]), np.array([2.0, 3.0, 4.0]))
     where = np.array([[0.0, 3.5, 2.0], [1.0, 0.5, 2.0], [0.0, 0.5, 0.0]])
     np.testing.assert_allclose(box.excess(where, vel, vel), [-0.25, 0.5, 0.0], atol=1e-12)
@@ -128,7 +140,8 @@ def test_excess_and_cost_have_their_closed_forms():
     np.testing.assert_allclose(wall.excess(pos, vel, vel), [-2.0, 1.0, -2.0], atol=1e-12)
     found = pj.Geofence(np.array([-1.0, -1.0, 0.0]), np.full(3, 3.5)).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [0.0, 0.5, -1.0], atol=1e-12)
-    # Inside, beyond 1.25 radii, and half way between, where u = 1/2 and the limit is doubled.
+    # The positions are inside the zone, farther than 1.25 radii from its centre, and half way
+    # between, where u = 1/2 and the speed limit is doubled.
     found = pj.SpeedZone(AT, 2.0, 2.5).excess(pos, vel, vel)
     np.testing.assert_allclose(found, [1.0, -1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(pj.Dislike(AT, 1.0, 2.0).cost(pos, vel, vel), [1.125, 0.0, 0.0])
@@ -188,7 +201,7 @@ def test_plans_avoid_obstacles_and_the_referee_rejects_plans_through_them(
 
 
 def fly_straight(hits, free, vel):
-    """Return one case without a floor, and its plan that flies straight at one velocity (3,)."""
+    """Return one case without a floor, and a plan that flies straight at a velocity (3,) [m/s]."""
     one = slice(0, 1)
     limits = dataclasses.replace(hits.limits, min_height=hits.limits.min_height - 9.0)
     head = np.zeros((1, 4, 3), np.float32)
@@ -198,7 +211,7 @@ def fly_straight(hits, free, vel):
 
 
 def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
-    """A straight path at 2 m/s through two spheres, the second of them deeper."""
+    """Fly straight through two forbidden spheres; the referee must report the deeper one."""
     case, plan = fly_straight(hits, free, (2.0, 0.0, 0.0))
     zones = (
         pj.KeepOut(np.array([[0.3, 0.4, 0.0]]), np.array([0.5])),
@@ -214,7 +227,7 @@ def test_the_referee_finds_the_depth_its_time_and_the_extra(hits, free):
 
 
 def test_the_peak_of_a_path_past_an_edge_is_found_between_samples(hits, free):
-    """A straight path at 2.8 m/s cuts 2 mm off a box's edge, where no sample lies."""
+    """Fly straight at 2.8 m/s through the edge of a box, 2 mm deep, between two samples."""
     case, plan = fly_straight(hits, free, (2.0, 2.0, 0.0))
     head, span = case.head_state, plan.trajectory.durations.sum(axis=1)
     maps, still = FREE.maps, np.zeros((FREE.num_pieces - 1, 3))
@@ -250,14 +263,18 @@ def test_another_value_compiles_nothing_anew(hits, around):
 
 
 def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
-    """Boxes 3 cm over the middles of two trajectories; planes across the two others."""
+    """Put boxes near the middles of two trajectories, and planes across two others.
+
+    The referee must reject the old plans, and accept plans that the planner makes with obstacles.
+    """
     sides = np.array([0.5, 0.4, 0.6])
     reach = sides * [0.5, 1.0, 0.5] - [0.0, 0.03, 0.0]
     low = np.where(np.arange(NUM)[:, None] < 2, middle - reach, FAR)
     first, last = (np.array([way(free, k)[place] for k in range(NUM)]) for place in (0, -1))
     across = np.cross(last - first, [0.0, 0.0, 1.0])
     across /= np.linalg.norm(across, axis=1, keepdims=True)
-    # The side of the straight line from start to end without the middle of the trajectory.
+    # A plane is parallel to the straight line from start to end. It forbids the side of the line on
+    # which the middle of the trajectory lies.
     side = np.sign(((middle - first) * across).sum(1, keepdims=True))
     depth = np.abs(((middle - first) * across).sum(1, keepdims=True))
     point = np.where(np.arange(NUM)[:, None] < 2, -FAR, first + 0.5 * depth * side * across)
@@ -265,13 +282,17 @@ def test_boxes_and_planes_are_planned_around_and_judged(hits, free, middle):
     cases = having(hits, low=low, size=sides, point=point, normal=normal)
     verdict = pj.hit.judge(cases, free)
     assert (verdict.failed_limit == "extra").all() and list(verdict.worst_extra) == [3, 3, 4, 4]
-    # A single attempt sometimes ends at an edge of a box.
+    # The planner with all attempts is used, because a single attempt sometimes gets stuck at an
+    # edge of a box.
     verdict = pj.hit.judge(cases, pj.plan(FREE, cases))
     assert verdict.success.all(), [verdict.sentence(k) for k in range(NUM)]
 
 
 def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
-    """Boxes of 20 to 60 cm near the middle of each trajectory; plans pass close to their edges."""
+    """Put random boxes near the middle of each trajectory; the referee must accept solved plans.
+
+    Plans pass close to the boxes' edges, where the distance is hard to sample.
+    """
     random, num_solved = np.random.default_rng(2), 0
     for _ in range(16):  # on some processors 8 of the first 32 cases are solved, on others more
         half = random.uniform(0.1, 0.3, (NUM, 3))
@@ -319,7 +340,10 @@ def test_a_cost_moves_the_trajectory(hits, free, middle):
 
 @pytest.mark.slow
 def test_catches_stay_inside_a_fence():
-    """The fence is at 85 % of the distance of the free catch from its start, along one axis."""
+    """Put a fence between the start and the catch of each plan, and plan again inside the fence.
+
+    The fence is at 85 % of the distance along one axis.
+    """
     cases = jax.tree.map(np.asarray, pj.catch.draw(NUM, "throws", seed=3))
     free = pj.plan(CATCH, cases)
     assert pj.catch.judge(cases, free).success.all()

@@ -1,4 +1,4 @@
-"""Ball flight with quadratic drag [Yu2023bat, eq. 2] and with linear drag, apex and fall."""
+"""Tests of ball flight with quadratic drag [Yu2023bat, eq. 2] and linear drag, apex and fall."""
 
 import functools
 
@@ -36,7 +36,7 @@ from planner_jax.sims.sensing import specific_energy
 
 WEIGHT = np.array([0.0, 0.0, -GRAVITY])
 
-# Compiled once for all tests of equal shapes and dtype.
+# These functions are compiled once for all tests with equal shapes and types.
 step_once = jax.jit(rk4_step)
 fly_eight_steps = jax.jit(functools.partial(fly, num_steps=8))
 drag_free = jax.jit(drag_free_flight)
@@ -47,7 +47,10 @@ fall_and_slope = jax.jit(jax.value_and_grad(drag_free_fall_time, argnums=(0, 1, 
 
 @jax.jit
 def linear_drag_and_rates(ball, duration, drag):
-    """Return the state, and its derivatives by time and by the drag on all axes."""
+    """Return a ball's state after `duration` [s] with linear drag, and its derivatives.
+
+    The derivatives are by time, and by a change of the drag that is equal on all axes.
+    """
     flight = functools.partial(linear_drag_flight, gravity=GRAVITY)
     state, in_time = jax.jvp(lambda t: flight(ball, t, drag), (duration,), (jnp.ones(()),))
     _, in_drag = jax.jvp(lambda k: flight(ball, duration, k), (drag,), (jnp.ones(3),))
@@ -61,7 +64,7 @@ def fly_steps(start, duration, drag=DRAG, gravity=GRAVITY, *, num=32):
 
 
 def integrate(acceleration, duration):
-    """Integrate the serve by SciPy, to rounding."""
+    """Integrate the serve's flight by SciPy with a tolerance of 1e-13; return the final state."""
     flight = solve_ivp(
         lambda _, state: np.concatenate([state[3:], acceleration(state[3:])]),
         (0.0, duration),
@@ -78,7 +81,10 @@ def with_quadratic_drag(vel):
 
 
 def test_a_ball_feels_its_weight_and_a_drag_against_its_velocity():
-    """Check a ball of speed |(3, 4, 12)| = 13, and one at rest with its gradient."""
+    """Check the acceleration of a ball at a speed of |(3, 4, 12)| = 13 m/s, and of a ball at rest.
+
+    The derivative at rest must be zero, not NaN.
+    """
 
     def accelerate(vel):
         acceleration = ball_acceleration(vel, 0.1, GRAVITY)
@@ -100,7 +106,7 @@ def test_one_runge_kutta_step_without_drag_is_the_closed_form():
 
 @float64
 def test_a_fall_from_rest_follows_its_closed_form():
-    """Check v = -c tanh(g t / c), z = -(c^2 / g) log cosh(g t / c) with terminal speed c."""
+    """Check v = -c tanh(g t / c) and z = -(c^2 / g) log cosh(g t / c), with terminal speed c."""
     final = fly_steps(ball((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), 2.0)
     terminal = np.sqrt(GRAVITY / DRAG)
     x = GRAVITY * 2.0 / terminal
@@ -111,7 +117,7 @@ def test_a_fall_from_rest_follows_its_closed_form():
 
 @float64
 def test_a_ball_without_weight_follows_its_closed_form():
-    """Check speed v / (1 + K v t) and distance log(1 + K v t) / K; |(2, -3, 6)| = 7."""
+    """Check speed v / (1 + K v t) and distance log(1 + K v t) / K for v = |(2, -3, 6)| = 7 m/s."""
     start = ball((1.0, 2.0, 3.0), (2.0, -3.0, 6.0))
     x = DRAG * 7.0 * 2.0
     expected = BallState(start.pos + start.vel * np.log1p(x) / (7.0 * DRAG), start.vel / (1.0 + x))
@@ -198,7 +204,7 @@ def test_linear_drag_goes_over_into_the_drag_free_flight():
 
 @float64
 def test_the_slope_in_linear_drag_at_no_drag_is_the_first_term_of_its_series():
-    """Check s = s_0 + v t + g t^2 / 2 - K (v t^2 / 2 + g t^3 / 6) + ..."""
+    """Check the derivative by K of s = s_0 + v t + g t^2/2 - K (v t^2/2 + g t^3/6) + ..."""
     t = 1.6
     _, _, slope = linear_drag_and_rates(ball(), t, np.zeros(3))
     expected = -(ball().vel * t**2 / 2.0 + WEIGHT * t**3 / 6.0)
@@ -250,7 +256,7 @@ def test_a_falling_ball_is_highest_now_and_the_apex_has_no_kink(vz):
 @float64
 @pytest.mark.parametrize("height", [0.0, 2.0, 3.5])
 def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
-    """Check the derivative of the time by the height, 1 / v_z."""
+    """Check the time at which a ball falls through a height, and its derivative 1 / v_z."""
     (time, reached), slopes = fall_and_slope(ball(), height, GRAVITY)
     there = drag_free(ball(), float(time), GRAVITY)
     assert reached and there.vel[2] < 0.0
@@ -258,7 +264,8 @@ def test_a_ball_falls_through_the_plane_at_the_fall_time(height):
     np.testing.assert_allclose(slopes[1], 1.0 / there.vel[2], rtol=1e-12)
 
 
-# The ball is too slow to reach the plane, touches it, falls below it, or falls from it.
+# In the four cases the ball is too slow to reach the plane, touches it, falls from a point below
+# the plane, or falls from a point in the plane.
 @pytest.mark.parametrize(("height", "vz"), [(2.25, 1.0), (2.25, 2.0), (2.25, -6.0), (2.0, -6.0)])
 def test_a_plane_that_is_not_reached_is_flagged_with_a_finite_gradient(height, vz):
     start = ball(vel=(0.0, 0.0, vz), dtype=np.float32)
