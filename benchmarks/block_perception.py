@@ -163,7 +163,7 @@ class Table:
 
 
 def report_models(bench: Bench, num: int, seed: int) -> None:
-    """Print the part `errors`: errors of `num` fitted flights for each suite, rate and noise."""
+    """Print errors of fitted flights for each suite, frame rate and noise model, without images."""
     bench.say(f"Median error, and share of {num} throws within {ROOM:g} m", "")
     table, moments = Table(bench), jnp.asarray(MOMENTS)
     for suite in ("short", "pole"):
@@ -188,7 +188,10 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_images(bench: Bench, num: int, seed: int) -> None:
-    """Print the part `images`: errors with rendered images and with the noise model, and times."""
+    """Print errors of flights fitted to rendered images, and to observations with modelled noise.
+
+    The times to process an image and to fit a flight are printed, too.
+    """
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
 
@@ -297,7 +300,7 @@ def moments_of(first: float, last: float, rate: float) -> list[float]:
 
 
 def pipeline(bench: Bench, num: int, seed: int) -> None:
-    """Print the part `pipeline`: the share of balls blocked from noisy observations."""
+    """Simulate arms that plan from noisy observations; print the share of balls that they block."""
     bench.say("", f"{num} throws of short, R1 wide, seed {seed}: the whole pipeline", "")
     bench.say(
         "| decided | noise | success % (95 %) | on the shield, % | without a plan, % | motions | "

@@ -159,7 +159,9 @@ def select_starts(solves: np.ndarray) -> list[int]:
 
 
 def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]]:
-    """Draw throws, and learn starts from them, in the order in which the planner tries them.
+    """Draw throws, and learn starting points of the least-squares search from them.
+
+    Returns the starting points in the order in which the planner tries them.
 
     Args:
         bench: prints the share of solved throws.

@@ -199,7 +199,7 @@ def fly(
 
 
 def cut_trajectory(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolynomial:
-    """Return the first `elapsed` [s] of a trajectory."""
+    """Return the part of a trajectory from its start to the time `elapsed` [s]."""
     ends = path.durations.cumsum()
     durations = path.durations - np.maximum(ends - elapsed, 0.0)
     flown = durations > 0.0

@@ -73,7 +73,7 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
 
 
 def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
-    """Return a copy of the planner whose rounds are replaced by the long search."""
+    """Return a copy of the planner that runs `TO_THE_OPTIMUM` instead of its own rounds."""
     return planner.with_settings((("rounds", (TO_THE_OPTIMUM,)),))
 
 

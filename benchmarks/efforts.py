@@ -72,7 +72,7 @@ def _time_fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of efforts."""
+    """Parse the arguments, and print the table of costs and times for each effort."""
     parser = argument_parser("efforts", __doc__, num=1000, seed=0, repeat=3)
     options = parser.parse_args()
     with begin(parser, options) as bench:

@@ -223,7 +223,7 @@ class Lattice:
         return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
-        """Return blocked cells and bit shifts of moving obstacles, by half layer and heading."""
+        """Return movers' blocked cells and shifts to their positions, by half layer and heading."""
         scene, num = self.scene, 2 * self.layers + 1
         times = 0.5 * scene.dt * np.arange(num)
         drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]

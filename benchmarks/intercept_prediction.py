@@ -180,7 +180,7 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
 
 
 def latency(bench: Bench, num: int, seed: int) -> None:
-    """Report the time of one prediction with its probability of success, over many targets."""
+    """Time single predictions of many targets; each includes the probability of a small error."""
 
     @jax.jit
     def one(seen: jax.Array) -> tuple[TurningPath, jax.Array]:

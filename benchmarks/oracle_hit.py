@@ -85,7 +85,7 @@ def format_table(summary: dict) -> str:
 def write_findings(
     bench: Bench, summary: dict, indices: np.ndarray, findings: list[Finding]
 ) -> None:
-    """Store a row for each case, and the trajectories of all feasible hits in hits.npz."""
+    """Store in the run folder a row for each case, and hits.npz with all feasible trajectories."""
     for index, finding in zip(indices, findings, strict=True):
         numbers = {k: v for k, v in vars(finding).items() if k not in ("coeffs", "durations")}
         bench.row(index=index, verdict=finding.verdict, **numbers)

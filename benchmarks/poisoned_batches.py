@@ -91,7 +91,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Compare both batches of a task, and print how many cases are marked and unchanged."""
+    """Plan a valid and a poisoned batch; print how many plans are marked and how many unchanged."""
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)
     bench.row(task=options.task, num=options.num, **found)

@@ -219,7 +219,7 @@ class Program:
         return np.repeat(values, list(self.sizes.values()))
 
     def _build(self, unknown: dict, case: dict, samples: int) -> tuple:
-        """Return the cost, the expressions that must be 0, and those that must be <= 0."""
+        """Return cost, expressions that must be 0, and expressions that must be <= 0."""
         states = ca.horzcat(
             case["head_state"],
             ca.reshape(unknown["states"], 12, self.pieces) * np.repeat(STATE_SCALE, 3),

@@ -50,7 +50,8 @@ STARTS = (
     (0.65, 1.1, 0.8),
     (0.97, 1.0, 1.4),
 )
-# Ranges of the same three numbers for random starting points.
+# Ranges of random starting points: impact time over landing time, the ball's flight time after the
+# impact [s], and thrust at the impact [g].
 START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))
 
 
