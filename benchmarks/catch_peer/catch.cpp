@@ -4,22 +4,23 @@
 //
 // FILE is a table such as tests/data/catch_paper.csv. A plan is a minimum-snap spline of four
 // equally long pieces from rest at (0, 0, 1). Its variables are the three inner waypoints, the
-// logarithm of the duration T, and position, velocity and acceleration at T; the jerk at T is
-// zero. The cost is the integral of |snap|^2, 1000 T, and penalties of speed, body rate, thrust
-// and height at 16 intervals a piece, of the net's distance from the ball and of its angle.
+// logarithm of the duration T, and position, velocity and acceleration at T; the jerk at T is zero.
+// The cost is the integral of |snap|^2, 1000 T, and penalties of speed, body rate, thrust and
+// height at 16 intervals a piece, of the net's distance from the ball and of its angle.
 //
-// With relative=1 the optima are the same, but the variables are whitened offsets of the waypoints
-// from the smoothest trajectory to the tail, and the net's position relative to the ball. With
-// memory=0 the search is BFGS with a dense matrix, which is small for 19 variables.
+// With relative=1 the optima are the same, but the variables are offsets of the waypoints from the
+// smoothest trajectory to the end ("tail"), in coordinates in which the energy is the squared norm
+// of the offsets, and the net's position relative to the ball. With memory=0 the search is BFGS
+// with a dense matrix, which is small for 19 variables.
 //
 // The program plans all cases of the file, one after another, in several rounds. It prints the CPU
 // time of the fastest round (without reading and printing), then a line for each case.
 //
-// Three choices make it fast. In time over the duration h of a piece, the spline is a constant
-// linear map of six rows: the waypoints and (p, v h, a h^2) at T, all relative to the head, whose
-// derivatives are zero. Samples are processed in vectors. Bounds without a root or a division
-// exclude most vectors, in which no limit is exceeded and the gradient is zero. Planning allocates
-// no memory.
+// Four choices make the program fast. First, if time is measured in units of the duration h of a
+// piece, the spline is a constant linear map of six rows: the waypoints and (p, v h, a h^2) at T,
+// relative to the start ("head"), whose derivatives are zero. Second, samples are processed in
+// vectors. Third, simple bounds without a root or a division exclude most vectors, in which no
+// limit is exceeded and the gradient is zero. Fourth, planning allocates no memory.
 
 #include <algorithm>
 #include <array>
@@ -45,12 +46,12 @@ constexpr int kWidth = 4;
 typedef double Vec __attribute__((vector_size(8 * kWidth)));
 
 constexpr int kPieces = 4;
-constexpr int kNodes = 16;                      // penalty intervals a piece
-constexpr int kDegree = 7;                      // of minimum snap
-constexpr int kSamples = kPieces * kNodes;      // without the head, which is at rest
+constexpr int kNodes = 16;                      // intervals of a piece between two samples
+constexpr int kDegree = 7;                      // degree of a minimum-snap polynomial
+constexpr int kSamples = kPieces * kNodes;      // without the start, where limits always hold
 constexpr int kBlocks = kSamples / kWidth;
-constexpr int kInner = kPieces - 1;             // waypoints
-constexpr int kColumns = kInner + 3;            // waypoints, then p, v, a at the tail
+constexpr int kInner = kPieces - 1;             // number of waypoints
+constexpr int kColumns = kInner + 3;            // waypoints, then p, v, a at the end
 constexpr int kVariables = 19;
 constexpr int kRegisters = (kVariables + kWidth - 1) / kWidth;
 constexpr int kPadded = kRegisters * kWidth;
@@ -77,7 +78,8 @@ constexpr double kNetRadius = 0.125;
 const double kSafeCosine = std::cos(std::acos(-1.0) / 6.0);
 constexpr double kHead[3] = {0.0, 0.0, 1.0};
 
-// Order of the variables: waypoints by axis, log T, position, velocity, acceleration.
+// Index of the first number of log T, position, velocity and acceleration in the vector of
+// variables. The waypoints come first, ordered by axis.
 constexpr int kLogTime = 9, kPosition = 10, kVelocity = 13, kAcceleration = 16;
 
 struct alignas(64) Point {
@@ -121,14 +123,15 @@ inline void add(Point& to, double factor, const Point& what) {
     for (int i = 0; i < kRegisters; ++i) to.reg[i] += factor * what.reg[i];
 }
 
-// The factor of power k after differentiation of the given order.
+// Return k (k - 1) ... (k - order + 1), the factor of t^k in the derivative of the given order.
 double falling(int k, int order) {
     double factor = 1.0;
     for (int i = 0; i < order; ++i) factor *= k - i;
     return factor;
 }
 
-// Constant matrices of the spline, in time over the duration of a piece.
+// Constant matrices of the spline, with time in units of the duration of a piece. The "columns" are
+// the waypoints (or offsets) and the state at the end, from which the matrices compute the spline.
 struct Spline {
     const bool relative;  // whether the first columns are offsets instead of waypoints
     double coefficients[kPieces][kDegree + 1][kColumns];
@@ -152,7 +155,8 @@ struct Spline {
         }
     }
 
-    // A derivative at a time between 0 and 4, as a linear form of the columns.
+    // Return the coefficients with which a derivative at a time from 0 to 4 is a sum of the
+    // columns.
     std::array<double, kColumns> row(double time, int order) const {
         const int piece = std::min(int(time), kPieces - 1);
         const double inside = time - piece;
@@ -165,8 +169,9 @@ struct Spline {
     }
 
   private:
-    // The coefficients. Equations: rest at the head, the tail, the waypoints, and six continuous
-    // derivatives at each waypoint.
+    // Solve for the polynomial coefficients as linear functions of the columns. The equations are
+    // the standstill at the start, the state at the end, the positions of the waypoints, and six
+    // continuous derivatives at each waypoint.
     void solve() {
         constexpr int size = kPieces * (kDegree + 1);
         std::vector<std::array<double, size + kColumns>> rows;
@@ -212,8 +217,9 @@ struct Spline {
                     rows[i][size + c] / rows[i][i];
     }
 
-    // A triangular square root of the energy's matrix, by Gram-Schmidt on the snap at four Gauss
-    // points a piece. The matrix itself would lose small energies to rounding.
+    // Compute a triangular square root of the matrix of the snap energy, by Gram-Schmidt on the
+    // snap at four Gauss points a piece. With the matrix itself, small energies would be lost to
+    // rounding.
     void factorise() {
         const double points[2] = {0.3399810435848563, 0.8611363115940526};
         const double shares[2] = {0.6521451548625461, 0.3478548451374538};
@@ -241,7 +247,8 @@ struct Spline {
             std::copy_n(energy[i], kColumns, offsets[i]);
     }
 
-    // Replace waypoints by offsets: apply the first rows of the energy's root.
+    // Change the matrices such that the first columns are offsets instead of waypoints. The first
+    // rows of the energy's square root convert waypoints to offsets.
     void change_columns() {
         double waypoints[kInner][kColumns];
         for (int c = 0; c < kColumns; ++c)
@@ -273,7 +280,7 @@ struct Case {
     double guessed_time;
 };
 
-// The state of a ball with linear drag after a time, and its acceleration.
+// Compute position, velocity and acceleration of a ball with linear drag after a time.
 inline void fly(const Ball& ball, double time, double pos[3], double vel[3], double acc[3]) {
     const double rest = std::exp(-kDrag * time);
     for (int i = 0; i < 3; ++i) {
@@ -288,7 +295,8 @@ struct Hinge {
     Vec value, slope;
 };
 
-// Zero below 0, a quartic blend up to the width, linear above.
+// The penalty of an excess x along the trajectory, and its derivative: zero for x < 0, a quartic
+// polynomial up to the width, and linear above.
 inline Hinge smoothed(Vec x, double width) {
     const Vec inside = smaller(larger(x, Vec{}), spread(width));
     const Vec share = inside * (1.0 / width);
@@ -297,7 +305,8 @@ inline Hinge smoothed(Vec x, double width) {
             square * (3.0 - 2.0 * share)};
 }
 
-// Cubic up to the width, then a far steeper cubic.
+// The penalty of an excess x at the catch, and its derivative `slope`: zero for x < 0, cubic up to
+// the width, and a far steeper cubic above.
 inline double steep(double x, double width, double& slope) {
     slope = 0.0;
     if (x <= 0.0) return 0.0;
@@ -310,7 +319,7 @@ inline double steep(double x, double width, double& slope) {
     return width * width * width + beyond * beyond * x * unit;
 }
 
-// The catch at the end of a plan.
+// The states of ball, quadrotor and net at the end of a plan, when the ball is caught.
 struct Catch {
     double ball_pos[3], ball_vel[3], ball_acc[3];
     double axis[3], inverse_thrust;  // of the quadrotor
@@ -335,7 +344,7 @@ inline Catch catch_at(const Spline& spline, const Case& task, const Point& x, do
     return found;
 }
 
-// The inputs of the spline's linear map.
+// Compute the columns, from which the spline is a linear map, from the variables and the end.
 inline void fill_columns(const Spline& spline, const Point& x, const double tail[3], double h,
                          double columns[kColumns][3]) {
     for (int i = 0; i < 3; ++i) {
@@ -347,7 +356,7 @@ inline void fill_columns(const Spline& spline, const Point& x, const double tail
     }
 }
 
-// The cost and its gradient with respect to the variables.
+// Return the cost at the variables x, and compute its gradient `slope`.
 double cost_of(const Spline& spline, const Case& task, const Point& x, Point& slope) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
     const double rate = 1.0 / h;
@@ -356,7 +365,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     fill_columns(spline, x, at_end.tail, h, columns);
     double by_h = 0.0, by_time = kTimeWeight, cost = kTimeWeight * duration;
 
-    // Penalties along the trajectory.
+    // Add the penalties of the limits along the trajectory.
     const double rates[4] = {1.0, rate, rate * rate, rate * rate * rate};
     Vec sums[kColumns][3] = {};
     Vec penalty{}, with_h{};
@@ -377,8 +386,8 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
         const Vec thrust2 = tx * tx + ty * ty + tz * tz;
         const Vec fast = v[0] * v[0] + v[1] * v[1] + v[2] * v[2] - kMostSpeed * kMostSpeed;
         const Vec low = (kLeastHeight - kHead[2]) - z;
-        // Bounds without root or division: while the thrust points up, the squared body rate is at
-        // most twice the squared ratio of jerk and thrust.
+        // These bounds need neither a root nor a division. While the thrust points up, the squared
+        // body rate is at most twice the squared ratio of jerk and thrust.
         const Vec inside = larger(larger(thrust2 - kMostThrust * kMostThrust,
                                          kLeastThrust * kLeastThrust - thrust2),
                                   larger(2.0 * jerk2 - kMostRate * kMostRate * thrust2, -tz));
@@ -404,14 +413,16 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
         const Vec weight = spline.weights[block];
         penalty += weight * (kLimitWeight * (speed.value + turn.value + push.value) +
                              kGroundWeight * ground.value);
-        // Slopes by height, velocity, acceleration and jerk, times the sample's weight and h.
+        // The following are derivatives of the penalties by height, velocity, acceleration and
+        // jerk, times the sample's weight and h.
         const Vec share = weight * (2.0 * kLimitWeight * h);
         const Vec by_speed = share * speed.slope, by_turn = share * turn.slope;
         const Vec by_push = share * push.slope * middle * inverse;
         const Vec by_low = weight * (-kGroundWeight * h) * ground.slope;
         const Vec by_twist = by_turn * twist * inverse_twist;
         const Vec turned = by_turn * inverse2;
-        // The twist's denominator is |tau|^2 + |tau| tau_z.
+        // The denominator of `twist`, the part of the body rate about the z axis, is
+        // |tau|^2 + |tau| tau_z, with the thrust tau.
         const Vec by_denominator = by_twist * twist;
         const Vec by_tau = by_push + turned * (along * along - tilt) -
                            by_denominator * (2.0 + tz * inverse);
@@ -449,7 +460,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
         by_h += spent - rate * total(with_h);
     }
 
-    // Energy.
+    // Add the snap energy.
     const double unit = rates[3] * rates[3] * rate;
     double energy = 0.0;
     for (int i = 0; i < 3; ++i) {
@@ -466,7 +477,7 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     cost += unit * energy;
     by_h -= kDegree * unit * energy * rate;
 
-    // The catch.
+    // Add the penalties of the net's distance from the ball and of its angle.
     double distance2 = 0.0, speed2 = 0.0, facing = 0.0;
     for (int i = 0; i < 3; ++i) {
         distance2 += at_end.miss[i] * at_end.miss[i];
@@ -484,7 +495,8 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     for (int i = 0; i < 3; ++i) {
         const double by_tail = by_columns[kInner][i], by_miss = by_distance * at_end.miss[i];
         by_pos[i] = by_tail + by_miss;
-        // Slope by the quadrotor's position at which the net's centre would meet the ball.
+        // This is the derivative by the position of the quadrotor for which the net's centre is at
+        // the ball.
         const double by_below = spline.relative ? by_tail : -by_miss;
         by_axis[i] = by_angle * at_end.ball_vel[i] - kNetHeight * by_below;
         leaning += by_axis[i] * at_end.axis[i];
@@ -508,8 +520,8 @@ double cost_of(const Spline& spline, const Case& task, const Point& x, Point& sl
     return cost;
 }
 
-// The initial guess: from rest to rest below the ball at the guessed time, with waypoints on the
-// minimum-jerk trajectory.
+// Return the initial guess: from standstill to standstill below the ball at the guessed time, with
+// waypoints on the minimum-jerk trajectory.
 Point guess_of(const Spline& spline, const Case& task) {
     Point x{};
     double ball[3], vel[3], acc[3];
@@ -534,12 +546,12 @@ Point guess_of(const Spline& spline, const Case& task) {
 }
 
 struct Settings {
-    int memory = 48;          // pairs of L-BFGS; 0 for the dense matrix of BFGS
+    int memory = 48;          // number of pairs that L-BFGS stores; 0 for BFGS
     int past = 10;            // iterations over which the cost is compared
     double delta = 1e-7;      // relative change of the cost that ends the search
     int most_steps = 1000;
-    double decrease = 1e-4, curvature = 0.9;  // of the weak Wolfe conditions
-    int relative = 0;         // 1: relative variables, see above
+    double decrease = 1e-4, curvature = 0.9;  // constants of the weak Wolfe conditions
+    int relative = 0;         // 1: variables relative to the smoothest trajectory and to the ball
     int interpolate = 0;      // 1: cubic interpolation within a bracket, 0: bisection
     double scale_q = 1.0, scale_t = 1.0, scale_p = 1.0, scale_v = 1.0, scale_a = 1.0;
     int repeats = 3;
@@ -551,7 +563,8 @@ struct Result {
     int iterations, evaluations;
 };
 
-// The search; one object is used for all cases, so that no case allocates memory.
+// The search of one plan by L-BFGS or BFGS. One object plans all cases, so that planning allocates
+// no memory.
 class Search {
   public:
     Search(const Spline& spline, const Settings& settings) : spline_(spline), given_(settings) {
@@ -620,7 +633,8 @@ class Search {
         return cost;
     }
 
-    // A weak Wolfe line search by Lewis and Overton; sets the new point and cost.
+    // Search along a direction for a step with the weak Wolfe conditions, by the method of Lewis
+    // and Overton. Sets the new point, its cost and its gradient.
     bool search(const Case& task, const Point& x, double& cost, const Point& g,
                 const Point& direction, double step, Point& x_new, Point& g_new) {
         const double slope = dot(g, direction), begun = cost;
@@ -660,7 +674,7 @@ class Search {
         return cost < begun;
     }
 
-    // The direction of L-BFGS, by the two-loop recursion over the pairs.
+    // Compute the search direction of L-BFGS, by the two-loop recursion over the stored pairs.
     void limited(const Point& s, const Point& y, double ys, bool curved, const Point& g,
                  Point& direction) {
         if (curved) {
@@ -686,7 +700,8 @@ class Search {
         }
     }
 
-    // The direction of BFGS with a dense matrix; `direction` holds the previous one, -H g.
+    // Compute the search direction -H g of BFGS with a dense matrix H. On entry, `direction` holds
+    // the previous search direction.
     void dense(const Point& s, const Point& y, double ys, bool curved, bool reset, const Point& g,
                const Point& g_new, Point& direction) {
         if (reset) {
@@ -726,7 +741,8 @@ class Search {
     int first_ = 0, count_ = 0, evaluations_ = 0;
 };
 
-// Return whether 200 samples keep the limits, and the catch is in the net, within five per cent.
+// Return whether the limits hold at 200 samples and the ball is in the net, with a tolerance of 5
+// %.
 bool succeeds(const Spline& spline, const Case& task, const Point& x) {
     const double duration = std::exp(x.at[kLogTime]), h = duration / kPieces;
     const Catch at_end = catch_at(spline, task, x, duration);
