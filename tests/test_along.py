@@ -76,7 +76,7 @@ def test_it_is_the_trapezoid_sum_of_the_hinges(float64):
 def test_slopes_and_curvature_are_those_of_finite_differences(float64):
     x = jax.tree.map(lambda x: x[1], cases(dtype=np.float64))
     step = 1e-5
-    for moving in ((True, False), (False, True), (True, True)):  # the unknowns, the parameters
+    for moving in ((True, False), (False, True), (True, True)):  # Move x, the parameters, both.
         direction = (
             jax.tree.map(
                 lambda leaf, m=moving[0]: m * np.cos(np.arange(leaf.size)).reshape(leaf.shape),
@@ -181,7 +181,7 @@ def reference(mode):
 @pytest.mark.parametrize(
     "mode",
     [
-        "greatest",  # by the kernel of peaks
+        "greatest",  # computed by the kernel of greatest excesses
         *(pytest.param(mode, marks=[pytest.mark.slow] * (k > 1)) for k, mode in enumerate(MODES)),
     ],
 )

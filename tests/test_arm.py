@@ -25,7 +25,7 @@ FILE = Path(planner_jax.robot.__file__).parent / "models" / "irb1600.xml"
 IRB1600 = FILE.read_text("utf-8")
 ASKEW = (Path(__file__).parent / "data" / "askew_arm.xml").read_text("utf-8")
 MODELS = {"irb1600": IRB1600, "askew": ASKEW}
-NUM = 200  # angles in the one program that most tests share
+NUM = 200  # Number of joint positions in the one compiled program that most tests use.
 CHAIN = np.array([[0.15, 0, 0.4865], [0, 0, 0.475], [0.3, 0, 0], [0.3, 0, 0], [0.065, 0, 0]])
 
 float64 = pytest.mark.usefixtures("float64")
@@ -270,7 +270,7 @@ def test_every_product_asks_for_full_precision():
 
 
 def test_the_regimes_differ_in_speed_acceleration_and_end():
-    speeds = [150.0, 160.0, 170.0, 320.0, 400.0, 450.0]  # [deg/s], of the datasheet
+    speeds = [150.0, 160.0, 170.0, 320.0, 400.0, 450.0]  # [deg/s], from the data sheet
     regimes = {"R1": (2.0, 60.0, False), "R2": (1.0, 30.0, True), "R3": (2.0, 60.0, True)}
     for name, (factor, acceleration, ends_at_rest) in regimes.items():
         limits = REGIMES[name].limits

@@ -140,10 +140,10 @@ def sum_of_hit(thrust_xz, ball_vel, xi):
 @pytest.mark.parametrize(
     ("xi", "ball_vel", "thrust"),
     [
-        ((0.0, 0.0, 3.0), (0.0, 0.0, -5.0), (4.0, 10.0)),  # straight above
+        ((0.0, 0.0, 3.0), (0.0, 0.0, -5.0), (4.0, 10.0)),  # The target is straight above.
         ((0.0, 0.0, -1.0), (0.0, 0.0, -5.0), (0.0, 10.0)),  # straight below, no tau_x
         ((3.0, 1.0, -1.0), (0.0, 0.0, -5.0), (0.0, 10.0)),
-        ((3.0, 1.0, -1.0), (-3.0, 0.0, -5.0), (-4.0, 10.0)),  # the racket faces away
+        ((3.0, 1.0, -1.0), (-3.0, 0.0, -5.0), (-4.0, 10.0)),  # The racket faces away.
         ((5.0, 1.0, 0.0), (5.0, 0.0, 0.0), (1e-3, 0.0)),
     ],
 )
@@ -234,7 +234,7 @@ def test_juggle_starts_at_rest_and_ends_in_its_fixed_stroke(cases, juggle_plans)
     acc = jax.vmap(lambda path, time: evaluate(path, time, 2))(
         juggle_plans.trajectory, juggle_plans.stroke.time
     )
-    np.testing.assert_allclose(acc[:, 2], 0.1 * GRAVITY, atol=2e-3)  # thrust less g
+    np.testing.assert_allclose(acc[:, 2], 0.1 * GRAVITY, atol=2e-3)  # The thrust is 1.1 g.
 
 
 @float64

@@ -21,7 +21,7 @@ from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
 from planner_jax.core.errors import ArgumentError
 
-NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not installed for tests
+NEEDS = {"oracle_hit": "casadi", "policy_peer": "stable_baselines3"}  # not installed for the tests
 BENCHMARKS = sorted(Path(benchmarks.__path__[0]).glob("*.py"))
 
 
@@ -166,7 +166,7 @@ def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():
 
 def test_a_yardstick_for_cases_of_another_class_is_none():
     cases = pj.hit.draw(2)
-    plans = pj.plan(pj.hit.planner("bat"), cases)  # shares the program of test_baselines
+    plans = pj.plan(pj.hit.planner("bat"), cases)  # test_baselines compiles it, too.
     assert cost_gaps(Half(), cases, plans, card=registry.task_named("intercept")) is None
 
 

@@ -127,7 +127,7 @@ def test_without_casadi_it_ends_with_the_line_that_installs_it(monkeypatch, caps
 @needs_casadi
 @pytest.mark.slow
 def test_a_run_has_a_row_for_every_setting_solver_and_effort(monkeypatch, tmp_path):
-    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)  # for this process
+    monkeypatch.setattr(os, "sched_setaffinity", lambda *_: None)  # Do not bind this process.
     few = {"num": 2, "tune": 2, "repeat": 1, "batch": 16, "tasks": "hit", "out": tmp_path / "run"}
     monkeypatch.setattr("sys.argv", ["ipopt", *(f"--{name}={few[name]}" for name in few)])
     ipopt.main()

@@ -73,9 +73,9 @@ def test_a_ball_gets_into_a_box_when_it_is_there(float64):
     assert entry((5.0, 0.2, 1.0), (-8.0, 0.0, 1.0)) == (pytest.approx(0.5), True)
     fall = pytest.approx(np.sqrt(4.0 / 9.81))
     assert entry((0.0, 0.0, 3.85), (0.0, 0.0, 0.0)) == (fall, True)
-    assert not entry((5.0, 3.0, 1.0), (-8.0, 0.0, 1.0))[1]  # passes by
-    assert not entry((5.0, 0.0, 1.0), (8.0, 0.0, 1.0))[1]  # goes away
-    assert not entry((5.0, 0.0, 0.1), (-8.0, 0.0, 0.0))[1]  # from below
+    assert not entry((5.0, 3.0, 1.0), (-8.0, 0.0, 1.0))[1]  # The ball passes the box.
+    assert not entry((5.0, 0.0, 1.0), (8.0, 0.0, 1.0))[1]  # The ball flies away.
+    assert not entry((5.0, 0.0, 0.1), (-8.0, 0.0, 0.0))[1]  # The ball comes from below.
 
 
 def test_steps_add_up_to_the_integral_of_rates():
@@ -158,7 +158,7 @@ def test_no_pose_is_freer_than_the_referee_says(float64):
     kinds = referee_clearances(leaves, arm.capsule_link, angles, np.ones((num, 1), bool))
     distances = np.array([kinds[kind][0] for kind in KINDS])
     theirs = distances.min(axis=0)
-    assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # tolerance of the referee
+    assert (theirs[least >= OnlineBlock().margin] > -1e-3).all()  # the referee's tolerance
     free = theirs > 0.01
     np.testing.assert_allclose(least[free], theirs[free], atol=6e-3)
     nearest = np.array([kinds[kind][2] for kind in KINDS])[distances.argmin(axis=0), np.arange(num)]
@@ -226,10 +226,10 @@ def test_claims_are_confirmed_by_the_referee():
 
 def test_plans_of_a_batch_say_what_became_of_each_ball():
     cases = jax.tree.map(np.array, pj.block.draw(8, seed=8, regime="R1", wide=True))
-    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.ball.vel[1, 0] *= -1.0  # The ball flies away from the arm.
     cases.ball.pos[2] = np.nan
-    cases.scene.floor[6] = 0.5  # above the shield
-    for box in (cases.scene.inner, cases.scene.outer):  # where the arm cannot reach
+    cases.scene.floor[6] = 0.5  # The floor is above the shield.
+    for box in (cases.scene.inner, cases.scene.outer):  # The arm cannot reach them.
         box.lower[7, 2] += 4.0
         box.upper[7, 2] += 4.0
     cases.ball.pos[7, 2] += 4.0

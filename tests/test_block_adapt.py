@@ -68,7 +68,7 @@ def test_the_cells_around_a_point_are_the_nearest_of_its_face():
         assert found and own in cells and len(set(cells.tolist())) == 4
         np.testing.assert_allclose(away, apart[cells], atol=1e-5)
         np.testing.assert_allclose(np.min(away), apart.min(), atol=1e-5)
-    (cells, _, found), _ = at(np.array([0.0, 0.3, 1.85]))  # on a face with one cell across
+    (cells, _, found), _ = at(np.array([0.0, 0.3, 1.85]))  # This face has one cell across.
     assert found and set(cells.tolist()) == {12 + 2, 12 + 3}
     assert not at(np.array([0.0, 1.0, 0.9]))[0][2]
 
@@ -131,11 +131,11 @@ def planned():
         scene=paper_scene(has_pole=False),
     )
     cases = jax.tree.map(np.array, cases)
-    cases.ball.vel[1, 0] *= -1.0  # flies away
+    cases.ball.vel[1, 0] *= -1.0  # The ball flies away from the arm.
     cases.ball.pos[2] = np.nan
-    cases.angles[3, 2] += 1e-2  # not at home
-    cases.limits.velocity[4] *= 0.5  # other limits
-    cases.rates[5, 0] = 0.1  # not at rest
+    cases.angles[3, 2] += 1e-2  # The arm is not at its home pose.
+    cases.limits.velocity[4] *= 0.5  # The limits differ from the library's.
+    cases.rates[5, 0] = 0.1  # The arm is not at rest.
     return own, cases, jax.device_get(pj.plan(own, jax.tree.map(jnp.asarray, cases)))
 
 

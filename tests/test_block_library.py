@@ -114,9 +114,9 @@ def test_a_point_of_a_cell_is_in_that_cell(name):
 def test_points_on_edges_are_in_exactly_one_cell():
     box = paper_scene().outer
     at = jax.jit(lambda point: cell_of(TINY.outer, box, tuple(point)))
-    assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # between two cells: the one with greater y
+    assert at(jnp.array([1.0, 0.0, 0.9])) == (2, True)  # On a common edge, greater y counts.
     assert at(jnp.array([1.0, 0.0, 0.9250001])) == (3, True)
-    assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # an edge: the face normal to x
+    assert at(jnp.array([1.0, 0.3, 1.85])) == (3, True)  # On a box edge, the x face counts.
     assert at(jnp.array([0.999, 0.3, 1.85])) == (5, True)
     assert at(jnp.array([1.0, 1.0, 0.1])) == (2, True)
     assert not at(jnp.array([0.3, 1.0, 0.1]))[1]  # no cells on +y
@@ -214,17 +214,17 @@ def test_statuses_name_the_reason_of_a_failure():
     good = ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8))
     shots = [
         good,
-        ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8), before=0.3),  # too soon
-        ball_through((1.0, 0.9, 1.2), (0.4, 0.05, 0.8)),  # beside the shield
+        ball_through((1.0, 0.05, 1.2), (0.4, 0.05, 0.8), before=0.3),  # The ball arrives too soon.
+        ball_through((1.0, 0.9, 1.2), (0.4, 0.05, 0.8)),  # The ball passes the shield.
         ball_through((0.1, 1.0, 1.2), (0.1, 0.4, 0.8)),  # no cells on +y
-        ball_through((0.45, 0.5, 1.85), (0.4, 0.3, 0.8)),  # the last pair, which has no motion
-        (good[0], -good[1]),  # flies away
-        good,  # not a number
+        ball_through((0.45, 0.5, 1.85), (0.4, 0.3, 0.8)),  # The last pair has no motion.
+        (good[0], -good[1]),  # The ball flies away from the arm.
+        good,  # A number is replaced by NaN below.
         good,
         good,
     ]
     angles = np.tile(irb1600().home, (len(shots), 1))
-    angles[7, 2] += 1e-2  # not at home
+    angles[7, 2] += 1e-2  # The arm is not at its home pose.
     cases = pj.block.case(*np.swapaxes(shots, 0, 1), angles=angles, anywhere=True)
     cases = jax.tree.map(np.array, cases)
     cases.ball.pos[6] = np.nan
@@ -294,7 +294,7 @@ def test_damaged_files_are_rejected_in_one_line(tmp_path, monkeypatch):
     rejects("is cut off$")
     path.write_bytes(whole.replace(b"library 1\n", b"library 9\n", 1))
     rejects("^library must be of version 1, got version 9 in")
-    at = whole.index(np.float32(0.806).tobytes())  # the pole
+    at = whole.index(np.float32(0.806).tobytes())  # byte position of the pole's x coordinate
     path.write_bytes(whole[:at] + np.float32(0.7).tobytes() + whole[at + 4 :])
     rejects("^library must have the setting [0-9a-f]{12}, got [0-9a-f]{12} in")
 
@@ -373,7 +373,7 @@ def test_a_repair_plans_only_motions_that_collide(counted, monkeypatch):
         return ~hit[library.found[0]]
 
     monkeypatch.setattr(building, "_is_free", is_free)
-    rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # the row length of the stub
+    rows = np.pad(library.table.rows, ((0, 0), (0, 0), (0, 36)))  # The stub's rows are as long.
     library = library_of(rows, library.table.homes, LAYOUTS["A"], library.setting)
     stored = property(lambda self: np.isfinite(self.table.rows[..., 6 * PIECES]))
     monkeypatch.setattr(type(library), "found", stored)
@@ -402,7 +402,7 @@ def test_a_home_in_collision_is_rejected(tmp_path):
     home[1] = 1.9
     with pytest.raises(ValueError, match="^homes must be free, got -.* m to .* at home 0$"):
         building.build(tmp_path / "a", setting(), home, TINY)
-    pole: Any = np.array([0.806, 0.1], np.float32)  # where the forearm is at home
+    pole: Any = np.array([0.806, 0.1], np.float32)  # The forearm is there at home.
     with pytest.raises(ValueError, match="^homes must be free"):
         building.repair(make_library(), dataclasses.replace(paper_scene(), pole=pole))
 

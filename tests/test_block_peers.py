@@ -75,7 +75,7 @@ def test_joints_arrive_together_at_rest_within_their_limits(stretch, float64):
         assert (np.abs(rates) <= LIMITS.velocity + 1e-6).all()
         assert (np.abs(accelerations) <= LIMITS.acceleration + 1e-6).all()
         steps = np.diff(angles, axis=0)
-        assert np.abs(steps).max() < 0.2  # no jump between pieces
+        assert np.abs(steps).max() < 0.2  # Pieces join without a jump.
 
 
 @jax.jit
@@ -140,7 +140,7 @@ def test_edges_are_free_if_all_their_samples_are():
     lines = case.angles + np.linspace(0.0, 1.0, 401)[:, None, None] * (ends - case.angles)
     exact = free.is_free(lines.reshape(-1, 6)).reshape(401, 30).all(axis=0)
     assert found[0] and 3 < found.sum() < 27
-    assert (found == exact).sum() >= 29  # an edge may touch an obstacle between its samples
+    assert (found == exact).sum() >= 29  # Edges are sampled only.
     coeffs = np.stack([np.broadcast_to(case.angles, ends.shape), ends - case.angles], axis=1)
     for k in range(30):
         assert free.is_motion_free(coeffs[k : k + 1], np.ones(1)) == found[k]
@@ -184,9 +184,9 @@ def test_paths_with_corners_are_timed_within_limits():
 
 def test_planners_on_the_host_report_why_there_is_no_plan():
     cases = jax.tree.map(np.array, pj.block.draw(5, "open", seed=8))
-    cases.scene.floor[0] = 0.5  # above the shield
+    cases.scene.floor[0] = 0.5  # The floor is above the shield.
     cases.ball.vel[1, 0] *= -1.0  # flies away
-    cases.rates[2] = 0.1  # moves already
+    cases.rates[2] = 0.1  # The arm moves already.
     cases.limits.acceleration[3] = 0.5
     cases.ball.pos[4] = np.nan
     plans = pj.plan(pj.block.planner("insat", **QUICK), jax.tree.map(jnp.asarray, cases))
@@ -262,4 +262,4 @@ def test_an_arm_at_the_contact_pose_stays(name):
     plans = pj.plan(pj.block.planner(name, **options), cases)
     verdict: Any = pj.block.judge(cases, plans)
     assert verdict.success.all(), verdict.sentence(0)
-    assert (plans.cost < 0.11).all()  # no spline is shorter than 0.1 s
+    assert (plans.cost < 0.11).all()  # The shortest spline takes 0.1 s.

@@ -160,7 +160,7 @@ def test_sweeps_report_observations_and_planning_times(tmp_path):
     assert 0.0 < sweep("seen", wide=True, perception=True)["fit_error_median"] < 0.3
     counted = sweep("counted", planning_budget=0.0)
     assert 0.0 < counted["planning_p50"] <= counted["planning_p99"]
-    assert sweep("late", planning_budget=5.0)["successes"] == 0  # the ball arrives earlier
+    assert sweep("late", planning_budget=5.0)["successes"] == 0  # The ball arrives earlier.
 
 
 def test_a_replanned_case_has_the_ball_of_the_original_case(cases):

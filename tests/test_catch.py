@@ -28,7 +28,7 @@ from tests.trees import assert_same
 
 PLANNER = ExactCatch(rounds=(Round(1, LbfgsConfig(max_steps=20)),))
 NUM = 8
-THROWS = NUM // 2  # lanes of one throw, whose second target is absent; the others have two
+THROWS = NUM // 2  # Number of cases with one ball, which come first. The others have two balls.
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +219,7 @@ def solve(starts, solver, *, settings=(), goals=()):
 def test_a_round_starts_where_its_last_stage_ended():
     early, late = solve(1, STAND, goals=(5.0,)), solve(1, STAND, goals=(5.0, 3.0))
     np.testing.assert_allclose([early.point[0], late.point[0]], [5.0, 3.0], atol=1e-3)
-    assert 0 < early.iterations < late.iterations  # iterations of stages count
+    assert 0 < early.iterations < late.iterations  # Iterations of stages count, too.
     # The reported costs are for the planner's own goal, not for the goals of the stages.
     np.testing.assert_allclose([early.cost, late.cost], [25.0, 9.0], atol=1e-2)
 

@@ -130,7 +130,7 @@ def test_every_target_stays_in_its_volume_and_comes_near_the_quadrotor(name):
 def test_swings_are_near_in_time():
     cases = draw_doubles("harmonic2")
     ball = states(cases.targets, until_horizon(cases, 141))
-    near = away(ball.pos)[..., 40:101]  # from 2 to 5 s
+    near = away(ball.pos)[..., 40:101]  # These samples are from 2 to 5 s.
     assert near.min(axis=-1).max() < 1.5 + 0.04
     assert not cases.targets.amplitude[..., :2].any()
 
@@ -158,7 +158,7 @@ def test_lines_are_a_triangle_at_angles_of_120_degrees_and_polygons_in_parallel(
             assert (np.abs(centre[..., :2]) <= 0.5 + 1e-9).all()
         else:
             assert 1.0 <= radius.min() and radius.max() <= 1.5
-            middle = np.abs(centre[:, 0, 24:37, :2])  # around 4 to 6 s
+            middle = np.abs(centre[:, 0, 24:37, :2])  # These samples are from 4 to 6 s.
             assert (middle.max(axis=-1).min(axis=-1) <= 0.5 + 0.08).all()
 
 
@@ -225,6 +225,6 @@ def test_the_earliest_throw_leaves_less_time_than_any_other_of_its_suite():
     many = draw(200, "throws", 3)
     assert horizon <= np.min(many.horizon) + 1e-3
     assert ball.vel[2] <= np.min(many.targets.ball.vel[..., 2]) + 1e-3
-    assert abs(ball.pos[1]) < 1e-6  # to the middle
+    assert abs(ball.pos[1]) < 1e-6  # It is aimed at the middle.
     with pytest.raises(ValueError, match="^suite must be one of single throws, got 'hexagon6'$"):
         earliest_throw("hexagon6")

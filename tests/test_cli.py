@@ -169,7 +169,7 @@ def test_help_names_the_defaults_and_loads_no_jax(task, parts):
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    said = " ".join(done.stdout.split())  # without the breaks of its lines
+    said = " ".join(done.stdout.split())  # Line breaks are removed.
     for part in parts:
         assert part in said
 

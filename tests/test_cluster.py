@@ -128,7 +128,7 @@ def ray(monkeypatch, request):
     told = ("RAY_USAGE_STATS_ENABLED", "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
     changed = ("XLA_PYTHON_CLIENT_PREALLOCATE", "XLA_CLIENT_MEM_FRACTION", "CUDA_VISIBLE_DEVICES")
     for name in ("NPROC", "PJRT_NPROC", *told, *changed):
-        monkeypatch.setenv(name, "1")  # restored later
+        monkeypatch.setenv(name, "1")  # The value is restored after the test.
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES")
     monkeypatch.setattr(run, "write_report", lambda folder: None)
     cluster._maker_of.cache_clear()
@@ -141,7 +141,7 @@ def ray(monkeypatch, request):
 
 def test_rows_are_those_of_a_plain_run_in_whatever_order_they_are_made(finished, out, ray):
     manifest = start(out)
-    assert ray.done == [3, 2, 1, 0, 4]  # two for each worker at the start
+    assert ray.done == [3, 2, 1, 0, 4]  # Each worker starts with two.
     assert rows_of(out) == rows_of(finished[0])
     assert manifest["run"] == finished[1]["run"]
     assert manifest["sessions"][0]["workers"] == "ray"
@@ -195,7 +195,7 @@ def test_a_run_begun_alone_is_finished_by_workers(finished, out, monkeypatch, ra
         with pytest.raises(SweepInterrupted):
             start_sweep(TASK, SETTINGS, out, progress=False)
     manifest = resume_sweep(TASK, out, progress=False, workers="ray", num=NUM)
-    assert sorted(ray.done) == [2, 3, 4]  # existing parts are not made again
+    assert sorted(ray.done) == [2, 3, 4]  # Existing parts are not planned again.
     assert rows_of(out) == rows_of(finished[0])
     assert [session.get("workers") for session in manifest["sessions"]] == [None, "ray"]
 
@@ -339,7 +339,7 @@ def test_a_run_with_a_real_cluster_survives_the_death_of_a_worker(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:os.fork.. was called:RuntimeWarning")  # JAX may run here
+@pytest.mark.filterwarnings("ignore:os.fork.. was called:RuntimeWarning")  # JAX may run.
 def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     tmp_path, monkeypatch
 ):
@@ -357,7 +357,7 @@ def test_workers_of_a_real_cluster_that_hold_shares_of_gpus_make_the_same_rows(
     command = [sys.executable, "-m", "planner_jax", "sweep", "hit", *options, str(plain)]
     subprocess.run(command, check=True, capture_output=True)
     monkeypatch.setattr(cluster, "require_backend", lambda: "gpu")
-    machine.threads_of_a_computation.cache_clear()  # this process plans nothing itself
+    machine.threads_of_a_computation.cache_clear()  # This process plans nothing itself.
     try:
         settings = HitSettings(num=32, batch=2, planner="juggle")
         start(out, settings)

@@ -31,7 +31,7 @@ from planner_jax.task.intercept.problem import MotionProblem
 from planner_jax.task.intercept.searches import Search
 from tests.trees import assert_same
 
-NUM = 6  # cases of a batch; no more than one bucket
+NUM = 6  # Number of cases in a batch, which fits into the smallest padded batch size.
 
 # The following classes define a task as a user would: approach a point in the plane.
 
@@ -248,7 +248,8 @@ def assert_close(ours, theirs, tolerance=1e-3):
     """
     np.testing.assert_array_equal(ours.status, theirs.status)
     for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))  # others must be equal
+        # NaN and infinity do not count for the tolerance; the assertion requires them to be equal.
+        size = np.max(np.abs(b), initial=1e-3, where=np.isfinite(b))
         np.testing.assert_allclose(a, b, rtol=0.0, atol=tolerance * size)
 
 
@@ -274,7 +275,7 @@ def test_a_nan_lane_says_so_and_leaves_its_neighbours_bits_alone(entry):
     status = pj.Status.BAD_INPUT if has_rules(broken) else pj.Status.NON_FINITE
     assert list(found.status[np.array([1, 3])]) == [status] * 2
     assert_same(found, entry.plans, [0, 2, 4, 5])
-    if has_rules(one):  # of arrays on the host the error names the leaf and the lane
+    if has_rules(one):  # For NumPy arrays the error names array and case.
         with pytest.raises(pj.CaseError, match=f"^{entry.broken}.* must be finite.*nan in lane 1"):
             pj.plan(entry.planner, one)
 
@@ -340,9 +341,9 @@ def traces(monkeypatch):
 
 @entries(on_host=False, slow=(*LIKE_OTHERS, "catch mpp"))
 def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
-    assert entry.plans is not None  # planned once
+    assert entry.plans is not None  # The batch is planned only once.
     found = traces(entry.planner.inner)
-    pj.plan(entry.planner, entry.cases(NUM + 3))  # jax arrays of another number
+    pj.plan(entry.planner, entry.cases(NUM + 3))  # JAX arrays, another batch size
     found.clear()
     pj.plan(entry.planner, entry.cases(NUM + 3))
     pj.plan(entry.planner, jax.tree.map(np.asarray, entry.cases(NUM + 2)))
@@ -429,7 +430,7 @@ def test_a_gradient_is_there_where_it_is_promised_and_refused_elsewhere(entry):
             pj.gradient(entry.planner, entry.batch, of="cost", by=entry.broken)
         return
     found = pj.gradient(entry.planner, entry.batch, **entry.gradient)
-    if not searches_first:  # the search continues from the plans
+    if not searches_first:  # The search continues from the old plans.
         assert (pj.are_solved(found.plans) | ~pj.are_solved(entry.plans)).all()
     there = np.isfinite(found.residual)
     assert found.residual.shape == found.value.shape == (NUM,)

@@ -75,7 +75,7 @@ def hanging(places, horizons):
     return pj.catch.case(targets, np.asarray(horizons, float), gravity=np.full(len(pos), 9.81))
 
 
-NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # targets of a quadrotor at (0, 0, 1)
+NEAR, FAR = (-1.0, 0.0, 1.2), (2.0, 0.0, 1.2)  # [m] Targets; the quadrotor starts at (0, 0, 1).
 
 
 @pytest.fixture(scope="module")
@@ -105,7 +105,7 @@ def test_greedy_catches_next_what_it_reaches_first(pairs):
     found = greedy(pairs)
     assert found.order.tolist() == [[1, 0], [0, 1], [1, 0], [1, 0], [1, 0]]
     assert shortfall(pairs, found)[0] == 0.0
-    assert shortfall(pairs, found)[1] > 0.1  # too late for the far one
+    assert shortfall(pairs, found)[1] > 0.1  # The far target is reached too late.
 
 
 def test_best_catches_first_what_is_due_first(pairs):
@@ -166,21 +166,21 @@ def test_absent_targets_come_last_and_change_nothing(triangles, decide):
     here = masks[np.arange(NUM)[:, None, None], order]
     assert (here == (np.arange(3) < masks.sum(axis=1)[:, None, None])).all()
     missing = shortfall(few, found)
-    np.testing.assert_array_equal(missing[0], 0.0)  # no target is present
+    np.testing.assert_array_equal(missing[0], 0.0)  # No target is present.
     whole = decide(triangles)
     pos = triangles.targets.ball.pos + jnp.where(masks[..., None], 0.0, jnp.nan)
     ball = triangles.targets.ball.replace(pos=pos)
     with_nan = dataclasses.replace(few, targets=triangles.targets.replace(ball=ball))
     assert_same(decide(with_nan), found, slice(1, None))
     np.testing.assert_array_equal(missing[1:], shortfall(with_nan, decide(with_nan))[1:])
-    assert whole.order.tolist()[-1] == found.order.tolist()[-1]  # where all are present
+    assert whole.order.tolist()[-1] == found.order.tolist()[-1]  # All targets are present.
 
 
 @pytest.mark.slow
 def test_plans_follow_the_decision_and_best_catches_both_in_time(pairs):
     plans = plan(by(Best()), pairs)
     proposed = best(pairs)
-    for k in range(5):  # a plan follows one of the choices, order and times together
+    for k in range(5):  # Each plan has order and times of one choice.
         place = proposed.order.tolist()[k].index(plans.order[k].tolist())
         np.testing.assert_array_equal(plans.decided_times[k], proposed.times[k, place])
     assert is_solved(plans.status[:2]).all()
@@ -245,7 +245,7 @@ def test_greedy_plans_have_the_order_of_the_estimate(pairs):
     np.testing.assert_array_equal(plans.order, decided.order)
     np.testing.assert_array_equal(plans.decided_times, decided.times)
     assert is_solved(plans.status[0])
-    assert not is_solved(plans.status[1:3]).any()  # due before, or too far
+    assert not is_solved(plans.status[1:3]).any()  # The target is due too soon, or too far away.
 
 
 def test_a_decision_sets_order_and_times_alone(triangles):

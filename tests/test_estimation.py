@@ -14,8 +14,8 @@ from planner_jax.ball.flight import BallState, fly, linear_drag_flight, rk4_step
 from planner_jax.sims.sensing import RlsState, rls_update
 
 NUM = 121
-PERIOD = 0.01  # [s]
-NOISE = 0.02  # [m]
+PERIOD = 0.01  # [s] Time between two observations.
+NOISE = 0.02  # [m] Standard deviation of each observed coordinate.
 
 # These functions are compiled once for all tests with equal shapes and types. Functions with "many"
 # in their names take a batch of balls.

@@ -71,7 +71,7 @@ def test_the_violation_of_a_plan_is_the_excess_that_the_referee_finds(cases):
     found = plan(FIRST_ROUND, cases.replace(limits=limits))
     verdict = referee_hits(cases.replace(limits=limits), found)
     excess = np.maximum(verdict.max_speed / limits.speed, verdict.max_body_rate / limits.body_rate)
-    assert (found.violation > excess - 1.0 - 5e-4).all()  # other limits may be nearer
+    assert (found.violation > excess - 1.0 - 5e-4).all()  # Other limits count, too.
     broken = found.violation > 0.0
     assert broken.sum() >= NUM // 3
     np.testing.assert_allclose(found.violation[broken], excess[broken] - 1.0, atol=5e-4)

@@ -38,7 +38,7 @@ def batch(robot):
     """Return a batch of three different plans for a robot, of which the last is not solved."""
     scale = lambda leaf: np.stack([leaf, leaf * 0.75, leaf * 0.5]).astype(leaf.dtype)  # noqa: E731
     plans = jax.tree.map(scale, PLANS[robot])
-    if robot == "quadrotor":  # gravity is the same for all plans of a run
+    if robot == "quadrotor":  # All plans of a run have the same gravity.
         plans = plans.replace(gravity=np.full(NUM, 9.81, np.float32))
     return plans.replace(status=np.array([0, 1, 2], np.int32))
 

@@ -41,7 +41,7 @@ def test_yaw_and_its_rate_are_those_of_the_nose_seen_from_above():
     yaw, rate = frames.yaw_of(found.quat_wxyz, found.body_rate)
     nose = matrices(found.quat_wxyz)[:, :, 0]
     np.testing.assert_allclose(yaw, np.arctan2(nose[:, 1], nose[:, 0]), atol=1e-6)
-    first = slice(1, 700)  # within the first piece
+    first = slice(1, 700)  # These samples are within the first piece.
     differences = (yaw[2:] - yaw[:-2]) * 2000.0
     assert np.abs(rate[first]).max() > 0.1
     np.testing.assert_allclose(differences[:699], rate[first], atol=0.05)

@@ -23,7 +23,7 @@ from tests.derivatives import assert_gradient_matches_differences
 # near the middles of its trajectories.
 FREE = pj.hit.ExactHit(learned=False)
 CATCH = pj.catch.planner("exact", decide="given")
-HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # one attempt: one program to compile
+HIT = FREE.with_settings((("rounds", FREE.rounds[1:2]),))  # One attempt needs one program.
 NUM, AT, FAR = 4, np.zeros(3), np.full((4, 3), 50.0)
 TRACES = []
 
@@ -175,7 +175,7 @@ def test_gradients_match_differences(extra, float64):
 
 def test_a_case_gives_its_extras_the_shape_of_the_batch():
     pos, vel, target = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
-    one = pj.Geofence((-1, -1, 0), (1, 1, 2))  # for one case, in a batch of three
+    one = pj.Geofence((-1, -1, 0), (1, 1, 2))  # One fence is for all three cases.
     many = pj.KeepOut(np.ones((3, 3)), np.ones(3))
     cases = pj.hit.case(pos, vel, target, extras=(one, many))
     assert [leaf.shape for leaf in jax.tree.leaves(cases.extras)] == [(3, 3), (3, 3), (3, 3), (3,)]
@@ -294,7 +294,7 @@ def test_the_referee_accepts_all_solved_plans_past_boxes(hits, middle):
     Plans pass close to the boxes' edges, where the distance is hard to sample.
     """
     random, num_solved = np.random.default_rng(2), 0
-    for _ in range(16):  # on some processors 8 of the first 32 cases are solved, on others more
+    for _ in range(16):  # On some processors only 8 of the first 32 cases are solved.
         half = random.uniform(0.1, 0.3, (NUM, 3))
         low = middle + random.normal(0.0, 0.08, (NUM, 3)) - half
         cases = having(hits, low=low, size=2.0 * half)
@@ -325,7 +325,7 @@ def test_a_users_class_is_planned_and_judged(hits, free):
     assert list(verdict.failed_limit) == ["extra", "", "", ""] and verdict.worst_extra[0] == 2
     verdict = pj.hit.judge(gentle, pj.plan(HIT, gentle))
     assert verdict.success.all(), verdict.sentence(0)
-    assert TRACES.count(True)  # by the referee
+    assert TRACES.count(True)  # The referee passes NumPy arrays.
 
 
 def test_a_cost_moves_the_trajectory(hits, free, middle):
@@ -375,7 +375,7 @@ def test_the_gradient_by_a_radius_matches_differences_of_plans(hits, float64):
         return pj.plan(long, cases.replace(extras=(zone, *cases.extras[1:]))).cost
 
     slopes = (costs(1e-4) - costs(-1e-4)) / 2e-4
-    assert slopes.min() > 1e-8  # every sphere is in the way
+    assert slopes.min() > 1e-8  # Every sphere obstructs its plan.
     np.testing.assert_allclose(found.by["extras.0.radius"], slopes, rtol=1e-3)
 
 
