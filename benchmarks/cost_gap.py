@@ -78,9 +78,9 @@ def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:
-    """Return the median, 90 % and 99 % quantile of the results of `cost_gaps`, by name.
+    """Return the median, 90 % and 99 % quantile of relative cost gaps, by name.
 
-    The values are None if there are no gaps.
+    The gaps are one or more results of `cost_gaps`. The quantiles are None if there are no gaps.
     """
     together = np.concatenate([np.zeros(0), *(each for each in gaps if each is not None)])
     names = ("cost_gap_median", "cost_gap_p90", "cost_gap_p99")

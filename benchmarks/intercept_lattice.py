@@ -307,9 +307,10 @@ class Lattice:
         ]
 
     def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
-        """Return states that meet the target at a layer, at most one per speed level and heading.
+        """Return reached states that meet the target after `layer` layers of time.
 
-        A state is (bit of the cell, index of the speed level, index of the heading).
+        A state is (bit of the cell, index of the speed level, index of the heading). There is at
+        most one for each speed level and heading.
         """
         goal = self._goal(layer)
         found = [

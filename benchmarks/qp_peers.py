@@ -115,7 +115,7 @@ def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
 
 
 def _equality_values(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
-    """Return the right-hand sides of all equalities: the given ones, then zeros."""
+    """Return the right-hand sides of a program's equalities: `right_side`, then zeros."""
     return np.concatenate([np.asarray(right_side, float), np.zeros(len(matrices["zeros"]))])
 
 

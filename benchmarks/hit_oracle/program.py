@@ -28,7 +28,8 @@ STATE_SCALE, SNAP_SCALE = np.array([1.0, 3.0, 10.0, 60.0]), 600.0
 LEAST_THRUST = 1.0
 GUESSED_EXCESS = 0.5  # Initial guess of the greatest relative excess over a limit.
 
-# Names of the program's parameters, which are numbers of the case in SI units -> count of numbers.
+# Names of the program's parameters, and of how many numbers each consists. They describe a case, in
+# SI units.
 PARAMETERS = {
     "ball": 3 * (BALL_DEGREE + 1),  # position = sum_k ball[k] (t / landing_time)^k
     "landing_time": 1,

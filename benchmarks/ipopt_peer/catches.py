@@ -11,7 +11,7 @@ from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 
 RIM = 0.9  # A planned catch is within this share of the net's radius from its centre.
 
-# Names of a catch's parameters, in SI units -> count of numbers.
+# Names of a catch's parameters in SI units, and of how many numbers each consists.
 SIZES = {
     "gravity": 1,
     "speed": 1,

@@ -9,7 +9,7 @@ import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
-# Names of a hit's parameters, in SI units -> count of numbers.
+# Names of a hit's parameters in SI units, and of how many numbers each consists.
 SIZES = {
     "gravity": 1,
     "speed": 1,
