@@ -163,7 +163,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
         shown = jnp.concatenate([shown[1:], after.pose[None]])
-        believed = jnp.concatenate([believed[1:] + correction, next_pose[None]])
+        believed = jnp.concatenate([believed[1:] + correction[None], next_pose[None]])
         worst = jnp.where(counts, jnp.maximum(worst, off), worst)
         squared = squared + jnp.where(counts, off * span, 0.0)
         saturated = saturated + jnp.where(counts, over * span, 0.0)

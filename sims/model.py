@@ -149,7 +149,9 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
         ctrl=controls,
         qfrc_applied=jnp.concatenate([forces, drags]),
     )
-    data = mjx.step(model, data)
+    # MJX combines arrays of different ranks.
+    with jax.numpy_rank_promotion("allow"):
+        data = mjx.step(model, data)
     return Physics(qpos=data.qpos, qvel=data.qvel, act=data.act)
 
 

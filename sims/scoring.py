@@ -87,14 +87,18 @@ def passage(
 
     def gap(at: Moment) -> Array:
         """Return the height (N,) [m] of the balls over the disc's plane."""
-        return jnp.sum((at.ball_pos - at.robot_pos) * at.normal, axis=1) - world.carrier.tool.height
+        height = jnp.sum((at.ball_pos - at.robot_pos[None]) * at.normal[None], axis=1)
+        return height - world.carrier.tool.height
 
     start, end = gap(before), gap(after)
     passes = (start > 0.0) & (end <= 0.0)
     share = start / jnp.where(passes, start - end, 1.0)
 
     def at_share(share: Array) -> Moment:
-        return jax.tree.map(lambda a, b: a + share[:, None] * (b - a), before, after)
+        def blend(a: Array, b: Array) -> Array:
+            return a.reshape(-1, 3) + share[:, None] * (b - a).reshape(-1, 3)
+
+        return jax.tree.map(blend, before, after)
 
     at, moving = at_share(share), at_share(share + 0.5)  # leaves (N, 3)
     normal = at.normal / jnp.sqrt(jnp.maximum(jnp.sum(at.normal**2, axis=1, keepdims=True), 1e-12))

@@ -50,14 +50,23 @@ def float64():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def strict_types(request):
-    """In default runs raise where JAX would convert a type, except in modules with MJX or Brax."""
-    stem, marks = request.path.stem.removeprefix("test_"), request.config.option.markexpr
-    is_strict = "not slow" in marks and not stem.startswith("sims_") and stem not in MIXED
-    usual = jax.config.jax_numpy_dtype_promotion
-    jax.config.update("jax_numpy_dtype_promotion", "strict" if is_strict else usual)
+def strict_arrays(request):
+    """Raise in default runs where JAX would add axes or convert a type to combine arrays.
+
+    Types are converted in modules with MJX or Brax.
+    """
+    stem = request.path.stem.removeprefix("test_")
+    options = {"jax_numpy_rank_promotion": "raise"}
+    if not stem.startswith("sims_") and stem not in MIXED:
+        options["jax_numpy_dtype_promotion"] = "strict"
+    if "not slow" not in request.config.option.markexpr:
+        options = {}
+    usual = {name: getattr(jax.config, name) for name in options}
+    for name, value in options.items():
+        jax.config.update(name, value)
     yield
-    jax.config.update("jax_numpy_dtype_promotion", usual)
+    for name, value in usual.items():
+        jax.config.update(name, value)
 
 
 @pytest.fixture(scope="module")

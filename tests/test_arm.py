@@ -63,7 +63,7 @@ def everything_at(arm, angles, velocity, acceleration):
     rotation, middle = shield_pose(arm, angles)
     branches, found = inverse_kinematics(arm, rotation, middle)
     turned, place = jax.vmap(lambda q: shield_pose(arm, q))(branches)
-    turned_off, place_off = jnp.abs(turned - rotation), jnp.abs(place - middle)
+    turned_off, place_off = jnp.abs(turned - rotation[None]), jnp.abs(place - middle[None])
     off = jnp.maximum(jnp.max(turned_off, axis=(1, 2)), jnp.max(place_off, axis=1))
     torques = inverse_dynamics(arm, angles, velocity, acceleration)
     frames, pose = link_frames(arm, angles), (rotation, middle)

@@ -38,7 +38,7 @@ def states(targets, times):
 
 
 def until_horizon(cases, num=60):
-    return cases.horizon[..., None] * jnp.linspace(0.0, 1.0, num)
+    return cases.horizon[..., None] * jnp.linspace(0.0, 1.0, num)[None, None]
 
 
 def draw_doubles(name, num=NUM, seed=3):

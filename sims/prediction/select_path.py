@@ -248,7 +248,7 @@ def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
     ahead, aside = ahead - among.lever[:, 0], aside - among.lever[:, 1]
     x, y = among.velocity[:, 0], among.velocity[:, 1]
     way = jnp.stack([x * ahead - y * aside, x * aside + y * ahead], axis=-1)
-    offset = among.centre - prediction.path.at(time).pos[None] + way
+    offset = (among.centre - prediction.path.at(time).pos)[None] + way
     return offset, among.velocity_variance * (ahead**2 + aside**2)
 
 

@@ -49,7 +49,7 @@ def tyre_forces(
     along = cos * vel[0] + sin * vel[1]
     own = jnp.stack([along, cos * vel[1] - sin * vel[0], vel[2]])
     pull = jnp.stack([drive + coupling * vel[2] ** 2, jnp.zeros((), dtype), jnp.zeros((), dtype)])
-    free = own + timestep * jnp.sum(inverse * pull, axis=1)
+    free = own + timestep * jnp.sum(inverse * pull[None], axis=1)
     # Lateral directions of both axles in the middle of the step, in the car's frame at its start.
     half = 0.5 * timestep * vel[2]
     zero, one = jnp.zeros((), dtype), jnp.ones((), dtype)
@@ -60,13 +60,13 @@ def tyre_forces(
             jnp.stack([-jnp.sin(front), jnp.cos(front), wheelbase * jnp.cos(steering) * one]),
         ]
     )
-    slip = jnp.sum(rows * free, axis=1)
+    slip = jnp.sum(rows * free[None], axis=1)
     tyres, loads = vehicle.tyres, jnp.asarray(vehicle.loads, dtype)
     give = jnp.zeros_like(loads)  # [m/(s N)], lateral slip velocity per force, of each axle
     if tyres is not None:
         give = jnp.maximum(jnp.abs(along), _STANDING) / (tyres.stiffness * loads)
-    moved = jnp.sum(rows[:, None, :] * inverse, axis=2)  # J M^-1, (2, 3)
-    matrix = timestep * jnp.sum(moved[:, None, :] * rows, axis=2) + jnp.diag(give)
+    moved = jnp.sum(rows[:, None, :] * inverse[None], axis=2)  # J M^-1, (2, 3)
+    matrix = timestep * jnp.sum(moved[:, None, :] * rows[None], axis=2) + jnp.diag(give)
     a, c, d = matrix[0, 0], matrix[0, 1], matrix[1, 1]
     solved = jnp.stack([d * slip[0] - c * slip[1], a * slip[1] - c * slip[0]])
     force = -solved / (a * d - c * c)
