@@ -17,6 +17,7 @@ from planner_jax.robot.quadrotor import (
     net_thrust,
     tangent_basis,
 )
+from planner_jax.runs.timing import CompileClock
 
 GRAVITY = 9.81
 UP = np.array([0.0, 0.0, 1.0])
@@ -214,6 +215,18 @@ def test_each_plan_of_a_batch_is_sampled_up_to_its_own_end():
             assert leaf.shape[:2] == (2, 17)
             assert np.isfinite(leaf[k, :num]).all() and np.isnan(leaf[k, num:]).all()
             np.testing.assert_allclose(getattr(alone, name), leaf[k, :num], rtol=1e-6, atol=1e-6)
+
+
+def test_other_lengths_rates_and_batches_compile_nothing():
+    curve(0).sample(20.0), batch(curve(0), curve(1)).sample(20.0)
+    with CompileClock() as clock:
+        for k in range(80):
+            assert curve(0, 0.5 + 0.01 * k).sample(10.0 * (k + 1)).time.size > 1
+        many = batch(*(curve(k, 0.5 + 0.01 * k) for k in range(70))).sample(100.0)
+    assert not clock.compiled
+    last = curve(69, 1.19).sample(100.0)
+    assert many.pos.shape == (70, last.time.size, 3)
+    np.testing.assert_allclose(last.pos, many.pos[69], rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("rate", [10.0, 60.0, 100.0, 1000.0])

@@ -14,6 +14,9 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
 _MOST = 10**8  # greatest number of setpoints that one call may compute
+# Numbers of plans and of times that one compiled call evaluates, for one plan and for a batch. They
+# are constants, so that another number of plans or of times compiles nothing.
+_ONE, _BATCH = (1, 1024), (64, 64)
 TreeT = TypeVar("TreeT")
 
 
@@ -42,8 +45,7 @@ def sample_at_rate(
     """
     require_number("rate", rate, POSITIVE)
     ends, leaves = np.asarray(ends), jax.tree.map(np.asarray, leaves)
-    is_one = ends.ndim == 0
-    if is_one:
+    if is_one := ends.ndim == 0:
         ends, leaves = ends[None], jax.tree.map(lambda leaf: leaf[None], leaves)
     last = np.nanmax(ends, initial=0.0)
     if last * rate * ends.size > _MOST:
@@ -51,11 +53,32 @@ def sample_at_rate(
         rule = f"at most {most:.3g} for {ends.size} plans of up to {last:.3g} s"
         raise ArgumentError("rate", rule, rate)
     times = np.arange(int(last * rate * (1.0 + 1e-6)) + 1) / rate
-    setpoints = jax.tree.map(np.array, _sample(leaves, times.astype(ends.dtype), setpoint_at))
+    setpoints = _in_tiles(leaves, times.astype(ends.dtype), setpoint_at, _ONE if is_one else _BATCH)
     past = ~(times <= ends[:, None] * (1.0 + 1e-6))
     for leaf in setpoints.values():
         leaf[past] = np.nan
     return {"time": times} | {n: leaf[0] if is_one else leaf for n, leaf in setpoints.items()}
+
+
+def _in_tiles(
+    leaves: TreeT, times: np.ndarray, setpoint_at: Callable, tile: tuple[int, int]
+) -> dict[str, np.ndarray]:
+    """Evaluate B plans at K times, in calls for `tile` plans and times: arrays (B, K, ...).
+
+    The last plan and the last time fill up calls at the ends of the batch and of the times.
+    """
+    num, found = jax.tree.leaves(leaves)[0].shape[0], {}
+    for i in range(0, num, tile[0]):
+        plans = np.minimum(np.arange(i, i + tile[0]), num - 1)
+        some = jax.tree.map(lambda leaf: leaf[plans], leaves)  # noqa: B023
+        for k in range(0, times.size, tile[1]):
+            at = times[np.minimum(np.arange(k, k + tile[1]), times.size - 1)]
+            for name, part in _sample(some, at, setpoint_at).items():
+                if name not in found:
+                    found[name] = np.empty((num, times.size, *part.shape[2:]), part.dtype)
+                place = found[name][i : i + tile[0], k : k + tile[1]]
+                place[:] = np.asarray(part)[: place.shape[0], : place.shape[1]]
+    return found
 
 
 @functools.partial(jax.jit, static_argnames="setpoint_at")
