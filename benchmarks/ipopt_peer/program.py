@@ -18,7 +18,6 @@ expression graph would be about a hundred times larger, and IPOPT slower.
 """
 
 import dataclasses
-import importlib
 import subprocess
 import tempfile
 from collections.abc import Callable
@@ -27,13 +26,9 @@ from typing import Any
 
 import numpy as np
 
+from planner_jax.benchmarks.ipopt_peer.basis import ORDERS, PLACES, Basis, ca
 from planner_jax.cost.penalty import join_trapezoid_weights
 
-ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extra `oracle`.
-
-ORDERS = 4  # Number of boundary conditions at each end: position, velocity, acceleration and jerk.
-# Components of a sample as (order of the derivative, axis): height, velocity, acceleration, jerk.
-PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
 COMPILER = ("cc", "-O3", "-march=native", "-ffast-math", "-fPIC", "-shared")
 
 
@@ -88,6 +83,21 @@ def body_axes(axis: Any) -> tuple[Any, Any]:
     return ca.vertcat(1.0 - k * x * x, -k * x * y, -x), ca.vertcat(-k * x * y, 1.0 - k * y * y, -y)
 
 
+def compile_functions(functions: list) -> list:
+    """Generate C code of all functions, compile it, and load the compiled functions.
+
+    The temporary files are deleted, because the loaded library does not need them.
+    """
+    code = ca.CodeGenerator("program.c")
+    for function in functions:
+        code.add(function)
+    with tempfile.TemporaryDirectory(prefix="ipopt-") as folder:
+        source, library = Path(folder, "program.c"), Path(folder, "program.so")
+        code.generate(f"{folder}/")
+        subprocess.run([*COMPILER, str(source), "-o", str(library)], check=True)
+        return [ca.external(function.name(), str(library)) for function in functions]
+
+
 class Program:
     """The nonlinear program of a problem with its derivatives, built once for all cases.
 
@@ -104,19 +114,18 @@ class Program:
         planner = problem.planner
         self.problem, self.penalised, self.backoff = problem, penalised, backoff
         self._maps = planner.maps
-        self._matrices = [ca.DM(self._maps.sample_matrix(planner.nodes, d)) for d in range(ORDERS)]
+        self._basis = Basis(planner)
         weights = join_trapezoid_weights(planner.nodes, self._maps.proportions)
         self._weights, self.num_samples = ca.DM(weights).T, len(weights)
         self.num_params = sum(problem.sizes.values())
         self._power = 2 * self._maps.order - 1
         self._own = planner.energy_weight * self._maps.offset_energy
-        self._lay_out()
         self._build_ends()
         self._build_limits()
         self.worst = self._worst()
         self.functions = [self._nlp(), self._gradient(), self._jacobian(), self._hessian()]
         if compiled:
-            self.functions = self._compile()
+            self.functions = compile_functions(self.functions)
 
     def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
         """Return a function that runs IPOPT from an initial guess (n,) with parameters (P,).
@@ -146,23 +155,6 @@ class Program:
         """Split a vector of parameters into a dict of parameters by name."""
         ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
-
-    def _lay_out(self) -> None:
-        """Define the order of the trajectory's coefficients.
-
-        Coefficients are ordered by axis; for each axis the boundary conditions come before the
-        offsets. In x the offsets are ordered by waypoint. Coefficients that are variables of x, the
-        offsets, are called outer. Boundary conditions, which depend on x through the function of
-        the end, are called inner, and h follows them.
-        """
-        planner, rows = self.problem.planner, 2 * ORDERS
-        inside = planner.num_pieces - 1
-        self._num_columns = rows + inside
-        self._outer = [a * self._num_columns + rows + i for a in range(3) for i in range(inside)]
-        self._inner = [a * self._num_columns + i for a in range(3) for i in range(rows)]
-        order = [3 * i + axis for axis in range(3) for i in range(inside)]
-        self._place = np.argsort(order).tolist()
-        self._scale = ca.DM(planner.scale).T
 
     def _build_ends(self) -> None:
         """Build the function of the end's variables, its Jacobian, and its weighted Hessian.
@@ -240,42 +232,29 @@ class Program:
         The parts are the unscaled variables of the end, and the waypoint offsets (M - 1, 3).
         """
         num = self.problem.planner.num_offsets
-        x, params = ca.MX.sym("x", self._scale.numel()), ca.MX.sym("params", self.num_params)
-        natural = x * self._scale.T
+        scale = self._basis.scale
+        x, params = ca.MX.sym("x", scale.numel()), ca.MX.sym("params", self.num_params)
+        natural = x * scale.T
         return x, params, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
-
-    def _columns(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
-        """Return the trajectory's coefficients (C, 3), and the mean duration h of a piece [s]."""
-        rows = 2 * ORDERS
-        columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
-        return columns, outward[3 * rows]
 
     def _offset_energy(self, offsets: Any, h: Any) -> Any:
         """Return the weighted snap energy of the offsets, which adds to the smoothest energy."""
         return self._own * ca.sumsqr(offsets) / h**self._power
 
-    def _to_x(self, by_outer: Any, by_natural: Any) -> Any:
-        """Convert derivatives by offsets, ordered by axis, and by the end's variables.
-
-        Returns derivatives by x, (R, n).
-        """
-        wide = ca.horzcat(by_outer[:, self._place], by_natural)
-        return wide * ca.repmat(self._scale, wide.shape[0], 1)
-
     def _worst(self) -> Any:
         """Build a function of x that returns the largest excess over a limit on the trajectory."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends = self._ends(natural, params)
-        columns, h = self._columns(outward, offsets)
-        limits = self._limits(self._unit(columns), h, params)
+        columns, h = self._basis.join(outward, offsets)
+        limits = self._limits(self._basis.sample(columns), h, params)
         return ca.Function("worst", [x, params], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
 
     def _nlp(self) -> Any:
         """Build the objective and the constraints: each limit at all samples, then at the end."""
         x, params, natural, offsets = self._point()
         outward, core, at_ends = self._ends(natural, params)
-        columns, h = self._columns(outward, offsets)
-        values = self._values(self._unit(columns), h, params)
+        columns, h = self._basis.join(outward, offsets)
+        values = self._values(self._basis.sample(columns), h, params)
         f, g = core + self._offset_energy(offsets, h), ca.MX(0, 1)
         if self.penalised:
             f = f + ca.sum2(values * self._weights)
@@ -287,37 +266,39 @@ class Program:
         """Build the objective and its gradient with respect to x."""
         x, params, natural, offsets = self._point()
         outward, core, _, by_natural = self._ends_slopes(natural, params)
-        columns, h = self._columns(outward, offsets)
-        energy, num_in = self._offset_energy(offsets, h), len(self._inner) + 1
+        columns, h = self._basis.join(outward, offsets)
+        energy, num_in = self._offset_energy(offsets, h), len(self._basis.inner) + 1
         f = core + energy
         by_outer = 2.0 * self._own / h**self._power * ca.vec(offsets).T
-        by_inner, by_h = ca.MX.zeros(1, len(self._inner)), -self._power * energy / h
+        by_inner, by_h = ca.MX.zeros(1, len(self._basis.inner)), -self._power * energy / h
         if self.penalised:
-            unit = self._unit(columns)
+            unit = self._basis.sample(columns)
             f = f + ca.sum2(self._values(unit, h, params) * self._weights)
             of_samples, _ = self._bends(unit, h, params, self._weights)
-            by_columns = self._columns_of(of_samples)
-            by_outer, by_inner = by_outer + by_columns[:, self._outer], by_columns[:, self._inner]
+            by_columns = self._basis.gradient(of_samples)
+            by_outer = by_outer + by_columns[:, self._basis.outer]
+            by_inner = by_columns[:, self._basis.inner]
             by_h = by_h + ca.sum2(of_samples[len(PLACES), :])
         inward = ca.horzcat(by_inner, by_h) @ by_natural[:num_in, :] + by_natural[num_in, :]
-        gradient = self._to_x(by_outer, inward).T
+        gradient = self._basis.to_x(by_outer, inward).T
         return ca.Function("gradient", [x, params], [f, gradient], ["x", "p"], ["f", "grad_f_x"])
 
     def _jacobian(self) -> Any:
         """Build the constraints and their Jacobian with respect to x."""
         x, params, natural, offsets = self._point()
         outward, _, at_ends, by_natural = self._ends_slopes(natural, params)
-        columns, h = self._columns(outward, offsets)
-        values, slopes = self._slopes(self._unit(columns), h, params)
+        columns, h = self._basis.join(outward, offsets)
+        values, slopes = self._slopes(self._basis.sample(columns), h, params)
         g, jacobian = ca.MX(0, 1), ca.MX(0, x.numel())
         if not self.penalised:
-            num_in, blocks = len(self._inner) + 1, []
+            num_in, blocks = len(self._basis.inner) + 1, []
             for limit in range(self._num_values):
-                by_columns, by_h = self._slopes_of(limit, slopes)
-                inward = ca.horzcat(by_columns[:, self._inner], by_h) @ by_natural[:num_in, :]
-                blocks.append(self._to_x(by_columns[:, self._outer], inward))
-            none = ca.MX.zeros(self._num_at_ends, len(self._outer))
-            blocks.append(self._to_x(none, by_natural[num_in + 1 :, :]))
+                by_columns, by_h = self._basis.limit_slopes(limit, slopes, self._slope_places)
+                by_inner = ca.horzcat(by_columns[:, self._basis.inner], by_h)
+                inward = by_inner @ by_natural[:num_in, :]
+                blocks.append(self._basis.to_x(by_columns[:, self._basis.outer], inward))
+            none = ca.MX.zeros(self._num_at_ends, len(self._basis.outer))
+            blocks.append(self._basis.to_x(none, by_natural[num_in + 1 :, :]))
             g, jacobian = ca.vertcat(ca.vec(values.T), at_ends), ca.vertcat(*blocks)
         return ca.Function("jacobian", [x, params], [g, jacobian], ["x", "p"], ["g", "jac_g_x"])
 
@@ -326,97 +307,37 @@ class Program:
         x, params, natural, offsets = self._point()
         of_f, of_g = ca.MX.sym("of_f"), ca.MX.sym("of_g", self.num_constraints)
         outward, _, _, by_natural = self._ends_slopes(natural, params)
-        columns, h = self._columns(outward, offsets)
+        columns, h = self._basis.join(outward, offsets)
         if self.penalised:
             multipliers, at_ends = of_f * self._weights, ca.MX.zeros(self._num_at_ends, 1)
         else:
             count = self._num_values * self.num_samples
             multipliers = ca.reshape(of_g[:count], self.num_samples, self._num_values).T
             at_ends = of_g[count:]
-        of_samples, bends = self._bends(self._unit(columns), h, params, multipliers)
-        by_columns, full = self._columns_of(of_samples), self._hessian_of_columns(bends)
+        of_samples, bends = self._bends(self._basis.sample(columns), h, params, multipliers)
+        by_columns = self._basis.gradient(of_samples)
+        full = self._basis.hessian(bends, self._bend_places)
         # The blocks below are sums of derivatives of the limits and of the offsets' snap energy.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
-        num_out, num_in = len(self._outer), len(self._inner) + 1
-        inner = [*self._inner, 3 * self._num_columns]
-        of_outer = full[self._outer, self._outer] + bend * ca.MX.eye(num_out)
+        outer, place = self._basis.outer, self._basis.place
+        inner = [*self._basis.inner, 3 * self._basis.num]
+        num_out, num_in = len(outer), len(inner)
+        of_outer = full[outer, outer] + bend * ca.MX.eye(num_out)
         with_h = -power * bend / h * ca.vec(offsets)
-        mixed = full[self._outer, inner]
+        mixed = full[outer, inner]
         mixed = mixed + ca.horzcat(ca.MX.zeros(num_out, num_in - 1), with_h)
         of_h = ca.diagcat(ca.MX.zeros(num_in - 1, num_in - 1), power * (power + 1) * energy / h**2)
         of_inner = full[inner, inner] + of_h
         by_h = ca.sum2(of_samples[len(PLACES), :]) - power * energy / h
-        weights = ca.vertcat(by_columns[:, self._inner].T, by_h, of_f, at_ends)
+        weights = ca.vertcat(by_columns[:, self._basis.inner].T, by_h, of_f, at_ends)
         chain = by_natural[:num_in, :]
         of_natural = chain.T @ of_inner @ chain + self._ends_bend(natural, params, weights)
-        mixed = (mixed @ chain)[self._place, :]
+        mixed = (mixed @ chain)[place, :]
         hessian = ca.vertcat(
-            ca.horzcat(of_outer[self._place, self._place], mixed),
+            ca.horzcat(of_outer[place, place], mixed),
             ca.horzcat(mixed.T, of_natural),
         )
-        hessian = ca.triu(hessian * (self._scale.T @ self._scale))
+        hessian = ca.triu(hessian * (self._basis.scale.T @ self._basis.scale))
         names = ["x", "p", "lam_f", "lam_g"]
         return ca.Function("hessian", [x, params, of_f, of_g], [hessian], names, ["hess"])
-
-    def _slopes_of(self, value: int, slopes: Any) -> tuple[Any, Any]:
-        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and h (K, 1)."""
-        parts = [ca.MX.zeros(self.num_samples, self._num_columns)] * 3
-        by_h = ca.MX.zeros(self.num_samples, 1)
-        for k, (i, j) in enumerate(self._slope_places):
-            if i == value and j == len(PLACES):
-                by_h = by_h + slopes[k, :].T
-            elif i == value:
-                order, axis = PLACES[j]
-                factor = ca.repmat(slopes[k, :].T, 1, self._num_columns)
-                parts[axis] = parts[axis] + factor * self._matrices[order]
-        return ca.horzcat(*parts), by_h
-
-    def _unit(self, columns: Any) -> Any:
-        """Return the components (10, K) of K samples in units of h, from coefficients (C, 3)."""
-        sampled = [matrix @ columns for matrix in self._matrices]
-        return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
-
-    def _columns_of(self, of_samples: Any) -> Any:
-        """Convert derivatives by samples (11, K) to derivatives by coefficients (1, 3 C)."""
-        parts = [ca.MX.zeros(1, self._num_columns)] * 3
-        for i, (order, axis) in enumerate(PLACES):
-            parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
-        return ca.horzcat(*parts)
-
-    def _hessian_of_columns(self, bends: Any) -> Any:
-        """Convert the samples' Hessians to one by coefficients and h, (3 C + 1, 3 C + 1)."""
-        last, num = len(PLACES), self._num_columns
-        factors = {place: bends[k, :].T for k, place in enumerate(self._bend_places)}
-        sizes = (num, num, num, 1)
-        blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # The loops are ordered such that each product with a sample matrix is computed only once.
-        for i, (order, axis) in enumerate(PLACES):
-            inside: dict[int, Any] = {}
-            for j, (other, of) in enumerate(PLACES):
-                factor = factors.get((min(i, j), max(i, j)))
-                if factor is not None and of >= axis:
-                    part = ca.repmat(factor, 1, num) * self._matrices[other]
-                    inside[of] = inside[of] + part if of in inside else part
-            for of, part in inside.items():
-                blocks[axis][of] = blocks[axis][of] + self._matrices[order].T @ part
-            if (i, last) in factors:
-                blocks[axis][3] = blocks[axis][3] + self._matrices[order].T @ factors[i, last]
-        if (last, last) in factors:
-            blocks[3][3] = ca.sum1(factors[last, last])
-        lower = lambda a, b: blocks[a][b] if a <= b else blocks[b][a].T  # noqa: E731
-        return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
-
-    def _compile(self) -> list:
-        """Generate C code of all functions, compile it, and load the compiled functions.
-
-        The temporary files are deleted, because the loaded library does not need them.
-        """
-        code = ca.CodeGenerator("program.c")
-        for function in self.functions:
-            code.add(function)
-        with tempfile.TemporaryDirectory(prefix="ipopt-") as folder:
-            source, library = Path(folder, "program.c"), Path(folder, "program.so")
-            code.generate(f"{folder}/")
-            subprocess.run([*COMPILER, str(source), "-o", str(library)], check=True)
-            return [ca.external(function.name(), str(library)) for function in self.functions]

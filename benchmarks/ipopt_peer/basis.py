@@ -1,0 +1,103 @@
+"""The coefficients of one minimum-snap trajectory, with the chain rule through its samples.
+
+`program.py` builds IPOPT's nonlinear program on these functions: they convert derivatives by the
+samples of a trajectory to derivatives by its coefficients, and these to derivatives by x.
+"""
+
+import importlib
+from typing import Any
+
+import numpy as np
+
+ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extra `oracle`.
+
+ORDERS = 4  # Number of boundary conditions at each end: position, velocity, acceleration and jerk.
+# Components of a sample as (order of the derivative, axis): height, velocity, acceleration, jerk.
+PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
+Places = list[tuple[int, int]]  # indices (row, column) of the entries of a sparse matrix
+
+
+class Basis:
+    """Linear maps from the coefficients of a trajectory, (C, 3), to its samples and to x.
+
+    Coefficients are ordered by axis; for each axis the boundary conditions come before the
+    offsets. In x the offsets are ordered by waypoint. Coefficients that are variables of x, the
+    offsets, are called outer. Boundary conditions, which depend on x through the function of
+    the end, are called inner, and h, the mean duration of a piece, follows them.
+
+    Args:
+        planner: the `ExactHit` or `ExactCatch` whose settings and constant matrices are used.
+    """
+
+    def __init__(self, planner: Any):
+        rows, inside = 2 * ORDERS, planner.num_pieces - 1
+        matrices = [planner.maps.sample_matrix(planner.nodes, d) for d in range(ORDERS)]
+        self._matrices, self._num_samples = [ca.DM(m) for m in matrices], len(matrices[0])
+        self.num = rows + inside
+        self.outer = [a * self.num + rows + i for a in range(3) for i in range(inside)]
+        self.inner = [a * self.num + i for a in range(3) for i in range(rows)]
+        order = [3 * i + axis for axis in range(3) for i in range(inside)]
+        self.place = np.argsort(order).tolist()
+        self.scale = ca.DM(planner.scale).T
+
+    def join(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
+        """Return the trajectory's coefficients (C, 3), and the mean duration h of a piece [s]."""
+        rows = 2 * ORDERS
+        columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
+        return columns, outward[3 * rows]
+
+    def sample(self, columns: Any) -> Any:
+        """Return the components (10, K) of K samples in units of h, from coefficients (C, 3)."""
+        sampled = [matrix @ columns for matrix in self._matrices]
+        return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
+
+    def to_x(self, by_outer: Any, by_natural: Any) -> Any:
+        """Convert derivatives by offsets, ordered by axis, and by the end's variables.
+
+        Returns derivatives by x, (R, n).
+        """
+        wide = ca.horzcat(by_outer[:, self.place], by_natural)
+        return wide * ca.repmat(self.scale, wide.shape[0], 1)
+
+    def limit_slopes(self, value: int, slopes: Any, places: Places) -> tuple[Any, Any]:
+        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and h (K, 1)."""
+        parts = [ca.MX.zeros(self._num_samples, self.num)] * 3
+        by_h = ca.MX.zeros(self._num_samples, 1)
+        for k, (i, j) in enumerate(places):
+            if i == value and j == len(PLACES):
+                by_h = by_h + slopes[k, :].T
+            elif i == value:
+                order, axis = PLACES[j]
+                factor = ca.repmat(slopes[k, :].T, 1, self.num)
+                parts[axis] = parts[axis] + factor * self._matrices[order]
+        return ca.horzcat(*parts), by_h
+
+    def gradient(self, of_samples: Any) -> Any:
+        """Convert derivatives by samples (11, K) to derivatives by coefficients (1, 3 C)."""
+        parts = [ca.MX.zeros(1, self.num)] * 3
+        for i, (order, axis) in enumerate(PLACES):
+            parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
+        return ca.horzcat(*parts)
+
+    def hessian(self, bends: Any, places: Places) -> Any:
+        """Convert the samples' Hessians to one by coefficients and h, (3 C + 1, 3 C + 1)."""
+        last, num = len(PLACES), self.num
+        factors = {place: bends[k, :].T for k, place in enumerate(places)}
+        sizes = (num, num, num, 1)
+        blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
+        # The loops are ordered such that each product with a sample matrix is computed only once.
+        for i, (order, axis) in enumerate(PLACES):
+            inside: dict[int, Any] = {}
+            for j, (other, of) in enumerate(PLACES):
+                factor = factors.get((min(i, j), max(i, j)))
+                if factor is not None and of >= axis:
+                    part = ca.repmat(factor, 1, num) * self._matrices[other]
+                    inside[of] = inside[of] + part if of in inside else part
+            for of, part in inside.items():
+                blocks[axis][of] = blocks[axis][of] + self._matrices[order].T @ part
+            if (i, last) in factors:
+                blocks[axis][3] = blocks[axis][3] + self._matrices[order].T @ factors[i, last]
+        if (last, last) in factors:
+            blocks[3][3] = ca.sum1(factors[last, last])
+        lower = lambda a, b: blocks[a][b] if a <= b else blocks[b][a].T  # noqa: E731
+        return ca.vertcat(*(ca.horzcat(*(lower(a, b) for b in range(4))) for a in range(4)))
