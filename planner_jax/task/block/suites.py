@@ -1,18 +1,6 @@
-"""Named, seeded suites of thrown balls for the task `block`.
+"""Named, seeded suites of thrown balls for the task `block` [Natarajan2024, Section V-A].
 
-The 200 throws of [Natarajan2024, Section V-A] start at 6 to 12 m and enter both boxes of the scene,
-the outer and the protected inner box. The paper states no other range. This library defines the
-ranges, here and in `planner_jax.task.block.spec`. The ranges of a suite never change; other ranges
-need another name. All distributions are uniform.
-
-| quantity | range |
-|---|---|
-| launch | azimuth -60 to 60 degrees from the x axis, the suite's distance, height -0.48 to 1 m |
-| aim | a point on a side +x, +y or -y of the inner box that faces the launch |
-| flight time to the aim | distance divided by 7 to 10 m/s |
-
-A throw is drawn again until the ball, of 0.05 m radius, enters the outer box through a side or the
-top, and then the inner box, without touching the pole. Robot base frame, z up, SI units.
+`docs/suites.md` states the ranges of all suites. Robot base frame, z up, SI units.
 """
 
 import jax.numpy as jnp

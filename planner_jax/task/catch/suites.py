@@ -1,63 +1,6 @@
 """Named, seeded suites of catch cases: the throws and the simulations of [Yu2023catch].
 
-The paper names its cases (Sections VII-A and VII-B, Table III) without the ranges from which it
-draws them. The ranges below are chosen such that no case is easier than the paper reports.
-
-All quantities are uniformly distributed. World frame, z up, SI units. At time 0 the quadrotor
-hovers at (0, 0, 1).
-
-Throws: a machine at (4, 0, 0.8) throws a ball, which lands in a rectangle around the origin.
-Landing point and flight time determine the ball's velocity. The ball may be caught until it falls
-below 0.45 m. This is the height of the net if an upright quadrotor is at its least height, 0.25 m.
-
-| suite | drag [1/s] | landing [m x m] | flight [s] | launch before time 0 [s] |
-|---|---|---|---|---|
-| throws | 0.5 | 2 x 0.8 | 1.4 to 1.78 | 0.3 |
-| hard | 0.5 | 4 x 3 | 1.4 to 1.78 | 0.5 |
-| parabola1 | 0 | 2 x 0.8 | 1.4 to 2 | 0.3 |
-| parabola2, ball 1 | 0 | 2 x 0.8 | 1.4 to 1.6 | 0.3 |
-| parabola2, ball 2 | 0 | 2 x 0.8 | 1.7 to 2 | 0 |
-
-With drag, the longest flight, 1.78 s, has its apex at 4.2 m, the height of the paper's hall; the
-paper allows 1.9 s. The shortest flight has its apex at 2.7 m; the paper first detects balls above
-2.8 m. From time 0, at most 1.48 s remain for a catch, and 1.6 s in the paper. For balls without
-drag the paper allows any height.
-
-All other targets pass near the vertical axis through the origin and stay within a cylinder around
-this axis until their horizon, the latest time of a catch. The radius of the cylinder is given.
-
-| suite | horizontal speed [m/s] | height [m] | horizon [s] | radius [m] |
-|---|---|---|---|---|
-| harmonic2 | 1 to 1.5 | 1 to 3.5 | 7 | 9 |
-| triangle3 | 1 to 1.5 | 1.5 to 2.5 | 6 | 7.3 |
-| square4, pentagon5, hexagon6, heptagon7 | 1 to 1.5 | 1.5 to 2.5 | 10 | 11.3 |
-
-- harmonic2: two targets at a height of 2 to 2.5 m plus an oscillation of 0.6 to 1 m at 1.5 to
-  2.5 rad/s. Each drifts in its own direction and is within 1.5 m of the axis after 2 to 5 s.
-- triangle3: three targets at the corners of an equilateral triangle, 3 to 4 m from its centre. Each
-  flies along a side, all with the same speed, height and sense of rotation. They are closest to
-  each other after 1.7 to 3.5 s. The centre is within 0.5 m of the axis in x and in y.
-- hexagon6 and the other polygons: targets at the corners of a regular polygon, 1 to 1.5 m from its
-  centre, all with the same velocity. The centre is within 0.5 m of the axis in x and in y after 4
-  to 6 s.
-
-The targets of triangles and polygons fly horizontally. At every catch the net must therefore lean
-by at least 90 degrees less theta_safe, that is 60 degrees.
-
-Rushes: targets of `triangle3` and `hexagon6` with different horizons. The targets are put into a
-random order. The first horizon is `first`, and each following horizon is `after` later. A uniform
-random number from -spread / 2 to spread / 2 is added to every horizon. The target that can be
-caught first is often not the most urgent target.
-
-| suite | targets of | first [s] | after [s] | spread [s] |
-|---|---|---|---|---|
-| rush3 | triangle3 | 2.35 | 0.9 | 0.5 |
-| rush6 | hexagon6 | 3.8 | 0.9 | 0.6 |
-
-Swarms (`swarm8`, `swarm12`): balls that sink at constant speed, more than can be caught. A plan may
-leave balls out, and the score is the number of caught balls. Each ball starts within 6 m of the
-axis at a height of 2 to 6 m, sinks at 0.4 to 2 m/s, drifts horizontally at up to 0.3 m/s, and may
-be caught until it falls below 0.45 m.
+`docs/suites.md` states the ranges of all suites. World frame, z up, SI units.
 """
 
 import dataclasses

@@ -1,10 +1,6 @@
 """Named, seeded suites of groups: several targets for one car among walls and movers.
 
-No paper defines these suites. Start, walls, movers and one target are drawn as in
-`planner_jax.task.intercept.suites`, for the time before which all targets must be met. Then the
-number of targets and the further targets are drawn. A target is drawn again as long as a cause of
-rejection in that module applies. All targets therefore stay on the map and off the walls up to that
-time. World frame in the plane, SI units.
+`docs/suites.md` states how they are drawn. World frame in the plane, SI units.
 """
 
 import dataclasses

@@ -1,32 +1,6 @@
 """Named, seeded suites of interceptions on a map of 8 m x 8 m.
 
-[Qu2022] shows one map (Section V) and states no ranges. This library defines the ranges, here and
-in `planner_jax.task.intercept.spec`. The ranges of a suite never change; other ranges need another
-name. All distributions are uniform. The car is the default of `case`. SI units.
-
-| quantity | range |
-|---|---|
-| start | x 0.8 m, y 1 to 7 m, heading 0, 0.5 m/s |
-| target | 0.2 to 0.5 m/s in any direction; half of them turn, at 0.03 to 0.1 rad/s |
-| meeting point | anywhere at least 0.3 m inside the map; in a maze behind its first wall |
-| walls | 3 to 6 corners on a circle of 0.2 to 0.8 m anywhere on the map |
-| movers | 4 to 6 corners on a circle of 0.2 to 0.4 m, 0.1 to 0.6 m/s (`storm`: 0.2 to 1 m/s) |
-
-A mover, that is a moving obstacle, obstructs a car that drives straight from the start to the
-meeting point at constant speed: at 0.2 to 0.8 of the meeting time both are at the same point. The
-mover crosses there in any direction.
-
-A maze has walls of 0.2 m across the whole map, each with a gap of 0.7 to 1.1 m. Two arms of 0.5
-to 0.8 m on the side of the start, 0.8 to 1.4 m apart, make a dead end where the straight line to
-the meeting point runs into a wall, or at the nearest position that leaves the gap open. Walls less
-than 2.5 m from the map's edge have no arms, so that the car has space to turn at the start.
-
-The suite `rush` has the distributions of `hard` and its own seed. The meeting is not at 10 s, but
-0.5 s after the earliest arrival that a coarse reach set predicts (`searches.earliest_arrival`, in
-double precision). The meeting time therefore differs from case to case.
-
-Whether the target turns, and the numbers of walls and movers, are drawn once for each case. All
-other quantities are drawn again until no cause of rejection (`_APPLIES`) applies.
+`docs/suites.md` and `planner_jax.task.intercept.spec` state the ranges of all suites. SI units.
 
 In this module, draws are dictionaries of arrays with leading axis B:
 
