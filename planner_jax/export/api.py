@@ -1,7 +1,6 @@
 """Export of one plan to a controller: `export` writes a file, and `stream` sends it to a UDP port.
 
-The module that writes a format is imported only when the format is requested, since it may need an
-optional package.
+A format's module is imported when it is requested, since it may need an optional package.
 """
 
 import dataclasses

@@ -1,9 +1,7 @@
 """Plans for the high-level commander of a Crazyflie quadrotor: polynomials of degree 7.
 
-The Crazyflie's memory holds 132 bytes for each piece: eight coefficients each of x, y, z [m] and
-yaw [rad], the constant first, then the duration [s], all little-endian float32. The Crazyflie and
-this library use the same frame, z up, and time starts at zero in each piece. The plan's numbers are
-therefore written unchanged.
+The memory holds 132 bytes for each piece: eight coefficients each of x, y, z [m] and yaw [rad], the
+constant first, then the duration [s], all little-endian float32. The frame is the library's, z up.
 """
 
 from typing import BinaryIO

@@ -40,10 +40,7 @@ _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
 
 
 def write(plan: Plan, rate: float, file: BinaryIO) -> None:
-    """Write the setpoints of a plan at `rate` [Hz], in the units and frames of `plan.sample`.
-
-    Numbers are written with enough digits to restore the same floating-point number.
-    """
+    """Write the setpoints of a plan at `rate` [Hz], in the units and frames of `plan.sample`."""
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
     header = [f"{name} [{unit}]" for _, names, unit in columns for name in names]

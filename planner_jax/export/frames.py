@@ -12,17 +12,14 @@ import numpy as np
 
 
 def to_ned(vectors: np.ndarray) -> np.ndarray:
-    """Convert vectors (..., 3) from ENU to NED: (x, y, z) -> (y, x, -z).
-
-    The conversion is its own inverse, is exact, and applies to positions and all derivatives.
-    """
+    """Convert vectors (..., 3) from ENU to NED or back: (x, y, z) -> (y, x, -z)."""
     return np.stack([vectors[..., 1], vectors[..., 0], -vectors[..., 2]], axis=-1)
 
 
 def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
-    """Convert a yaw counter-clockwise from east to a yaw clockwise from north, in [-pi, pi) [rad].
+    """Convert a yaw counter-clockwise from east to a yaw clockwise from north, or back, [rad].
 
-    The conversion is its own inverse. The rate of the yaw only changes its sign.
+    The result is in [-pi, pi). The rate of the yaw only changes its sign.
     """
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 

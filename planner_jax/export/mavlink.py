@@ -22,8 +22,6 @@ _NO_FIELD_IGNORED = 0  # type mask of a message in which every field is valid
 def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
     """Yield for each setpoint its time [us] since the plan's start, and its MAVLink 2 packet.
 
-    A packet has position, velocity, acceleration, yaw and yaw rate of `trajectory_setpoints`.
-
     Raises:
         ArgumentError: the plan cannot be exported, or the rate is out of its range.
     """
@@ -47,10 +45,7 @@ def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
 
 
 def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
-    """Write a telemetry log of a plan at `rate` [Hz].
-
-    Before each packet are eight bytes, big-endian: its time [us] since the start of the plan.
-    """
+    """Write a telemetry log of a plan at `rate` [Hz]: the time [us, 8 bytes] and each packet."""
     for stamp, packet in packets(plan, rate):
         file.write(struct.pack(">Q", stamp) + packet)
 

@@ -1,7 +1,6 @@
-"""Export of plans as MCAP files, which ROS 2's recorder rosbag2 reads and plays.
+"""Export of plans as MCAP files (profile ros2, messages in CDR encoding) for ROS 2's rosbag2.
 
-The files have the profile ros2, schemas ros2msg and messages in CDR encoding. Times of messages
-count from the start of the plan.
+Times of messages count from the start of the plan.
 """
 
 from typing import BinaryIO

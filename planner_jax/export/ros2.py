@@ -1,8 +1,7 @@
 """Export of plans for ROS 2: one message of the package `trajectory_msgs` with all setpoints.
 
-World frame ENU and body frame FLU (REP 103), which this library uses too. In the message a
-quadrotor or a car is one joint with six degrees of freedom, whose linear and angular velocities are
-in the world frame. An arm has six joints.
+World frame ENU and body frame FLU (REP 103). A quadrotor or a car is one joint with six degrees of
+freedom, whose velocities are in the world frame. An arm has six joints.
 """
 
 import pkgutil

@@ -62,8 +62,7 @@ def robot_of(plan: Plan) -> Robot:
     """Return the entry of `ROBOTS` for one plan, and check that the plan can be exported.
 
     Raises:
-        ArgumentError: the object is not a plan of a robot, is a batch, is not solved, has arrays of
-            a wrong shape, or has no duration.
+        ArgumentError: the object is not one solved plan of a robot, or its arrays are wrong.
     """
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
@@ -142,7 +141,7 @@ def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
 def load_plan(path: str | os.PathLike, row: int | None = None) -> Plan:
     """Load one plan from a file that `plan.save` wrote.
 
-    The result is the plan of a robot, such as `CarPlan`, without the fields that a task adds.
+    The result is a robot's plan, such as `CarPlan`, without the fields that a task adds.
 
     Args:
         path: path of the file.

@@ -1,7 +1,4 @@
-"""Live planning for one robot: it receives observations of a ball and answers with setpoints (UDP).
-
-A program sends packets with measured positions; the command `planner-jax serve` answers them.
-"""
+"""Live planning for one robot: `planner-jax serve` answers measurements with setpoints (UDP)."""
 
 import lazy_loader
 

@@ -1,9 +1,9 @@
 """Checks which received packets live planning may use.
 
-A packet is used once, and only in the order of sending. All senders must use one common clock. Its
-offset to the clock of this process is arbitrary. A packet whose sending time disagrees with earlier
-packets by more than a second is ignored. If no packet has been used for a second, such a packet is
-accepted as the first packet of a new clock.
+A packet is used once, and only in the order of sending. All senders use one common clock, with any
+offset to the clock of this process. A packet whose sending time disagrees with earlier packets by
+more than a second is ignored. If no packet was used for a second, such a packet is the first one of
+a new clock.
 """
 
 import math

@@ -1,8 +1,7 @@
 """Packet format of live planning (`planner-jax serve`): little-endian, packed, with a version.
 
-A request has a header, and either an observation of a ball or a state of the robot. An answer has a
-header that repeats the request's ball, sequence number and time. Then follow a description and K
-setpoints. `docs/live.md` has a table of all fields.
+A request has a header, and an observation of a ball or a state of the robot. An answer has a header
+that repeats the request's, a description and K setpoints. `docs/live.md` lists all fields.
 """
 
 import dataclasses

@@ -1,10 +1,9 @@
 """Live planning without the socket: a packet with a measurement in, a packet with setpoints out.
 
-The robot always follows a course, a trajectory that ends at standstill. The first course leads from
-the robot's first reported state to standstill. Later courses are plans that meet the ball, each
-followed by a recovery trajectory to standstill. An answer has the next setpoints of the course.
-Planning runs in a separate thread, and an answer waits for a new plan only for a fraction of the
-deadline.
+The robot always follows a course, a trajectory that ends at standstill: at first from its first
+reported state, later a plan that meets the ball, with a recovery trajectory. An answer has the next
+setpoints. Planning runs in a separate thread. An answer waits for a new plan only for a fraction of
+the deadline.
 """
 
 import concurrent.futures
@@ -138,10 +137,9 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.begin()
 
     def answer(self, data: bytes, sender: Hashable, received: float) -> bytes | None:
-        """Use the measurement in a packet, and return the packet of the answer.
+        """Use the measurement in a packet; return the answer's packet, None if it is unreadable.
 
-        Returns None if the packet cannot be read. The arrival time `received` [s] is measured by
-        `time.perf_counter()`.
+        `received` [s] is the arrival time by `time.perf_counter()`.
         """
         self._complete()
         report = self.report
@@ -278,10 +276,10 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery trajectory from the current plan's end to standstill.
+        """Plan the recovery from the plan's end; if there is none, return to the previous course.
 
-        If none keeps the limits, return to the previous course. To save time, this is called after
-        an answer is sent, unless the answer's setpoints reach beyond the contact.
+        To save time, this is called after an answer is sent, unless its setpoints go beyond the
+        contact.
         """
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:

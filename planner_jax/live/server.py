@@ -61,8 +61,8 @@ class Server:
     def _receive(self) -> tuple[bytes, tuple[str, int], float]:
         """Return the next packet, its sender, and its arrival time by `time.perf_counter()`.
 
-        The packet may have arrived before this call, while the server was computing an answer. The
-        arrival time is therefore computed from the time stamp of the operating system.
+        The arrival time is from the time stamp of the operating system, since the packet may have
+        waited.
         """
         data, others, _, sender = self._socket.recvmsg(LONGEST, socket.CMSG_SPACE(_STAMP.size))
         now, received = time.time(), time.perf_counter()
@@ -107,7 +107,7 @@ class Server:
 def compute_in_place() -> None:
     """Let JAX run CPU computations in the calling thread; call this before any computation.
 
-    By default JAX dispatches a computation to another thread. For the small computations of live
-    planning the dispatch takes longer than the computation.
+    By default JAX passes a computation to another thread, which takes longer than small
+    computations.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)

@@ -126,10 +126,9 @@ class _Pair:
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
-    """Return the rotations of links 1 to 6 and the positions [m] of their joints.
+    """Return links' rotations to the base frame, and joints' positions [m], for links 1 to 6.
 
-    The joint angles are (6, B, S) [rad]. Rotations are (3, 3, B, S), from link to base frame, and
-    positions (3, B, S).
+    Joint angles are (6, B, S) [rad], rotations (3, 3, B, S), and positions (3, B, S).
     """
     turn, position = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
     turns, positions = [], []
@@ -159,7 +158,7 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
     The distance of overlapping solids is minus the penetration depth. If one solid is a capsule,
     the depth is at most its radius, and for two capsules at most the sum of both radii. Distances
-    are exact. Bounding spheres exclude samples that cannot have the least distance.
+    at samples are exact.
 
     Args:
         case: arrays of B cases.
@@ -168,8 +167,8 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
         sampled: (B, S) bool, samples to evaluate, at least one in each motion.
 
     Returns:
-        By kind, the least distance (B,) [m], infinite without an obstacle; its sample (B,); and
-        the name (B,) of the part of the arm.
+        By kind, the least distance (B,) [m], infinite without an obstacle; its sample (B,); and the
+        name (B,) of the part of the arm.
     """
     capsules, shield = _arm(case, links, angles)
     moving = [each for each in capsules if each.link != _BASE]
@@ -212,9 +211,8 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
 def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
     """Return the capsules of links 2 to 4 for the test against the shield.
 
-    Link 4 is wider than thick, and the shield approaches only its narrow sides. A capsule with the
-    width of link 4 would overlap the shield at any angle of joint 5. The capsule's radius is
-    therefore reduced until it only touches the shield when all joint angles are 0.
+    Link 4 is wider than thick, and the shield approaches only its narrow sides. The radius of its
+    capsule is therefore reduced until it only touches the shield when all joint angles are 0.
     """
     num_lanes = len(case["arm.shield_half"])
     straight, shield = _arm(case, links, np.zeros((6, num_lanes, 1)))

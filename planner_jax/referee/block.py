@@ -1,10 +1,9 @@
 """Float64 NumPy referee of blocks: decides by kinematics whether a plan succeeds.
 
-A block stops a thrown ball with a shield on a six-axis arm. The referee compares the joints'
-polynomials with their limits at their extrema, measures the clearance of arm and shield at samples,
-and computes the ball's parabola [Natarajan2024, eqs 5 to 7]. It reads the plan's motion and contact
-time, and ignores its status and cost. It shares no code with the planners. Robot base frame, z up,
-SI units. Times count from the first observation of the ball.
+A block stops a thrown ball with a shield on a six-axis arm. The referee reads the plan's motion and
+contact time, and ignores its status and cost. It shares no code with the planners. The ball's
+parabola is [Natarajan2024, eqs 5 to 7]. Robot base frame, z up, SI units. Times count from the
+first observation of the ball.
 """
 
 import dataclasses
@@ -80,8 +79,8 @@ class BlockVerdict(Verdict):
     """Verdict on B plans in which an arm blocks a ball with its shield.
 
     Measurements are NaN where the inputs are not finite or the plan's times are wrong. A clearance
-    is the least distance of solids over the samples. It is minus the penetration depth if they
-    overlap (at most a capsule's radius), and infinite without an obstacle.
+    is the least distance of solids over the samples: negative if they overlap, and infinite without
+    an obstacle.
     """
 
     SENTENCES = _SENTENCES
@@ -117,8 +116,7 @@ def referee_blocks(
     """Decide for every plan of a batch of blocks whether it succeeds.
 
     Angles, rates and accelerations are compared with their limits at the ends of each piece and at
-    their extrema inside. An extremum is a root of the next derivative. Bisection finds the roots
-    between the extrema of that derivative, recursively from the constant derivative down.
+    their extrema inside.
 
     Clearances are computed at the ends of the pieces and at samples between them. Samples are at
     most `LONGEST_STEP` and `LARGEST_TURN` apart, but not closer than 0.17 ms. At samples the
@@ -129,8 +127,8 @@ def referee_blocks(
 
     Args:
         cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
-        plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients
-            (B, M, D + 1, 6), durations (B, M).
+        plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients (B,
+            M, D + 1, 6), durations (B, M).
         tolerance: relative tolerance of velocities, accelerations, the case's offset and its tilt;
             absolute tolerance of the start and of jumps between pieces [rad], [rad/s], and of joint
             angles beyond their limits [rad].
@@ -235,10 +233,9 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return angles, rates and accelerations at their extrema and at the ends of the pieces.
+    """Return angles, rates and accelerations at their K extrema and at the ends of the pieces.
 
-    Each of these three quantities is a pair of values and times [s] since the piece's start, both
-    (K, 6, B, M), for K extrema and ends of 6 joints. K differs among the quantities.
+    Each quantity is a pair of values and times [s] since the piece's start, both (K, 6, B, M).
     """
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
@@ -268,10 +265,10 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test start, continuity and joint limits of a motion.
+    """Test a motion's start, continuity and joint limits.
 
-    Returns measurements, tests (failed, excess, time) by name, and by test the joint (B,) str with
-    the greatest excess.
+    Returns measurements, tests (failed, excess, time) by name, and by test the worst joint (B,)
+    str.
     """
     tests, parts, measured = {}, {}, {}
 
@@ -311,11 +308,7 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
-    """Return the joint angles (6, B) [rad] at the contact.
-
-    The arm stays at the end of its motion until the contact. If the motion ends at the contact up
-    to `CONTACT_TIME_TOLERANCE`, its polynomial is evaluated at the contact time itself.
-    """
+    """Return joint angles (6, B) [rad] at the contact, `stays` (B,) [s] after the motion's end."""
     beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
@@ -323,7 +316,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
     """Return by kind of obstacle the least distance (B,) [m], its time (B,) [s] and its part (B,).
 
-    The norm of the joint rates in each piece is at most `turning` (B, M) [rad/s].
+    `turning` (B, M) [rad/s] bounds the norm of the joint rates in each piece.
     """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
@@ -403,11 +396,10 @@ def _tunnel(case: dict, contact: float) -> tuple:
 
 
 def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (2, B) [s] at which balls enter and leave a box.
+    """Return the times (2, B) [s] at which balls enter and leave a box, while rising and falling.
 
-    The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. The first row of
-    each result belongs to the ball's rise, the second row to its fall. A ball that is never inside
-    the box enters at infinity and leaves at minus infinity.
+    The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. A ball that is
+    never inside enters at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown

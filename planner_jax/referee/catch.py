@@ -99,9 +99,9 @@ def referee_catches(
     """Decide for every plan of a batch of catches whether it succeeds.
 
     The trajectory has M pieces for each target. Catch i = 0, 1, ... in the plan's order is at the
-    end of piece (i + 1) M - 1. Absent targets are ignored. Pieces after the last catch are ignored
-    if their duration is zero, and judged like all pieces otherwise. If targets are optional, the
-    pieces with a duration determine the number of catches, and each of these catches is judged.
+    end of piece (i + 1) M - 1. Absent targets are ignored, and so are pieces of zero duration after
+    the last catch. If targets are optional, the pieces with a duration determine the number of
+    catches, and each of these catches is judged.
 
     Target positions are computed in float64 for paths with the fields of `BallPath` (recognised by
     `ball`), `HarmonicPath` (`amplitude`) or `PathTable` (`resolution`). The arguments
@@ -109,10 +109,10 @@ def referee_catches(
 
     Args:
         cases: object with the fields of `CatchCase`, leaves with leading axis B; leaves of
-            `targets` have (B, N). Unless `optional`, all present targets must be caught. The
-            case's own order and times are not read.
-        plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients
-            (B, N * M, D + 1, 3), durations (B, N * M).
+            `targets` have (B, N). Unless `optional`, all present targets must be caught. The case's
+            own order and times are not read.
+        plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients (B, N
+            * M, D + 1, 3), durations (B, N * M).
         target_states: function `(targets, order, times) -> (pos, vel)` for targets of other
             classes, with order (B, N) int, times (B, N) [s], pos and vel (B, N, 3) [m], [m/s].
             Entry [b, i] is of target `order[b, i]` of case b at `times[b, i]`. Values for absent
@@ -250,9 +250,8 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
     """Interpolate positions and velocities (B, N, 3) at `times` from tables with equal time steps.
 
-    Node k of a table is at time (k - 1) * resolution. Between two nodes the interpolation is cubic
-    convolution with a = -1/2 [Keys1981]: a cubic polynomial whose slopes at the nodes are central
-    differences. Outside the table the target keeps its first or last velocity.
+    Node k of a table is at time (k - 1) * resolution. The interpolation is cubic convolution with a
+    = -1/2 [Keys1981]. Outside the table the target keeps its first or last velocity.
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)
@@ -326,9 +325,8 @@ def _test_order(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Test the plan's order (B, N) of targets; return which entries are right, and their targets.
 
-    `due` (B, N) marks entries that are catches: they must name present targets. An entry that is
-    not a catch must name an absent target, or any target if targets are optional. No entry may
-    repeat a target that an earlier entry names.
+    Entries with `due` (B, N) are catches and must name present targets. Other entries must name
+    absent targets, or any targets if targets are optional. No target may be named twice.
     """
     num = due.shape[1]
     order = np.nan_to_num(order, nan=-1.0)
@@ -382,8 +380,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
     """Test that the catch times are positive, rise, agree with the pieces, and keep the horizon.
 
-    Every piece up to the last catch must have a positive duration, and no later piece a negative
-    duration. The plan's `times` must be the ends of the pieces, and not after the target's horizon.
+    Every piece up to the last catch must have a positive duration, no later piece a negative one.
     """
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)

@@ -1,7 +1,6 @@
-"""Clearance of a moving rectangle from convex polygons, in float64 NumPy.
+"""Clearance of a moving rectangle, a car's body, from convex polygons, in float64 NumPy.
 
-The referee of interceptions tests the car's body against obstacles here. World frame in the plane,
-SI units.
+World frame in the plane, SI units. The referee of interceptions calls this module.
 """
 
 import numpy as np
@@ -16,13 +15,11 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     """Return the least distance (B,) [m] of each moving rectangle from N moving polygons.
 
     Also returns the time (B,) [s] of the least distance and the index (B,) of the polygon. Lower
-    bounds of the distance exclude most pairs of a sample and a polygon. The first bound uses
-    circles around both bodies, the second the lines through the polygon's edges and a circle around
-    the rectangle.
+    bounds of the distance exclude most pairs of a sample and a polygon.
 
     Args:
-        group: the polygons, as arrays "centre" [m] and "velocity" [m/s] (B, N, 2), "corners"
-            (B, N, V, 2) [m] relative to the centre, and "present" (B, N).
+        group: the polygons, as arrays "centre" [m] and "velocity" [m/s] (B, N, 2), "corners" (B, N,
+            V, 2) [m] relative to the centre, and "present" (B, N).
         half: (B, 2) [m], half sides of the rectangles.
         times: (B, S) [s], of the samples.
         poses: (B, S, 3), pose of the rectangle's middle: x [m], y [m], heading [rad].
@@ -86,8 +83,8 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons.
 
-    The offset is the inner product of normal and corner. An edge of zero length, between repeated
-    corners, has a zero normal and an infinite offset.
+    The offset is the inner product of normal and corner. For an edge between equal corners it is
+    infinite.
     """
     edge = np.roll(corners, -1, axis=-2) - corners
     area = (corners[..., 0] * edge[..., 1] - corners[..., 1] * edge[..., 0]).sum(axis=-1)
@@ -101,9 +98,9 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _separation(corners, normals, pose, half) -> np.ndarray:
     """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
 
-    If the greatest gap along the normals of all edges is negative, the bodies overlap, and the gap
-    is minus the depth. Otherwise the distance is the least distance between a corner of one body
-    and an edge of the other body. The half sides `half` of the rectangles are (P, 2) [m].
+    If the greatest gap along the normals of all edges is negative, it is minus the depth. Otherwise
+    the distance is between a corner and an edge. `half` (P, 2) [m] are half sides of the
+    rectangles.
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 

@@ -1,8 +1,7 @@
 """Test of a quadrotor's trajectory against the extra limits of its case, in float64 NumPy.
 
-Extra limits are objects in the case's field `extras`, which a user may define. The referee calls
-their method `excess` at points of the trajectory. This method is the only code that the referee
-shares with the planners.
+Extra limits are objects in the case's field `extras`, which a user may define. Their method
+`excess` is the only code that the referee shares with the planners.
 """
 
 import dataclasses
@@ -16,13 +15,10 @@ from planner_jax.referee.quadrotor import Pieces
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """An extra of a case that is a limit, since it has a method `excess`.
-
-    Extras without this method are terms of the planner's cost.
-    """
+    """An extra of a case that is a limit. Extras without `excess` are terms of the cost."""
 
     def excess(self, pos: np.ndarray, vel: np.ndarray, acc: np.ndarray) -> np.ndarray:
-        """Return the relative excess (...) over the limit; it is positive where the limit fails.
+        """Return the relative excess (...) over the limit, positive where the limit fails.
 
         Position [m], velocity [m/s] and acceleration [m/s^2] are (..., 3).
         """
@@ -40,8 +36,8 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
     """Find each plan's greatest relative excess (B,) over extra limits, its time and its limit.
 
     The excess is sampled at fractions u of every piece. Between samples the search refines the
-    intervals in which the lines through neighbouring samples allow the greatest values. The limit
-    is returned as its index in `extras`. Without an extra limit the excess and the index are -1.
+    likeliest intervals. The limit is returned as its index in `extras`; without an extra limit the
+    index and the excess are -1.
 
     Args:
         pieces: trajectories of B plans.

@@ -95,14 +95,14 @@ def referee_hits(
     """Decide for every plan of a batch of hits whether it succeeds.
 
     The impact is at the end of the trajectory. Errors of the state at time 0 and jumps between
-    pieces count as displacement (`referee.quadrotor.joint_errors`). In minimum-snap trajectories of
-    eight pieces, computed in float32 with coordinates up to 4.5 m, rounding causes at most 1.3e-4 m
-    of displacement. That is less than a third of the default tolerance.
+    pieces count as displacement (`referee.quadrotor.joint_errors`). In eight pieces of least snap,
+    computed in float32 with coordinates up to 4.5 m, rounding causes at most 1.3e-4 m, less than a
+    third of the default tolerance.
 
     Args:
         cases: object with the fields of `HitCase`, leaves with leading axis B.
-        plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients
-            (B, M, D + 1, 3), durations (B, M).
+        plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients (B, M,
+            D + 1, 3), durations (B, M).
         drag_after_impact: whether the ball has drag after the impact too.
         tolerance: relative tolerance of every limit of the case.
         landing_tolerance: [m], greatest horizontal distance between landing point and target.
@@ -157,11 +157,7 @@ def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndar
 
 
 def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    """Advance position and velocity (6, B) by one Runge-Kutta step (B,) [s] of order 4.
-
-    As the acceleration does not depend on the position, the mean velocity of the step is
-    v + step / 6 (a_1 + a_2 + a_3).
-    """
+    """Advance position and velocity (6, B) by one Runge-Kutta step (B,) [s] of order 4."""
     half, sixth, vel = 0.5 * step, step / 6.0, state[3:]
     acc_1 = _ball_acc(vel, drag, gravity)
     acc_2 = _ball_acc(vel + half * acc_1, drag, gravity)
@@ -178,9 +174,8 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
     """Find the time (B,) [s] within a step at which one entry of the ball's state falls to `level`.
 
-    The entry is the height (2) or the vertical speed (5). Returns the time and the state (6, B) at
-    that time. Newton's method starts at the end of the step, where the entry is falling. It
-    therefore converges to the last crossing.
+    The entry is the height (2) or the vertical speed (5). Returns the time and the state (6, B)
+    then. Newton's method starts at the end of the step and converges to the last crossing.
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):
@@ -193,8 +188,7 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
 def _return_in_air(state, height, drag, gravity) -> tuple:
     """Integrate a ball's flight with quadratic drag until it falls to `height` (B,) [m].
 
-    Returns the apex (B,) [m], its time, the landing point (3, B) and its time. Times count from the
-    start `state` (6, B) of the flight.
+    Returns apex (B,) [m], its time, landing point (3, B) and its time since the start `state`.
     """
     before_top, before_end, state = state.copy(), state.copy(), state.copy()
     top_time, end_time = np.zeros_like(height), np.zeros_like(height)
@@ -295,9 +289,8 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
     """Test that the impact time is positive, ends the trajectory, and precedes the ball's landing.
 
-    The height of a ball in flight has no local minimum, so its heights at time 0 and at the impact
-    bound it from below. A ball that is below the ground at the impact landed about
-    depth / |vertical speed| seconds earlier.
+    A ball that is below the ground at the impact landed about depth / |vertical speed| seconds
+    earlier.
     """
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)

@@ -1,10 +1,9 @@
 """Float64 NumPy referee of interceptions: decides by kinematics whether a plan succeeds.
 
 An interception is a car's drive to a moving target. The referee integrates the car's equations of
-motion [Qu2022, eq. 1] with the plan's speed and curvature. It measures the clearance of the car's
-rectangle at samples, and computes the target's position. Only targets of a user's own class are
-code that planners run too. The referee ignores the plan's status, cost and meeting point. World
-frame in the plane, SI units, headings counter-clockwise from the x axis.
+motion [Qu2022, eq. 1] with the plan's speed and curvature. It ignores the plan's status, cost and
+meeting point. Only targets of a user's own class are code that planners run too. World frame in the
+plane, SI units, headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -59,9 +58,9 @@ _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 class InterceptVerdict(Verdict):
     """Verdict on B plans in which a car drives to a moving target.
 
-    Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s.
-    A clearance is the least distance of the car's body from an obstacle over the samples. It is
-    minus the penetration depth if they overlap, and infinite without an obstacle.
+    Measurements are NaN where the inputs are not finite or the plan's time is not in (0, 3600] s. A
+    clearance is the body's least distance from an obstacle over the samples: negative if they
+    overlap, and infinite without an obstacle.
     """
 
     SENTENCES = _SENTENCES
@@ -243,10 +242,7 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
 
 
 def final_poses(plans, body) -> np.ndarray:
-    """Return the poses (B, 3) of the rear axles at the end of plans with the fields of `CarPlan`.
-
-    A pose is x [m], y [m] and heading [rad].
-    """
+    """Return the rear axles' poses (B, 3) at the end of car plans: x [m], y [m], heading [rad]."""
     case = {
         "plan.start": plans.start,
         "plan.speed": plans.speed,
@@ -275,7 +271,7 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 def _start(case: dict, allowed: float) -> tuple:
     """Test that pose, speed and curvature at time 0 are the case's; return (failed, error, time).
 
-    The error is the largest of the four errors in SI units: distance, heading, speed, curvature.
+    The error is the largest of four in SI units: distance, heading, speed and curvature.
     """
     away = case["plan.start"] - case["start"]
     errors = [
@@ -339,8 +335,8 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Integrate the motion; return times (B, S) [s] and poses (B, S, 3) of the body's middle.
 
-    Each piece between two knots lasts `span` (B,) [s]. All plans have the same number S of samples:
-    plans that need fewer samples repeat the end of each piece.
+    Each piece lasts `span` (B,) [s]. Plans that need fewer than S samples repeat the end of each
+    piece.
     """
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]

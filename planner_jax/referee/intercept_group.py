@@ -1,8 +1,7 @@
 """Float64 NumPy referee of group interceptions, in which a car meets several targets in turn.
 
 The drive to one target is a leg. Each leg is judged as an interception that starts where and when
-the preceding leg ends, by the integration of `referee.intercept`. World frame in the plane, SI
-units.
+the preceding leg ends, by `referee.intercept`. World frame in the plane, SI units.
 """
 
 import dataclasses

@@ -1,8 +1,4 @@
-"""Parts that the referees of all four tasks share.
-
-The module has the base class of verdicts, checks the shapes of arrays, distributes a batch of
-plans over threads or processes, and finds the first limit that each plan violates.
-"""
+"""Parts that the referees of all tasks share: verdicts, checks of shapes, threads and processes."""
 
 import dataclasses
 import functools
@@ -23,10 +19,9 @@ ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """The referee's decision on a batch of B plans, with its measurements.
+    """The referee's decision on B plans, with measurements; for a single plan without batch axis.
 
-    In a verdict on a single plan the fields have no batch axis. Measurements are NaN where the
-    plan or its case is not finite.
+    Measurements are NaN where the plan or its case is not finite.
     """
 
     # By limit: the sentence that describes its violation. A sentence may contain `{time}`,
@@ -184,7 +179,7 @@ def cores() -> int:
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
     """Test for each of B plans whether all numbers of its case and plan are finite.
 
-    Arrays of `limits` and the arrays named in `unbounded` may be infinite, but not NaN.
+    Arrays of `limits` and arrays named in `unbounded` may be infinite, but not NaN.
     """
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():

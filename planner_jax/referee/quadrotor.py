@@ -26,8 +26,8 @@ from planner_jax.referee.judging import (
 class Pieces:
     """Polynomial pieces of B trajectories in float64.
 
-    A piece that the plan does not fly is replaced by a copy of the last flown piece before it. The
-    copy does not change the extreme values of the trajectory.
+    A piece that the plan does not fly is a copy of the last flown piece before it, so that the
+    extreme values of the trajectory do not change.
     """
 
     coeffs: np.ndarray  # (3, B, M, D + 1)
@@ -44,8 +44,7 @@ class Pieces:
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
     """Build `Pieces` from coefficients (B, M, D + 1, 3) and durations (B, M) [s].
 
-    `flown` (B, M) bool marks the pieces that the plans fly, by default all. Unmarked pieces must
-    have zero duration.
+    `flown` (B, M) bool marks the flown pieces, by default all; others must have zero duration.
     """
     coeffs = np.moveaxis(coeffs, -1, 0)
     starts = np.cumsum(durations, axis=1) - durations
@@ -125,8 +124,8 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
     """Read the arrays of cases and plans that `judge_motion` needs, except the head state.
 
-    The result has no entries for parts that are None. These parts are a case's limits of
-    acceleration, thrust and rotors, and a plan's recovery trajectory.
+    Limits of acceleration, thrust and rotors that are None, and no recovery trajectory, have no
+    entry.
     """
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
@@ -203,9 +202,9 @@ _MEASURES = {
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Find the greatest of samples (N, M, S) of M pieces, and where the true maximum likely is.
 
-    Returns three arrays (N,): the index of the greatest of the M S samples, its value, and the
-    index of the sample next to the likely maximum. The likely maximum is the highest vertex of all
-    parabolas through three neighbouring samples of a piece. The array `values` is overwritten.
+    Returns arrays (N,): the index of the greatest of the M S samples, its value, and the index of
+    the sample next to the highest vertex of all parabolas through three neighbours. Overwrites
+    `values`.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
@@ -299,9 +298,9 @@ def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the fastest rotation of the thrust between two neighbouring samples.
 
-    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step. The
-    mean rate is never above the true maximum. It detects a thrust that passes through zero between
-    two samples, where the quadrotor would have to flip.
+    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step. It
+    detects a thrust that passes through zero between samples, where the quadrotor would have to
+    flip.
     """
     tau = acc.copy()
     tau[2] += gravity
@@ -408,10 +407,9 @@ def judge_motion(
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """Test that recovery trajectories end at standstill.
+    """Test that recovery trajectories end at standstill; the result is empty without a recovery.
 
-    Velocity, acceleration and jerk at the end count as displacement [m], as in `joint_errors`. The
-    result is empty if the plans have no recovery trajectory.
+    Velocity, acceleration and jerk at the end count as displacement [m], as in `joint_errors`.
     """
     if "recovery.coeffs" not in case:
         return {}

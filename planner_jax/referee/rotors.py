@@ -1,8 +1,7 @@
 """Thrusts of a quadrotor's four rotors along a trajectory, for the referee, in float64 NumPy.
 
-The attitude follows from the thrust (Hopf fibration at zero heading), and the body rate from the
-cross product of thrust and jerk. The angular acceleration is a central difference of body rates,
-so that the referee checks the planners, which compute it from the snap.
+Attitude and body rate follow from thrust and jerk (Hopf fibration at zero heading). The angular
+acceleration is a central difference of body rates; the planners compute it from the snap.
 """
 
 import numpy as np
@@ -17,8 +16,7 @@ _NUMBERS = 250_000  # greatest number of samples computed at once, so that they 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
     """Measure the least and the greatest thrust (B,) [N] of any rotor, and test both.
 
-    Every polynomial piece is sampled at fractions u (S,) of its duration. Returns measurements,
-    and tests (failed, relative excess, time) by name.
+    Samples are at fractions u (S,) of every piece. Returns measurements, and tests by name.
     """
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)

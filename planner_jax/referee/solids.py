@@ -1,7 +1,6 @@
-"""Distances in space between points, line segments and boxes, in float64 NumPy.
+"""Distances in space between points, line segments and boxes, in float64 NumPy, exact to rounding.
 
-The referee's collision tests of the arm call this module. Vectors (3, ...) [m] have their x, y, z
-components on the first axis, and the other axes broadcast. Distances are exact to rounding.
+Vectors (3, ...) [m] have their x, y, z components on the first axis; the other axes broadcast.
 """
 
 import itertools
@@ -45,8 +44,7 @@ def between_segments(
 ) -> np.ndarray:
     """Return distances (...) [m] between segments `first` to `second` and `third` to `fourth`.
 
-    The parameters of the nearest points of both lines are clipped to [0, 1] one after the other
-    (Ericson, Real-Time Collision Detection, Section 5.1.9).
+    The method is Ericson's (Real-Time Collision Detection, Section 5.1.9).
     """
     span, other, away = second - first, fourth - third, first - third
     a, b, c = dot(span, span), dot(span, other), dot(other, other)
@@ -60,11 +58,9 @@ def between_segments(
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the distances (...) [m] of line segments from axis-aligned boxes around the origin.
 
-    The distance is zero where a segment meets its box. Along a segment the squared distance is
-    convex, and its derivative is piecewise linear. The derivative has breaks where the segment
-    crosses the planes of the box's sides. The minimum lies between the last break with a negative
-    derivative and the first break with a positive one. The segment's ends `first` and `second`
-    and the box's half edges `half` are (3, ...) [m].
+    The squared distance is convex along a segment, and its derivative is piecewise linear with
+    breaks at the planes of the box's sides. The segment's ends and the half edges `half` are (3,
+    ...) [m].
     """
     span = second - first
 
@@ -90,10 +86,8 @@ def between_boxes(
 ) -> np.ndarray:
     """Return the distances (P,) [m] between P pairs of boxes.
 
-    The distance is minus the penetration depth where two boxes overlap. The candidates for a
-    separating axis are the normals of the sides and the cross products of the edges. If the
-    greatest gap along these axes is negative, the boxes overlap, and the gap is minus the depth.
-    Otherwise one of the two nearest points lies on an edge of its box.
+    The distance is minus the penetration depth where two boxes overlap, by the separating axis
+    theorem. Otherwise one of the two nearest points lies on an edge of its box.
 
     Args:
         middle: (3, P) [m], centre of the first box in the frame of the second box.

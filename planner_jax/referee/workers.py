@@ -1,8 +1,7 @@
-"""Worker processes of the referee, for batches of more than 16,000 plans.
+"""Worker processes of the referee, for batches above 16,000 plans, which slow threads down.
 
-In such batches threads would wait for the interpreter lock. A worker process runs this module with
-`python -m`. It imports the referee and NumPy, but not the calling program. The calling program
-therefore needs no `if __name__ == "__main__"`.
+A worker runs this module with `python -m` and does not import the calling program, which therefore
+needs no `if __name__ == "__main__"`.
 """
 
 import atexit

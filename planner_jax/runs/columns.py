@@ -106,9 +106,8 @@ OUTCOME = [
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """Return a column for every leaf of the cases, the plans and the verdict.
 
-    A column's name is the path of its leaf, such as "case.ball.pos" or "plan.cost". The columns of
-    `SOLVER` and `OUTCOME` instead have the same names in all runs. Unit and meaning are taken from
-    the metadata `unit` and `meaning` of the dataclass field.
+    A column's name is the path of its leaf, such as "plan.cost". Unit and meaning are the metadata
+    of the dataclass field. The columns of `SOLVER` and `OUTCOME` have the same names in all runs.
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]

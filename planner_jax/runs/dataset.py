@@ -1,8 +1,7 @@
 """The rows of a run: a Parquet dataset, which `pyarrow.dataset`, pandas and DuckDB read.
 
-A part of a dataset is one file of rows, such as `part-000007-1a2b3c4d.parquet`. Its name holds the
-number of the part and the CRC-32 checksum of the file. A part is written completely or not at all.
-Its metadata hold a record, a JSON object on how its rows were made.
+A part is one file of rows, such as `part-000007-1a2b3c4d.parquet`, whose name holds its number and
+its CRC-32 checksum. Its metadata hold a record, a JSON object on how the rows were made.
 """
 
 import io
@@ -31,8 +30,7 @@ class DamagedPart(ValueError):
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
     """Return the bytes of a Parquet file with some rows, and with a record in its metadata.
 
-    Only text columns are encoded with a dictionary, because numbers hardly repeat. List columns are
-    not compressed, because compression would save little.
+    Only text is encoded by a dictionary, and lists are not compressed, since that saves little.
     """
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]

@@ -1,7 +1,6 @@
 """JSON files of runs, such as `manifest.json`: their format version, and a digest against damage.
 
-A file holds one JSON object. Its entry `format` is the version number of the format, and its entry
-`digest` is the SHA-256 of all other entries.
+The entry `format` is the version of the format, the entry `digest` the SHA-256 of all others.
 """
 
 import hashlib

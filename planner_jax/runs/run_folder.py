@@ -1,8 +1,7 @@
 """The folder of a run: manifest, rows, table, figures and HTML page.
 
-Each file is written under a scratch name and renamed when it is complete. A run that was killed at
-any moment can therefore be resumed. Only one process writes to the folder at a time: it holds a
-lock on the file `.lock`, which the operating system releases when the process ends.
+Each file is written under a scratch name and renamed when it is complete, so that a killed run can
+be resumed. Only the process that holds a lock on the file `.lock` writes to the folder.
 """
 
 import contextlib
@@ -112,7 +111,7 @@ class RunFolder:
     def _acquire(self, handle: int) -> None:
         """Lock an open file; raise `ArgumentError` if another process holds the lock for 0.2 s.
 
-        A shorter wait is normal: a process that only checks the folder holds the lock briefly.
+        A process that only checks the folder holds the lock for a shorter time.
         """
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
@@ -129,10 +128,7 @@ class RunFolder:
         return ArgumentError(self.name, rule, shown=f"{str(self.path)!r}{why}")
 
     def _require_empty(self) -> None:
-        """Raise `ArgumentError` if the folder holds files other than a lock and scratch files.
-
-        A process that is killed before its first manifest is complete leaves such files.
-        """
+        """Raise `ArgumentError` if the folder holds files other than a lock and scratch files."""
         if not all(path.name == LOCK or is_scratch(path) for path in self.path.iterdir()):
             rule = "a new or empty folder"
             if (self.path / MANIFEST).exists():

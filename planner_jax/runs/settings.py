@@ -1,7 +1,7 @@
 """Settings of runs, which are checked before anything is read, compiled or written.
 
-Settings are frozen dataclasses. The options of the command line are made from their fields. Nothing
-here imports JAX, so that the help of a command appears at once.
+They are frozen dataclasses, whose fields are the options of the command line. Nothing here imports
+JAX, so that the help of a command appears at once.
 """
 
 import dataclasses
@@ -56,8 +56,8 @@ def require_count(name: str, value: int | None, least: int, *, none: bool = Fals
 class SweepSettings:
     """Settings that the sweeps of all tasks have; a task's subclass adds further settings.
 
-    Together the settings determine every number in the rows of a run. A value that breaks its rule
-    raises `ArgumentError`.
+    They determine every number in a run's rows. A value that breaks its rule raises
+    `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the task's first planner

@@ -82,8 +82,7 @@ def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
 def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
     """Return a call's result and its duration [s] without compilation.
 
-    The call is repeated up to three times until JAX compiles nothing. If every call compiles, the
-    duration includes compilation.
+    The call is repeated up to three times until JAX compiles nothing.
     """
     for _ in range(_WARM_CALLS - 1):
         found, seconds, warm = measure(call)

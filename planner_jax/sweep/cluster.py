@@ -1,8 +1,7 @@
 """Workers of a Ray cluster that plan the chunks of a sweep, for the option `--workers ray`.
 
 A chunk is a block of consecutive cases. One Ray task plans and judges a chunk, and returns the
-bytes of the Parquet file with its rows. A worker whose code or devices differ from the run's raises
-`WorkersFailed`. If a worker dies, Ray repeats its task on another worker.
+bytes of the Parquet file with its rows. If a worker dies, Ray repeats its task on another worker.
 """
 
 import contextlib
@@ -46,8 +45,8 @@ _MEMORY = 0.6
 def workers_of(kind: str | None) -> Iterator[Workers | None]:
     """Provide the workers of a Ray cluster within a `with` block; None if `kind` is None.
 
-    The process joins the cluster at the address in the environment variable RAY_ADDRESS. If the
-    variable is not set, a cluster is started on this machine, and stopped at the end of the block.
+    The cluster is at the address in the environment variable RAY_ADDRESS. Without this variable it
+    is started on this machine, and stopped at the end of the block.
     """
     if kind is None:
         yield None

@@ -111,10 +111,9 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     """Return the success rate of a run minus the rate of the first run, with a 95 % interval.
 
     If both runs planned the same cases, the test is McNemar's exact test. It uses the n cases that
-    exactly one of the two runs solves; under the null hypothesis either run is equally likely to
-    solve such a case. The interval follows from the Clopper-Pearson interval of k / n, where the
-    other run solves k of the n cases. For runs of different cases the interval is Newcombe's, from
-    the Wilson intervals of both rates.
+    exactly one of the two runs solves. The interval follows from the Clopper-Pearson interval of k
+    / n, where the other run solves k of these cases. For runs of different cases the interval is
+    Newcombe's, from the Wilson intervals of both rates.
     """
     change = other.rate - first.rate
     if other_cases(first, other):
@@ -252,8 +251,8 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
 def as_csv(runs: Sequence[ComparedRun]) -> str:
     """Return the comparison as CSV text with one column for each run.
 
-    The first rows hold the quantities of `table_of`. Then one row follows for each case that only
-    some runs solve, with the first limit that fails in each run, or "success".
+    The first rows are those of `table_of`. Then follows a row for each case that only some runs
+    solve, with the first limit that fails in each run, or "success".
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

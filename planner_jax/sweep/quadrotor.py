@@ -105,10 +105,9 @@ def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
     """Return the magnitude (N,) [rad/s] of the body's angular velocity at zero heading.
 
-    With the thrust vector f and  c = f x jerk,  the angular velocity normal to the body z axis has
-    the magnitude  |c| / |f|^2.  The component about the body z axis is  -c_z / (|f| (|f| + f_z)),
-    because zero heading is defined by the Hopf fibration. The result is NaN where f is zero or
-    points straight down.
+    With the thrust vector f and c = f x jerk, the angular velocity normal to the body z axis has
+    the magnitude |c| / |f|^2. The component about the z axis is -c_z / (|f| (|f| + f_z)) by the
+    Hopf fibration. The result is NaN where f is zero or points straight down.
     """
     thrust = net_thrust(motion, gravity)
     size = np.linalg.norm(thrust, axis=1)

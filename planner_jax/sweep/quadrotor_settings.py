@@ -1,7 +1,6 @@
 """Settings that the sweeps of hits and catches share, because both robots are quadrotors.
 
-Nothing here imports JAX. The modules of robots are imported only when a setting names a robot, so
-that the help of a command is printed without importing NumPy.
+Neither JAX nor NumPy is imported before a setting names a robot, so that help appears at once.
 """
 
 import dataclasses
@@ -27,7 +26,7 @@ def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
     """Return the `QuadrotorModel` for a setting: a name, a file, a mapping, a model, or None.
 
     Raises:
-        ArgumentError: no robot has this name, its file has errors, or its tool is not `tool`.
+        ArgumentError: no such robot, its file has errors, or its tool is not `tool`.
     """
     if given is None:
         return None

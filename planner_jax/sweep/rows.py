@@ -31,8 +31,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
     """Return the case of a stored row of results: drawn again from its seed, or read from files.
 
     Raises:
-        ArgumentError: the folder does not hold a complete, finished sweep, or physics or limits of
-            the case differ from those in the manifest.
+        ArgumentError: the sweep is not complete, or the case differs from the manifest.
     """
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)

@@ -39,8 +39,7 @@ class RunFigure:
 class Sweep(Generic[AnySettings]):
     """What a sweep does for one task: provide cases, plan, judge, and report.
 
-    This class serves any task. A task may name a subclass in `SweepSettings.RUN` that overrides
-    methods, for example to add its own columns and figures.
+    A task may name a subclass in `SweepSettings.RUN`, for example with its own columns and figures.
     """
 
     frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns

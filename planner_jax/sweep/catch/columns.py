@@ -1,7 +1,7 @@
 """Columns of the rows that a sweep of catches stores: targets, decision, catches and verdict.
 
-For N targets, a list column of a row has N numbers, or the 3 N coordinates of N points. Lists of
-the case follow the order of its targets. Lists of plan and verdict follow the order of the catches.
+For N targets, a list column has N numbers, or 3 N coordinates. Lists of the case follow the order
+of its targets, lists of plan and verdict the order of the catches.
 """
 
 import numpy as np

@@ -66,10 +66,7 @@ def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCa
 
 
 def due_distance(plan: SampledCatch) -> np.ndarray:
-    """Return the distance (K,) [m] from the net's centre to the next target to be caught.
-
-    The first value after each catch is NaN. The drawn line then has a gap where the target changes.
-    """
+    """Return distances (K,) [m] from net to next target; NaN right after a catch, to draw a gap."""
     times, num = plan.motion.time, len(plan.catches)
     place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
     due = np.array(plan.row["order"])[np.minimum(place, num - 1)]

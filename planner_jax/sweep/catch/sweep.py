@@ -34,7 +34,7 @@ _NET_TESTS = {
 class CatchTally(Tally):
     """Counts of successes, and means of targets caught, catch times and optimal time ratios.
 
-    The optimal time ratio is the mean relative difference of decided and optimised catch times.
+    This ratio is the mean relative difference of decided and optimised catch times.
     """
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")

@@ -20,8 +20,8 @@ _FARTHEST = 1e6  # [m] greatest absolute coordinate of the start that is accepte
 class HitSettings(QuadrotorSettings):
     """Settings of a sweep of hits, which plans and judges many drawn or published cases.
 
-    `num` is the number of serves: by default all serves of the folder `serves`, or `DEFAULT_NUM` if
-    serves are drawn. `seed` determines the drawn serves, and the starts if `start` is "uniform".
+    `num` is the number of serves: by default all serves of the folder `serves`, or `DEFAULT_NUM`.
+    `seed` determines the drawn serves, and the starts if `start` is "uniform".
     """
 
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")

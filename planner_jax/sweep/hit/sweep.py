@@ -75,11 +75,7 @@ class ServeSource(Source):
 
 
 class HitTally(Tally):
-    """Counts of successes by scenario.
-
-    The report's example is a success with a serve from court region L and a target in region F, as
-    in [Yu2023bat, Fig. 7].
-    """
+    """Counts of successes by scenario; the report's example is like [Yu2023bat, Fig. 7]."""
 
     READS = (*COUNTED, *ScenarioCounts.READS)
 

@@ -1,7 +1,6 @@
 """Columns of the rows that a sweep of interceptions stores: case, plan and verdict.
 
-For N obstacles of V corners each, a list column has N entries, or the coordinates of all N x V
-corners. A polygon with fewer than V corners repeats one of its corners.
+For N obstacles of V corners, a list column has N entries, or the coordinates of N x V corners.
 """
 
 from collections.abc import Callable
