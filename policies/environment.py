@@ -9,15 +9,19 @@ all cases. The batch is divided evenly among the suites (families of cases). The
 different numbers of targets.
 """
 
+import contextlib
 import functools
+import io
 from collections.abc import Mapping
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs.base import Env, State
 from jax import Array
+
+with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
+    from brax.envs.base import Env, State
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import is_solved

@@ -8,8 +8,10 @@ ends with bit-identical weights. The moments of Adam start at zero in each part,
 not return them. The module `progress` records a training, and `curves` draws its learning curves.
 """
 
+import contextlib
 import dataclasses
 import functools
+import io
 import json
 import math
 import os
@@ -21,6 +23,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+
+with contextlib.redirect_stdout(io.StringIO()):  # hides the message that Warp is not installed
+    import brax  # noqa: F401
+
 from brax.training import networks as brax_networks
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks

@@ -174,6 +174,20 @@ def test_help_names_the_defaults_and_loads_no_jax(task, parts):
         assert part in said
 
 
+@pytest.mark.parametrize(
+    "module",
+    [
+        "sims.run",  # of the command `fly`
+        "policies.training",  # of the command `train`
+        pytest.param("policies.environment", marks=pytest.mark.slow),
+    ],
+)
+def test_imports_of_commands_print_nothing(module):
+    script = f"import planner_jax.{module}"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
 def test_the_version_is_printed():
     code, out, _ = run("--version")
     assert code == 0 and out.startswith("planner-jax ")
