@@ -25,10 +25,7 @@ Tangent = Array | SymbolicZero
 
 
 def aim_drag_free(pos: Array, target: Array, flight_time: Array, gravity: Array) -> Array:
-    """Return the initial velocity (3,) with which a drag-free ball reaches a target.
-
-    The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s].
-    """
+    """Return the velocity (3,) of a drag-free ball from `pos` to `target` in `flight_time` [s]."""
     return (target - pos) * reciprocal(flight_time) - 0.5 * gravity_vector(gravity) * flight_time
 
 

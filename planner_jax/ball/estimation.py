@@ -49,10 +49,7 @@ def _congruence(A: Array, P: Array) -> Array:
 
 
 def solve_definite(A: Array, B: Array) -> Array:
-    """Solve A X = B for X (m, n), with a small symmetric positive definite A (m, m).
-
-    Gaussian elimination without pivoting is unrolled, so that a batch of systems needs no LAPACK.
-    """
+    """Solve A X = B for X (m, n), with a small symmetric positive definite A (m, m), unrolled."""
     U, X = list(A), list(B)
     size = len(U)
     for i in range(size):

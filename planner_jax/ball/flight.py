@@ -53,8 +53,7 @@ def gravity_vector(gravity: Array) -> Array:
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     """Return the acceleration g - K_D |v| v [m/s^2] of a ball in flight [Yu2023bat, eq. 2].
 
-    If the velocity is a tuple of its three components, the result is a tuple too. The gradient is
-    finite for zero velocity.
+    The result is a tuple if the velocity is a tuple. The gradient is finite at zero velocity.
     """
     x, y, z = components(vel)
     speed_squared = x * x + y * y + z * z
@@ -69,11 +68,7 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """Advance a ball with quadratic drag by one Runge-Kutta step of order 4.
-
-    A negative duration [s] goes back in time. The vectors of the ball may be arrays, or tuples of
-    their components.
-    """
+    """Advance a ball with quadratic drag by one Runge-Kutta step of order 4, forward or back."""
 
     def rate(state: BallState) -> BallState:
         slopes: PyTree = ball_acceleration(state.vel, drag, gravity)
@@ -140,9 +135,7 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
 def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
 
-    For |x| < 1/2 a series of thirteen terms replaces the formula of phi_2, which suffers from
-    cancellation. The branch that is not selected gets a harmless input, so that the gradient is
-    not NaN.
+    For |x| < 1/2 a series of thirteen terms avoids the cancellation in the formula of phi_2.
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
@@ -169,10 +162,9 @@ def drag_free_apex(ball: BallState, gravity: Array) -> Array:
 
 
 def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return the time at which a drag-free ball falls through a horizontal plane.
+    """Return the time () [s] at which a drag-free ball falls through a horizontal plane.
 
-    It is the later root t of z + v_z t - g t^2 / 2 = height, for g > 0. Returns the time () [s] and
-    whether () the ball reaches the plane; if not, the time is 0.
+    Also return whether the ball reaches the plane's `height`; if not, the time is 0.
     """
     discriminant = ball.vel[2] ** 2 + 2.0 * gravity * (ball.pos[2] - height)
     real = discriminant > 0.0
@@ -200,8 +192,8 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
 def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:
     """Return the racket's unit normal (3,) and its speed () along the normal for a desired bounce.
 
-    The bounce changes the ball's velocity from v- to v+, which must differ [Yu2023bat, eqs 11 and
-    12]. The normal points along v+ - v-. In the paper it has the opposite sign.
+    The bounce changes the velocity v- to v+, and the normal is along v+ - v- [Yu2023bat, eqs 11 and
+    12, with the opposite sign].
     """
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)

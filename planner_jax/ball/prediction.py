@@ -72,9 +72,7 @@ def predict_path(
 def _node_function(num_nodes: int) -> Callable:
     """Build the function that integrates positions and velocities (N, 3) at the nodes of a table.
 
-    On a GPU a batch of balls can run in one kernel (`ball.prediction_kernel`). Derivatives are
-    computed in forward mode, also inside reverse mode: there are few inputs, and no intermediate
-    states need to be stored.
+    Derivatives use forward mode, also inside reverse mode, so that no states must be stored.
     """
 
     def integrate(
@@ -131,8 +129,7 @@ def horizon_of(table: PathTable) -> Array:
 def convolution_weights(u: Array) -> Array:
     """Return the weights (4,) of Keys' cubic convolution kernel [Yu2023bat, eqs 8 and 10b].
 
-    They multiply the four nodes around a point at the fraction `u` (), from 0 to 1, between the
-    second and the third of these nodes.
+    They multiply the four nodes around a point at the fraction `u` () between the middle two.
     """
     far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
     near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731

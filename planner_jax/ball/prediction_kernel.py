@@ -1,8 +1,7 @@
 """A GPU kernel that integrates the flights of a batch of balls into tables.
 
-The steps of a flight must be computed one after the other. As separate XLA operations they take
-about three hundred kernel launches, which dominate the time of a small batch. In this Pallas kernel
-each thread integrates one ball, together with the requested derivatives. `ball.prediction` uses it.
+As XLA operations the steps of a flight take about three hundred kernel launches. In this Pallas
+kernel each thread integrates one ball, together with the requested derivatives.
 """
 
 import dataclasses

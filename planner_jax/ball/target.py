@@ -26,10 +26,7 @@ class TargetPath(Protocol):
 
 
 def state_at(path: TargetPath, time: Array) -> BallState:
-    """Return position and velocity of a target at one time () [s].
-
-    If `at` returns only the position, its derivative is the velocity.
-    """
+    """Return position and velocity of a target at one time () [s], by `at` or its derivative."""
     state = path.at(time)
     if isinstance(state, BallState):
         return state
@@ -39,11 +36,7 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """Path of a ball with linear drag on each axis [Yu2023catch, eq. 9].
-
-    Without drag the path is a parabola, and without drag and gravity a straight line, as in
-    [Yu2023catch, Section VII-B a, c, d].
-    """
+    """Path of a ball with linear drag on each axis [Yu2023catch, eq. 9]."""
 
     rules: ClassVar[Table] = (
         Field("ball.pos", (3,)),

@@ -1,7 +1,6 @@
 """Entry point of the program `planner-jax`: it parses the command line and runs a command.
 
-The tasks (hit, catch, ...) come from the registry. The options of `sweep`, `fly` and `plan` are the
-fields of a task's settings. Nothing in this module is specific to a task.
+The tasks come from the registry, and their options are the fields of their settings.
 """
 
 import functools

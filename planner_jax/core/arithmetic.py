@@ -1,7 +1,7 @@
 """Arithmetic in forms that XLA compiles to few loops on a CPU.
 
-XLA compiles each division, root or sum over an axis to its own loop. The computing time of one
-small problem depends on the number of loops, not on the amount of arithmetic in them.
+The computing time of one small problem depends on the number of loops, and XLA compiles each
+division, root or sum over an axis to its own loop.
 """
 
 from types import ModuleType
@@ -14,10 +14,7 @@ from numpy.typing import DTypeLike
 
 
 def host_leaf(value: object, dtype: DTypeLike | None = None) -> Array:
-    """Return a value as a NumPy array whose type suits the leaves of cases and plans.
-
-    Such leaves are jax arrays inside compiled programs and may be NumPy arrays outside.
-    """
+    """Return a value as a NumPy array whose type suits the leaves of cases and plans."""
     return np.asarray(value, dtype)  # type: ignore[return-value]
 
 
@@ -62,10 +59,7 @@ Components = Array | tuple[Array, Array, Array]  # (..., 3), or its three compon
 
 
 def components(x: Components) -> list[Array]:
-    """Return the n components (...) of vectors (..., n), or the entries of a tuple.
-
-    They come from one split, whose derivative is one concatenation instead of n paddings.
-    """
+    """Return the n components (...) of vectors (..., n), or of a tuple, by one split."""
     if isinstance(x, tuple):
         return [*x]
     return [jnp.squeeze(part, -1) for part in jnp.split(x, x.shape[-1], axis=-1)]

@@ -129,10 +129,7 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return the leaves of an argument as arrays; raise unless their shapes begin with `shape`.
-
-    `words` describes the axes of `shape` in the message.
-    """
+    """Return an argument's leaves; raise unless their shapes begin with `shape`."""
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
     if not arrays or len(arrays) < len(leaves):

@@ -66,10 +66,7 @@ class Task:
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
-        """Function `draw(num, suite=None, seed=0, *, first=0)`, which draws cases of a suite.
-
-        Case k of a seed is always the same case; `first` is the k of the first case.
-        """
+        """Function `draw(num, suite=None, seed=0, *, first=0)` that draws cases of a suite."""
         return self._function("draw")
 
     @property
@@ -92,11 +89,7 @@ class Task:
         return {**self.suites, **{name: f"{entry.value}." for name, entry in others.items()}}
 
     def split_planner(self, name: object) -> tuple[str, str]:
-        """Split a planner's name, as in "library:FILE", into its key in `all_planners` and a file.
-
-        Raises:
-            UnknownName: no planner has this name, or it needs a file or takes none.
-        """
+        """Split a name such as "library:FILE" into planner and file, or raise `UnknownName`."""
         planner, file = split_name(self.all_planners(), "planner", name, self.from_file)
         if planner in self.from_file and not file:
             raise UnknownName(

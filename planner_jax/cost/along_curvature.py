@@ -135,10 +135,7 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,).
-
-    No limit depends on derivatives of two groups, so all groups share tangents.
-    """
+    """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,)."""
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)

@@ -270,12 +270,7 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Compute the terms that one sample adds to the results of a mode.
-
-    Returns:
-        worst: greatest excess of the sample; None in the mode "curvature".
-        terms: summands of the results, in the order of the results.
-    """
+    """Return a sample's greatest excess (None for "curvature"), and its summands of the results."""
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
     if mode == "values":
@@ -318,10 +313,7 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return the greatest excess, and the weighted penalty with its derivatives by `free`.
-
-    `_penalty` is called with the arguments `free`, followed by the arguments `fixed`.
-    """
+    """Return the greatest excess, and the weighted penalty with its derivatives by `free`."""
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 

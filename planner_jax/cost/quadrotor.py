@@ -36,10 +36,7 @@ def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """Return |a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2] [Yu2023bat, eq. 18a].
-
-    Without an acceleration limit it is -1.
-    """
+    """Return |a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2], or -1 without a limit."""
     if limits.acceleration is None:
         return 0.0 * components(acc)[0] - 1.0
     return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0
@@ -54,11 +51,7 @@ def body_rate_excess(
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
-    """Return z_min - z [m] for heights z (...) [m].
-
-    It is [Yu2023catch, eq. 28] without the square that is printed there, which changes the sign
-    below the ground.
-    """
+    """Return z_min - z [m] for heights z (...) [m]: [Yu2023catch, eq. 28] without its square."""
     return limits.min_height - height
 
 
@@ -217,8 +210,7 @@ def flight_along(
 ) -> Along:
     """Return the penalties of all limits along a flight, for `integrate_along`.
 
-    Excesses with squares get twice the relative margin. Only the existence of the case's limits
-    and extras matters, not their values.
+    Only the existence of the case's limits and extras matters, not their values.
     """
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)

@@ -222,11 +222,7 @@ def _require_format(to: str, plan: Plan) -> Format:
 
 
 def _resolve(writer: str, purpose: str) -> Callable:
-    """Import and return the function `writer`, a text "module:name" in this package.
-
-    Raises:
-        MissingExtra: the module needs a package that is not installed.
-    """
+    """Import and return the function "module:name" of this package, or raise `MissingExtra`."""
     try:
         return pkgutil.resolve_name(f"planner_jax.export.{writer}")
     except ModuleNotFoundError as error:

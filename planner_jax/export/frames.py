@@ -17,10 +17,7 @@ def to_ned(vectors: np.ndarray) -> np.ndarray:
 
 
 def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
-    """Convert a yaw counter-clockwise from east to a yaw clockwise from north, or back, [rad].
-
-    The result is in [-pi, pi). The rate of the yaw only changes its sign.
-    """
+    """Convert a yaw [rad] counter-clockwise from east to clockwise from north, or back."""
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 
 

@@ -20,11 +20,7 @@ _NO_FIELD_IGNORED = 0  # type mask of a message in which every field is valid
 
 
 def packets(plan: QuadrotorPlan, rate: float) -> Iterator[tuple[int, bytes]]:
-    """Yield for each setpoint its time [us] since the plan's start, and its MAVLink 2 packet.
-
-    Raises:
-        ArgumentError: the plan cannot be exported, or the rate is out of its range.
-    """
+    """Yield for each setpoint its time [us] since the plan's start, and its MAVLink 2 packet."""
     fields = trajectory_setpoints(plan, rate)
     if rate > FASTEST:
         raise ArgumentError("rate", f"at most {FASTEST:g} for MAVLink", rate)

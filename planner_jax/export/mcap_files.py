@@ -1,7 +1,4 @@
-"""Export of plans as MCAP files (profile ros2, messages in CDR encoding) for ROS 2's rosbag2.
-
-Times of messages count from the start of the plan.
-"""
+"""Export of plans as MCAP files (profile ros2), with times since the start of the plan."""
 
 from typing import BinaryIO
 

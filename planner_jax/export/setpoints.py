@@ -124,11 +124,7 @@ def setpoints_of(plan: Plan, rate: float) -> Setpoints:
 
 
 def pieces_of(plan: QuadrotorPlan) -> PiecewisePolynomial:
-    """Return the polynomial pieces of one plan as NumPy arrays, without pieces of zero duration.
-
-    Raises:
-        ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite.
-    """
+    """Return a plan's polynomial pieces as NumPy arrays, without pieces of zero duration."""
     robot_of(plan)
     path = jax.tree.map(np.asarray, plan.whole)
     coeffs, durations = path.coeffs, path.durations

@@ -1,7 +1,4 @@
-"""Functions that measure the machine's memory, disk, processor and threads.
-
-The command line imports this module before it imports JAX.
-"""
+"""Functions that measure memory, disk, processor and threads; they do not need JAX."""
 
 import contextlib
 import functools
@@ -94,9 +91,8 @@ def usable_cores() -> int:
 def threads_of_a_computation() -> int:
     """Return the number of threads that XLA uses for one computation on a CPU.
 
-    The environment variable PJRT_NPROC or NPROC sets the number. Its default is the number of
-    usable cores. On some CPUs the number affects the last digits of results. Call this function
-    when JAX has started, or is about to start.
+    It is the environment variable PJRT_NPROC or NPROC, else the number of usable cores. On some
+    CPUs it affects the last digits of results.
     """
     number = os.environ.get("PJRT_NPROC") or os.environ.get("NPROC", "")
     return max(int(number), 1) if number.isdecimal() else usable_cores()
@@ -104,10 +100,7 @@ def threads_of_a_computation() -> int:
 
 @functools.cache
 def processor() -> str:
-    """Return the name of the processor and its widest vector instructions.
-
-    NumPy and XLA select their algorithms by them, which affects the last digits of results.
-    """
+    """Return the processor's name and vector instructions, which affect results' last digits."""
     entries: dict[str, str] = {}
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
@@ -123,10 +116,7 @@ def processor() -> str:
 
 
 def as_here(function: Callable[_Arguments, _Result]) -> Callable[_Arguments, _Result]:
-    """Wrap a function so that another thread runs it with the JAX precision of this thread.
-
-    `jax.enable_x64(True)` holds only for the thread that calls it.
-    """
+    """Wrap a function so that another thread runs it with the JAX precision of this thread."""
     import jax  # the command line measures memory without JAX
 
     here = jax.config.jax_enable_x64  # type: ignore[attr-defined]

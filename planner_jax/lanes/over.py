@@ -138,9 +138,8 @@ def _by_kernel(
 ) -> list[_Value]:
     """Evaluate a call of a function that has a kernel.
 
-    The program contains two versions: the kernel, which is compiled for CUDA, and the function's
-    operations, which are compiled for other devices and for shapes that the kernel does not
-    support.
+    The program contains the kernel, compiled for CUDA, and the function's operations, for other
+    devices and for shapes that the kernel does not support.
     """
     pairs = zip(inputs, eqn.invars, strict=True)
     arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]

@@ -25,10 +25,7 @@ _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kern
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the number of lanes (problems) in a kernel's block, or None if it would be too small.
-
-    The result divides the number of lanes, and is at most `most`, a power of two.
-    """
+    """Return the number of lanes (problems) of a block, a divisor up to `most`, or None."""
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
 
@@ -122,8 +119,7 @@ def grid_index(axis: int) -> Array:
 def _spare_searches() -> None:
     """Provide an empty module that JAX looks for, which makes kernels a third faster to lower.
 
-    For every value that MLIR passes to Python, it tries to import a module of Triton's dialect that
-    jaxlib does not contain. The empty module saves thousands of searches of the import path.
+    MLIR tries to import this module of Triton's dialect for every value that it passes to Python.
     """
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:

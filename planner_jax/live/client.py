@@ -45,10 +45,7 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's state; return the answer, or None after the timeout.
-
-        Position [m], velocity [m/s] and acceleration [m/s^2] are (3,). For `measured` see `ball`.
-        """
+        """Send position [m], velocity and acceleration (3,); return the answer or None."""
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

@@ -1,7 +1,4 @@
-"""The course of a robot in live planning: the trajectory that it follows until standstill.
-
-A course is a plan that meets the ball and its recovery trajectory, or a recovery trajectory alone.
-"""
+"""The course of a robot in live planning: a trajectory that it follows until standstill."""
 
 from typing import Any
 
@@ -40,10 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan a recovery trajectory to standstill from the end of a plan's trajectory.
-
-    Returns the course of both trajectories, and whether the recovery trajectory keeps the limits.
-    """
+    """Extend a trajectory to standstill; return the course and whether limits hold."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])
@@ -55,8 +49,8 @@ def recovery_from(
 ) -> tuple[Course, bool]:
     """Plan a trajectory from a state (position to jerk) to standstill; return it as a course.
 
-    The course starts with `pieces` pieces of zero duration instead of a plan, since all courses
-    have arrays of one shape. The second result is whether the limits hold.
+    The course starts with `pieces` pieces of zero duration instead of a plan. The second result is
+    whether the limits hold.
     """
     path = _stand_still(pieces, state[0])
     path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])
@@ -85,10 +79,7 @@ class Query:
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample K = `num` setpoints of a course, with the columns of `packets.FIELDS`; pure.
-
-    After the end of the course the quadrotor hovers.
-    """
+    """Sample K = `num` setpoints of a course that ends in hover, columns `packets.FIELDS`."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)

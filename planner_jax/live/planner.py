@@ -233,10 +233,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Search for a plan that starts at the time `due`; runs in the planning thread.
-
-        A plan for the same ball is improved first. If that fails, planning starts from scratch.
-        """
+        """Search for a plan from the time `due`, first near a plan for the same ball."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
@@ -276,11 +273,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery from the plan's end; if there is none, return to the previous course.
-
-        To save time, this is called after an answer is sent, unless its setpoints go beyond the
-        contact.
-        """
+        """Plan the recovery from the plan's end; without any, return to the previous course."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return

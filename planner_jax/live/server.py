@@ -59,11 +59,7 @@ class Server:
                 self._answer(*self._receive())
 
     def _receive(self) -> tuple[bytes, tuple[str, int], float]:
-        """Return the next packet, its sender, and its arrival time by `time.perf_counter()`.
-
-        The arrival time is from the time stamp of the operating system, since the packet may have
-        waited.
-        """
+        """Return the next packet, its sender and its arrival time, from the system's time stamp."""
         data, others, _, sender = self._socket.recvmsg(LONGEST, socket.CMSG_SPACE(_STAMP.size))
         now, received = time.time(), time.perf_counter()
         for level, kind, stamp in others:

@@ -1,7 +1,6 @@
 """Braking of cars and arms from the end of a plan to standstill.
 
-A few candidate motions keep the robot's limits by construction. The first motion without a
-collision is selected. The distance functions of the planners detect collisions.
+A few candidate motions keep the robot's limits. The first one without a collision is selected.
 """
 
 import dataclasses

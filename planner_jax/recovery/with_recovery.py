@@ -79,10 +79,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 
 
 def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
-    """Return the cases of the recoveries from the ends of plans (B,).
-
-    Leaves are NumPy arrays if the leaves of the plans are NumPy arrays.
-    """
+    """Return the cases of the recovery trajectories from the ends of plans (B,)."""
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)

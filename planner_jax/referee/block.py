@@ -233,10 +233,7 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return angles, rates and accelerations at their K extrema and at the ends of the pieces.
-
-    Each quantity is a pair of values and times [s] since the piece's start, both (K, 6, B, M).
-    """
+    """Return angles, rates and accelerations (K, 6, B, M) at K extrema and ends, with times [s]."""
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []
@@ -265,11 +262,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test a motion's start, continuity and joint limits.
-
-    Returns measurements, tests (failed, excess, time) by name, and by test the worst joint (B,)
-    str.
-    """
+    """Test a motion's start, continuity and limits; return measurements, tests and worst joints."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -314,10 +307,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return by kind of obstacle the least distance (B,) [m], its time (B,) [s] and its part (B,).
-
-    `turning` (B, M) [rad/s] bounds the norm of the joint rates in each piece.
-    """
+    """Return the least distance (B,) [m] to each kind of obstacle, its time and its part."""
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
@@ -345,10 +335,7 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and joint angles (6, B, S) [rad] of the plans `lanes` at S samples.
-
-    Each piece has `count` (B, M) samples. Plans with fewer than S samples repeat their last sample.
-    """
+    """Return times (B, S) [s] and angles (6, B, S) [rad], `count` (B, M) samples a piece."""
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
     rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]

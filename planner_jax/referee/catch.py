@@ -378,10 +378,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test that the catch times are positive, rise, agree with the pieces, and keep the horizon.
-
-    Every piece up to the last catch must have a positive duration, no later piece a negative one.
-    """
+    """Test that the catch times are positive, rise, agree with the pieces, and keep the horizon."""
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)

@@ -1,7 +1,4 @@
-"""Clearance of a moving rectangle, a car's body, from convex polygons, in float64 NumPy.
-
-World frame in the plane, SI units. The referee of interceptions calls this module.
-"""
+"""Clearance of a moving rectangle, a car's body, from convex polygons, in float64 NumPy."""
 
 import numpy as np
 
@@ -81,11 +78,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons.
-
-    The offset is the inner product of normal and corner. For an edge between equal corners it is
-    infinite.
-    """
+    """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons."""
     edge = np.roll(corners, -1, axis=-2) - corners
     area = (corners[..., 0] * edge[..., 1] - corners[..., 1] * edge[..., 0]).sum(axis=-1)
     length = np.linalg.norm(edge, axis=-1)

@@ -287,11 +287,7 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 
 
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
-    """Test that the impact time is positive, ends the trajectory, and precedes the ball's landing.
-
-    A ball that is below the ground at the impact landed about depth / |vertical speed| seconds
-    earlier.
-    """
+    """Test that the impact time is positive, ends the trajectory, and is before the landing."""
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)
     height = np.minimum(case["ball.pos"][:, 2], ball[2])

@@ -269,10 +269,7 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def _start(case: dict, allowed: float) -> tuple:
-    """Test that pose, speed and curvature at time 0 are the case's; return (failed, error, time).
-
-    The error is the largest of four in SI units: distance, heading, speed and curvature.
-    """
+    """Test pose, speed and curvature at time 0 against the case; return (failed, error, time)."""
     away = case["plan.start"] - case["start"]
     errors = [
         np.linalg.norm(away[:, :2], axis=1),
@@ -333,11 +330,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 
 
 def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate the motion; return times (B, S) [s] and poses (B, S, 3) of the body's middle.
-
-    Each piece lasts `span` (B,) [s]. Plans that need fewer than S samples repeat the end of each
-    piece.
-    """
+    """Integrate the motion; return times (B, S) [s] and poses (B, S, 3) of the body's middle."""
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
     v0, k0 = v[:, :-1], k[:, :-1]

@@ -177,10 +177,7 @@ def cores() -> int:
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
-    """Test for each of B plans whether all numbers of its case and plan are finite.
-
-    Arrays of `limits` and arrays named in `unbounded` may be infinite, but not NaN.
-    """
+    """Test whether all numbers of B plans are finite; limits and `unbounded` may be infinite."""
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded

@@ -122,11 +122,7 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 
 
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans that `judge_motion` needs, except the head state.
-
-    Limits of acceleration, thrust and rotors that are None, and no recovery trajectory, have no
-    entry.
-    """
+    """Read the arrays of cases and plans that `judge_motion` needs, except the head state."""
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
     leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
@@ -298,9 +294,7 @@ def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Find the fastest rotation of the thrust between two neighbouring samples.
 
-    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step. It
-    detects a thrust that passes through zero between samples, where the quadrotor would have to
-    flip.
+    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step.
     """
     tau = acc.copy()
     tau[2] += gravity
@@ -407,10 +401,7 @@ def judge_motion(
 
 
 def _judge_rest(case: dict, pieces: Pieces, continuity: float) -> dict:
-    """Test that recovery trajectories end at standstill; the result is empty without a recovery.
-
-    Velocity, acceleration and jerk at the end count as displacement [m], as in `joint_errors`.
-    """
+    """Test that recovery trajectories end at standstill; the result is empty without a recovery."""
     if "recovery.coeffs" not in case:
         return {}
     durations = case["recovery.durations"]

@@ -90,10 +90,7 @@ def quaternion_rotation(quaternion: Array) -> Array:
 
 
 def _joint_rotations(arm: Arm, angles: Array) -> Array:
-    """Return the rotations (6, 3, 3) of links relative to the previous links, at angles (6,) [rad].
-
-    The rotation of a joint about its axis is given by Rodrigues' formula.
-    """
+    """Return rotations (6, 3, 3) of links relative to the previous links, at angles (6,) [rad]."""
     turn = quaternion_rotation(jnp.asarray(arm.turn))
     axis = jnp.asarray(arm.axis)
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]

@@ -117,10 +117,7 @@ def inverse_kinematics(arm: Arm, rotation: Array, middle: Array) -> tuple[Array,
 def _arm_angles(
     geometry: _Geometry, wrist: Array, front: Array, elbow: Array
 ) -> tuple[Array, Array]:
-    """Return angles (3,) [rad] of joints 1 to 3 that bring the wrist centre to a point (3,) [m].
-
-    Also return whether the arm reaches the point. `_ARM_BRANCHES` explains `front` and `elbow`.
-    """
+    """Return angles (3,) [rad] of joints 1 to 3 for a wrist centre, and whether it is reached."""
     x, y, z = wrist
     lateral, upper_arm, forearm = geometry.lateral, geometry.upper_arm, geometry.forearm
     # The slack allows for rounding errors at points to which the arm is fully stretched.

@@ -36,10 +36,7 @@ _ORIGIN = (0.0, 0.0, 0.0)
 
 @functools.cache
 def irb1600() -> Arm:
-    """Return the arm ABB IRB 1600-6/1.2 with a square shield of 0.30 m, NumPy float32 leaves.
-
-    The file `models/irb1600.xml` contains the numbers and names their sources.
-    """
+    """Return the arm ABB IRB 1600-6/1.2 with a square shield of 0.30 m (`models/irb1600.xml`)."""
     models = importlib.resources.files("planner_jax.robot") / "models"
     return read_arm((models / "irb1600.xml").read_text("utf-8"))
 

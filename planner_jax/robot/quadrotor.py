@@ -59,10 +59,7 @@ class QuadrotorLimits:
         return least, none + jnp.inf if self.max_thrust is None else self.max_thrust
 
     def scale(self, factor: float, gravity: Array) -> "QuadrotorLimits":
-        """Return limits with speed, acceleration, body rate and thrust scaled by a factor.
-
-        For the limits of thrust, the factor is applied to their differences from `gravity`.
-        """
+        """Return limits scaled by a factor; for thrusts, by their differences from `gravity`."""
         limits = {"speed": factor * self.speed, "body_rate": factor * self.body_rate}
         if self.acceleration is not None:
             limits["acceleration"] = factor * self.acceleration
@@ -119,10 +116,7 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Return the three components (...) of the body rate [rad/s] in the body frame.
-
-    Heading and arguments are as for `body_rate_squared`.
-    """
+    """Return the three components (...) of the body rate [rad/s] in the body frame."""
     tx, ty, az = components(acc)
     tz = az + gravity
     jx, jy, jz = components(jerk)
@@ -160,10 +154,7 @@ def rotor_thrusts(
 
 
 def tangent_basis(normal: Array) -> tuple[Array, Array]:
-    """Return the body x and y axes (3,) at zero heading for a body z axis `normal` (3,).
-
-    By the Hopf fibration they are smooth functions of the z axis, unless it points straight down.
-    """
+    """Return the body's x and y axes (3,) at zero heading for its z axis `normal` (3,)."""
     x, y, z = components(normal)
     k = reciprocal(at_least(1.0 + z, 1e-6))
     return (
@@ -173,10 +164,7 @@ def tangent_basis(normal: Array) -> tuple[Array, Array]:
 
 
 def flat_attitude(acc: Array, jerk: Array, gravity: Array) -> tuple[Array, Array]:
-    """Return the rotation (3, 3) from body to world frame, and the body rate (3,) [rad/s].
-
-    At zero heading they are functions of acceleration and jerk (3,), by differential flatness.
-    """
+    """Return rotation (3, 3) from body to world, and body rate (3,) [rad/s], at zero heading."""
     z = body_z(acc, gravity)
     size = jnp.sqrt(jnp.maximum(jnp.sum(net_thrust(acc, gravity) ** 2), 1e-2))
     z_dot = (jerk - jnp.sum(jerk * z) * z) / size
@@ -309,10 +297,7 @@ class QuadrotorPlan(Plan):
 
 
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return the fields of `QuadrotorSetpoints`, except `time`, of one plan at a time () [s].
-
-    `leaves` are the trajectory and the magnitude of gravity [m/s^2].
-    """
+    """Return a plan's setpoint, except `time`, at a time () [s]; `leaves` are path and gravity."""
     path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
     return {

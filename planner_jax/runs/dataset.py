@@ -28,10 +28,7 @@ class DamagedPart(ValueError):
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
-    """Return the bytes of a Parquet file with some rows, and with a record in its metadata.
-
-    Only text is encoded by a dictionary, and lists are not compressed, since that saves little.
-    """
+    """Return the bytes of a Parquet file with some rows, and with a record in its metadata."""
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]
     others = [field.name for field in rows.schema if not pa.types.is_list(field.type)]
@@ -99,10 +96,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return the reasons why files are damaged, by path.
-
-        If all files are sound but do not hold `num` rows, a reason is returned for the folder.
-        """
+        """Return the reasons why files are damaged, or do not hold `num` rows, by path."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:

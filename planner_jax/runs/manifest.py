@@ -1,7 +1,4 @@
-"""JSON files of runs, such as `manifest.json`: their format version, and a digest against damage.
-
-The entry `format` is the version of the format, the entry `digest` the SHA-256 of all others.
-"""
+"""JSON files of runs, such as `manifest.json`, with their format version and a SHA-256 digest."""
 
 import hashlib
 import json

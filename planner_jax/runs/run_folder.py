@@ -61,11 +61,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def create(self, manifest: Entries) -> Iterator[None]:
-        """Create the folder, write the first manifest, and hold the lock within the `with` block.
-
-        Raises:
-            ArgumentError: the folder cannot be created, or is not empty.
-        """
+        """Create the folder with its first manifest, and hold the lock within the `with` block."""
         self._made = [p for p in [self.path, *self.path.absolute().parents] if not p.exists()]
         with self.lock():
             self._require_empty()  # another process may have written a run since `require_new`
@@ -78,11 +74,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Create the folder if it is missing, and hold its lock within the `with` block.
-
-        Raises:
-            ArgumentError: another process holds the lock, or the folder cannot be written.
-        """
+        """Hold the folder's lock within the `with` block; raise `ArgumentError` if it is held."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
@@ -109,10 +101,7 @@ class RunFolder:
             yield
 
     def _acquire(self, handle: int) -> None:
-        """Lock an open file; raise `ArgumentError` if another process holds the lock for 0.2 s.
-
-        A process that only checks the folder holds the lock for a shorter time.
-        """
+        """Lock an open file; raise `ArgumentError` if another process holds the lock for 0.2 s."""
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
                 return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -145,11 +145,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
-    """Return the settings of a run, of class `kind`, from the `parameters` in its manifest.
-
-    Raises:
-        ArgumentError: the class does not accept the settings, because another version wrote them.
-    """
+    """Return a run's settings, of class `kind`, from its manifest, or raise `ArgumentError`."""
     try:
         return kind(**parameters)
     except (TypeError, ValueError) as error:

@@ -11,12 +11,7 @@ from planner_jax.runs.manifest import Entries
 
 
 def wilson_interval(successes: int, num: int) -> tuple[float, float]:
-    """Return the 95 % Wilson confidence interval of a success rate.
-
-    Args:
-        successes: number of successful trials.
-        num: number of trials; without any trial the interval is (0, 1).
-    """
+    """Return the 95 % Wilson confidence interval of a success rate; (0, 1) without any trial."""
     if num == 0:
         return 0.0, 1.0
     found = binomtest(successes, num).proportion_ci(0.95, "wilson")

@@ -80,10 +80,7 @@ def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
 
 
 def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
-    """Return a call's result and its duration [s] without compilation.
-
-    The call is repeated up to three times until JAX compiles nothing.
-    """
+    """Return a call's result and its duration [s] without compilation, by at most three calls."""
     for _ in range(_WARM_CALLS - 1):
         found, seconds, warm = measure(call)
         if warm:

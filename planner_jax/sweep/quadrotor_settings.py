@@ -1,7 +1,4 @@
-"""Settings that the sweeps of hits and catches share, because both robots are quadrotors.
-
-Neither JAX nor NumPy is imported before a setting names a robot, so that help appears at once.
-"""
+"""Settings that the sweeps of hits and catches share, because both robots are quadrotors."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -23,11 +20,7 @@ def robot_option(usual: str) -> Any:
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the `QuadrotorModel` for a setting: a name, a file, a mapping, a model, or None.
-
-    Raises:
-        ArgumentError: no such robot, its file has errors, or its tool is not `tool`.
-    """
+    """Return the robot for a setting (name, file, mapping, model), or raise `ArgumentError`."""
     if given is None:
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of

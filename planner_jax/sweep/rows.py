@@ -43,11 +43,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
 
 
 def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Restore the plan from a stored row of results, with the referee's reason for rejecting it.
-
-    Raises:
-        ArgumentError: the folder does not hold a complete, finished sweep, or has no such row.
-    """
+    """Restore the plan from a stored row of results, with the referee's reason for rejecting it."""
     manifest, sweep = read_finished(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:

@@ -154,11 +154,7 @@ def sweep_of(task: Task) -> Sweep:
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep object for a run's task; errors name the run's path as argument `name`.
-
-    Raises:
-        ArgumentError: the run is not a sweep, or its task is not installed.
-    """
+    """Return the sweep object for a run's task, or raise `ArgumentError` about argument `name`."""
     first, _, task = str(manifest["kind"]).partition(" ")
     if first != "sweep":
         raise ArgumentError(name, "the folder of a sweep", shown=f"a {manifest['kind']}")

@@ -65,10 +65,7 @@ def require_draw(num: int, seed: int, first: int) -> None:
 
 
 def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
-    """Make a random generator for each of `num` cases, seeded by suite, seed and the case's index.
-
-    A case therefore does not depend on other cases. `first` is the index of the first case.
-    """
+    """Make a random generator for each of `num` cases from suite, seed and the case's index."""
     require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
@@ -144,10 +141,7 @@ def judge_by(
 
 
 def require_settings(referee: Callable[..., object], settings: dict[str, object]) -> None:
-    """Raise unless every setting is a keyword argument of a referee and has its default's type.
-
-    If the referee has a parameter `**kwargs`, settings without an own parameter are not checked.
-    """
+    """Raise unless every setting is a keyword argument of a referee and has its default's type."""
     known = inspect.signature(referee).parameters
     accepts_any = any(each.kind is each.VAR_KEYWORD for each in known.values())
     for name, value in settings.items():

@@ -74,10 +74,7 @@ def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` if a quadrotor starts below its limit `min_height`.
-
-    Nothing is checked inside a JAX transformation, where arrays have no values yet.
-    """
+    """Raise `CaseError` if a quadrotor starts below its `min_height`; traced cases pass."""
     heights = cases.head_state[..., 0, 2], cases.limits.min_height
     if any(isinstance(each, Tracer) for each in heights):
         return

@@ -20,11 +20,7 @@ class PiecewisePolynomial:
 
 @struct.dataclass
 class Motion:
-    """Samples of a trajectory at N times, at which limits are evaluated.
-
-    In a CUDA kernel each vector is a tuple of its three components, and of the position only the
-    height is present.
-    """
+    """Samples of a trajectory at N times, at which limits are evaluated."""
 
     height: Array  # (N,) [m]
     vel: Array  # (N, 3) [m/s]
@@ -157,10 +153,7 @@ def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.cache
 def shift_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors and powers (size, size) of t that shift a polynomial's origin by t.
-
-    Coefficient j contributes C(j, i) t^(j - i) to the new coefficient i: the Taylor series at t.
-    """
+    """Return factors and powers (size, size) of t that shift a polynomial's origin by t."""
     indices = np.arange(size)
     factors = np.array([[math.comb(j, i) for j in indices] for i in indices])
     return factors, np.maximum(indices - indices[:, None], 0)

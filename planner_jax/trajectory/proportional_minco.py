@@ -80,10 +80,7 @@ class ProportionalMinco:
 
 @functools.cache
 def _hermite_map(order: int) -> np.ndarray:
-    """Return the matrix (2s, 2s) from end derivatives to the coefficients of a unit-time piece.
-
-    The columns are the derivatives 0 to s - 1 at time 0, then at time 1.
-    """
+    """Return the matrix (2s, 2s) from end derivatives to the coefficients of a unit-time piece."""
     size = 2 * order
     ends = np.zeros((size, size))
     for d in range(order):
@@ -249,10 +246,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
-    """Return the integral () of |p^(s)|^2 over the trajectory.
-
-    The trajectory has boundary rows (2s, 3), whitened offsets y (O, 3) and h = `piece_duration`.
-    """
+    """Return the integral () of |p^(s)|^2 for boundary rows (2s, 3) and whitened offsets (O, 3)."""
     boundary = boundary_energy(maps, rows, piece_duration)
     return boundary + offset_energy(maps, offsets, piece_duration)
 

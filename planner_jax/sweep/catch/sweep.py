@@ -32,10 +32,7 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts of successes, and means of targets caught, catch times and optimal time ratios.
-
-    This ratio is the mean relative difference of decided and optimised catch times.
-    """
+    """Counts of successes, and means of targets caught, catch times and optimal time ratios."""
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 

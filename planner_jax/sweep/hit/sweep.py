@@ -40,11 +40,7 @@ class ServeSource(Source):
     folder: Serves | None  # all serves of published files, if the settings name a folder of files
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the chunk of cases `first` to `last - 1`, with their serves as its `origin`.
-
-        Raises:
-            ArgumentError: a case breaks a rule, or its ball lands before planning starts.
-        """
+        """Return cases `first` to `last - 1` with their serves, or raise `ArgumentError`."""
         settings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]

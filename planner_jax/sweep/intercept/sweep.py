@@ -17,10 +17,7 @@ COMPARED = ("lattice", "spacetime")  # planners that also plan the run's example
 
 
 class InterceptTally(Tally):
-    """Counts of successes, and means of meeting time, miss distance and acceleration.
-
-    The report's example is a success in which the car passes a moving obstacle closely.
-    """
+    """Counts of successes, and means of meeting time, miss distance and acceleration."""
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
     READS = (*COUNTED, *MEANS, "mover_clearance")

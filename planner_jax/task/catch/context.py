@@ -1,8 +1,4 @@
-"""Functions that all catch planners share.
-
-They sort the targets by the order of catching, find attitudes of the net, and find cases in which
-the quadrotor cannot reach a target.
-"""
+"""Functions of all catch planners: order of targets, attitudes of the net, targets out of reach."""
 
 import jax
 import jax.numpy as jnp
@@ -50,10 +46,7 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) of the angles between the net's axis and the reversed velocities (N, 3).
-
-    Also return whether each target moves, (N,) bool; for others the cosine has no meaning.
-    """
+    """Return cosines (N,) between the net's axis and reversed velocities (N, 3), and which move."""
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))

@@ -76,10 +76,7 @@ def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
 
 @struct.dataclass
 class _Partial:
-    """State of a beam search: W sequences of catches, each of the same length so far.
-
-    The shortfall of a catch is the distance [m] by which the quadrotor is estimated to miss.
-    """
+    """State of a beam search: W sequences of catches, each of the same length so far."""
 
     rank: Array  # (W,) [s], the least is best; infinite in rows that hold no sequence
     short: Array  # (W,) [m], sum of the shortfalls

@@ -39,10 +39,7 @@ class Timetable:
 
 
 def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Return K times (N, K) [s] up to the horizons of N targets, and states and speeds then.
-
-    The states are (N, 3, K), with the times on the last axis, because CPUs vectorise along it.
-    """
+    """Return K times (N, K) [s] up to N targets' horizons, and states (N, 3, K) and speeds then."""
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares[None]
     along = lambda target, at: over_lanes(functools.partial(state_at, target))(at)  # noqa: E731
@@ -101,10 +98,7 @@ def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """Return the sum () [m] of the shortfalls of a choice at its times; see `arrival`.
-
-    Absent targets do not count. Shortfalls of optional targets are reduced by `_MARGIN`.
-    """
+    """Return the sum () [m] of the shortfalls of a choice at its times; see `arrival`."""
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
     states = jax.tree.map(lambda leaf: leaf[..., None], targets_at(targets, times))

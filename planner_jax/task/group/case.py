@@ -1,7 +1,4 @@
-"""Cases of the task `group`: one car has to meet several moving targets, in any order.
-
-[Qu2022] plans the interception of one target. Several targets are an extension of this library.
-"""
+"""Cases of the task `group`: one car has to meet several targets, which extends [Qu2022]."""
 
 import dataclasses
 from typing import Any, ClassVar
@@ -75,10 +72,7 @@ class InterceptGroup:
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """Return the case in which the car meets the target with the index `target` () int.
-
-        The car starts in the state `car` at the time `begin` () [s], which is time 0 of the result.
-        """
+        """Return the case of the drive to a target, from the state `car` at `begin` () [s]."""
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)
         movers = shared.movers

@@ -55,10 +55,7 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the earliest meeting with the target of index `target` after the meeting `last`.
-
-    If the car is too late everywhere, the meeting is where it is too late by the least time.
-    """
+    """Estimate the car's earliest meeting with the target of an index after the meeting `last`."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]

@@ -1,8 +1,4 @@
-"""Functions that all hit planners share.
-
-They tabulate the incoming ball's flight, compute excesses over the limits of the impact, and find
-cases in which the quadrotor cannot reach the ball.
-"""
+"""Functions of all hit planners: tables of balls, limits of the impact, balls out of reach."""
 
 import jax.numpy as jnp
 import numpy as np

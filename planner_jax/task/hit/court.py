@@ -35,10 +35,7 @@ PLANNERS = ("juggle", "bat-lite", "bat")
 
 
 def _scenario_names() -> tuple[str, ...]:
-    """Return the names of the 36 scenarios, such as "NFL": serve near, landing far, target left.
-
-    Of two scenarios that are mirror images in y only one is listed, where the first L or R is an L.
-    """
+    """Return the names of the 36 scenarios, such as "NFL": serve near, landing far, target left."""
     return tuple(
         serve + landing + target
         for serve in "NFL"
@@ -51,11 +48,7 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return the bounds (4, 2, 2) [m] of the regions.
-
-    The axes are: region in the order of `REGIONS`; coordinate |x| or y; lower or upper bound. The
-    far and side regions end at |x| = depth.
-    """
+    """Return bounds (4, 2, 2) [m] of the regions: region, coordinate |x| or y, lower or upper."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)
@@ -63,10 +56,7 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Return serve, landing and target region (..., 3) of scenarios (...), indices in SCENARIOS.
-
-    Regions are numbered from 1 to 4 in the order of REGIONS.
-    """
+    """Return serve, landing and target region (..., 3), 1 to 4, of scenario indices (...)."""
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 

@@ -189,10 +189,7 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return the horizontal speeds [m/s] of serves that land at distances [m], by Newton's method.
-
-    Also return the derivatives of the speeds by the distances [1/s], and the flight times [s].
-    """
+    """Return serves' horizontal speeds [m/s] for landing distances [m], slopes and flight times."""
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
@@ -209,11 +206,7 @@ def _aim(distance: np.ndarray, rise: np.ndarray):
 
 
 def advance(serves: Serves, delay: float) -> Serves:
-    """Return serves with the balls' positions and velocities after `delay` [s] of flight.
-
-    Raises:
-        ArgumentError: the delay is negative or not finite, or a ball lands earlier.
-    """
+    """Return serves after `delay` [s] of flight; raise `ArgumentError` if a ball lands earlier."""
     if not 0.0 <= delay < math.inf:
         raise ArgumentError("delay", "finite and >= 0", delay)
     time, _ = landing(serves.position, serves.velocity, DRAG, GRAVITY)
@@ -228,10 +221,7 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Return random hover positions (N, 3) [m], uniform over the half of the court with x < 0.
-
-    They are at least 0.5 m from the net. A position depends on the serve's index and the seed only.
-    """
+    """Return random hover positions (N, 3) [m], x < -0.5 m, from serves' indices and a seed."""
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
         rows = index // _STARTS == block

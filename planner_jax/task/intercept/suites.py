@@ -348,10 +348,7 @@ def _gap(
 
 
 def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return the distance (...) [m] of points (..., 2) from convex polygons (..., V, 2); 0 inside.
-
-    The corners of a polygon are in counter-clockwise order and may be repeated.
-    """
+    """Return distances (...) [m] of points (..., 2) from convex polygons (..., V, 2); 0 inside."""
     edge = np.roll(corners, -1, axis=-2) - corners
     away = points[..., None, :] - corners
     square = np.maximum((edge**2).sum(axis=-1), 1e-12)

@@ -264,11 +264,7 @@ def ends_of(body: CarBody) -> tuple[Array, Array, Array]:
 
 
 def clearance(case: InterceptCase, drive: Motion) -> Array:
-    """Return the clearance (M,) [m] of the car at the M samples of a motion.
-
-    The clearance is the distance of the body from the nearest obstacle, or the distance of the
-    body's middle from the map's edge, whichever is less.
-    """
+    """Return the body's clearance (M,) [m] from obstacles and map's edge at M samples."""
     pos, heading = drive.pos.reshape(-1, 2), drive.heading.reshape(-1)
     times = drive.time.reshape(-1)
     middle = pos + case.body.middle * drive.direction.reshape(-1, 2)
@@ -281,10 +277,7 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
-    """Return whether the body overlaps an obstacle at the start, and whether the target is blocked.
-
-    The target is blocked if it is off the map or too close to an obstacle at the case's time.
-    """
+    """Return whether the body overlaps an obstacle at the start, and if the target is blocked."""
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
     x, y = (-(both.centre - case.start[None, :2])[:, axis, None] for axis in range(2))
