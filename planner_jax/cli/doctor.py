@@ -5,9 +5,10 @@ import os
 import platform
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 from planner_jax.core.errors import install_line
-from planner_jax.host.compile_cache import keep_compiled_programs
+from planner_jax.host.compile_cache import LIMIT, SWITCH, cache_folder, keep_compiled_programs
 from planner_jax.host.machine import usable_cores
 from planner_jax.runs.environment import environment, require_backend
 
@@ -83,14 +84,16 @@ def _precision() -> Finding:
     return Finding("precision", text, good=ours < _FULL_PRECISION)
 
 
-def _cache(folder) -> Finding:
-    if folder is None:
-        return Finding("cache", "no folder for compiled programs can be made", good=False)
-    entries = [entry for entry in folder.iterdir() if entry.is_file()]
-    size = sum(entry.stat().st_size for entry in entries) / 2**20
-    return Finding(
-        "cache", f"{len(entries)} files, {size:.0f} MiB of compiled programs in {folder}"
-    )
+def _cache(folder: Path | None) -> Finding:
+    """Report the folder of compiled programs, its size, and the limit of the default folder."""
+    if folder is None or not folder.is_dir():
+        is_off = os.environ.get(SWITCH) == "off"
+        text = f"off, by {SWITCH}" if is_off else "no folder for compiled programs can be made"
+        return Finding("cache", text, good=is_off)
+    sizes = [entry.stat().st_size for entry in folder.iterdir() if entry.is_file()]
+    limit = f" of at most {LIMIT / 1e6:,.0f} MB" if folder == cache_folder() else ""
+    programs = f"{len(sizes):,} files, {sum(sizes) / 1e6:,.0f} MB{limit} of compiled programs"
+    return Finding("cache", f"{programs} in {folder}")
 
 
 def _plans() -> Iterator[Finding]:

@@ -1,35 +1,70 @@
-"""Keep compiled programs on the disk, so that only the first run waits for the compiler."""
+"""Compiled programs on the disk, so that only the first process waits for the compiler."""
 
+import contextlib
+import functools
 import os
+import sys
+import time
 import warnings
 from pathlib import Path
 
+SWITCH = "PLANNER_JAX_CACHE"  # the environment variable that disables the cache with the value off
+# [bytes] Size above which the oldest programs are deleted. JAX's own limit is not used: for every
+# program that it writes, it lists the whole folder, which takes 0.3 s for 10,000 programs.
+LIMIT = 2 * 10**9
+_CHECKED_EVERY = 3600.0  # [s] Least time between two checks of the folder's size.
+
 
 def cache_folder() -> Path:
-    """Return the folder of compiled programs: JAX_COMPILATION_CACHE_DIR, or the user's cache."""
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.join("~", ".cache")
-    default = os.path.join(os.path.expanduser(home), "planner-jax", "jax")
-    return Path(os.environ.get("JAX_COMPILATION_CACHE_DIR") or default)
+    """Return the default folder of compiled programs, within the platform's cache folder."""
+    usual = "~/Library/Caches" if sys.platform == "darwin" else "~/.cache"
+    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser(usual)
+    return Path(home, "planner-jax", "jax")
 
 
+@functools.cache
 def keep_compiled_programs() -> Path | None:
-    """Let JAX write compiled programs to `cache_folder` and read them from there.
+    """Let JAX write compiled programs to a folder on the disk and read them from there.
 
-    The command line and the benchmarks call this function. In a program of your own call it once,
-    before the first plan.
+    The first `pj.plan` of a process and all commands call this function. Call it yourself to store
+    programs that are compiled before the first plan. The folder is
+    JAX_COMPILATION_CACHE_DIR or JAX's option `jax_compilation_cache_dir` where one of them is set,
+    else planner-jax/jax in the user's cache folder, which is limited to 2 GB. With the environment
+    variable PLANNER_JAX_CACHE=off, JAX's options are unchanged.
 
     Returns:
-        The folder, or None if it cannot be created.
+        The folder, or None if there is none or it cannot be created.
     """
     import jax
 
-    # An entry that cannot be read or written costs a compilation, not the run.
-    warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
-    folder = cache_folder()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return None
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
-    return folder
+    chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
+    if os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
+        # An entry that cannot be read or written costs a compilation, not the run.
+        warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
+        if chosen is None:
+            chosen = cache_folder()
+            try:
+                chosen.mkdir(parents=True, exist_ok=True)
+            except OSError:
+                return None
+            _delete_oldest(chosen)
+            jax.config.update("jax_compilation_cache_dir", str(chosen))
+        if jax.config.jax_persistent_cache_min_compile_time_secs == 1.0:  # type: ignore[attr-defined]
+            jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)  # 1 is the default
+    return Path(chosen) if chosen else None
+
+
+def _delete_oldest(folder: Path) -> None:
+    """Delete the programs that were used least recently while the folder is larger than `LIMIT`."""
+    checked = folder / "checked"  # its time of change is the time of the last check
+    with contextlib.suppress(OSError):  # a folder that cannot be written, or another process
+        if checked.exists() and time.time() - checked.stat().st_mtime < _CHECKED_EVERY:
+            return
+        checked.touch()
+        files = [(entry.path, entry.stat()) for entry in os.scandir(folder) if entry.is_file()]
+        excess = sum(stat.st_size for _, stat in files) - LIMIT
+        for path, stat in sorted(files, key=lambda file: max(file[1].st_atime, file[1].st_mtime)):
+            if excess <= 0:
+                return
+            os.unlink(path)
+            excess -= stat.st_size

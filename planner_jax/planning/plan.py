@@ -12,6 +12,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.planner import CaseT, Kind, Planner, PlanT, require_fit
 from planner_jax.core.protocol import Status, is_resident
 from planner_jax.core.rules import Case, has_rules, require_shapes, require_sound
+from planner_jax.host.compile_cache import keep_compiled_programs
 from planner_jax.planning.batch import Progress, Watch
 from planner_jax.planning.drive import Driver, require_pure
 
@@ -71,6 +72,7 @@ def plan(
                 "time_limit and progress", "left out inside compiled functions", shown=""
             )
         return solve(planner, cases)
+    keep_compiled_programs()
     require_fit(planner, cases)
     if chunk is not None or devices is not None:
         _require_layout(chunk, devices)

@@ -1,0 +1,87 @@
+"""The folder of compiled programs: where it is, who may choose it, and its greatest size."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from planner_jax.cli import doctor
+from planner_jax.host import compile_cache
+
+# A call of `plan` with wrong arguments raises an error, but only after the cache is set up.
+SCRIPT = """
+from concurrent.futures import ThreadPoolExecutor
+import jax
+import planner_jax as pj
+def fail(_):
+    try: pj.plan(None, None)
+    except (TypeError, AttributeError): pass
+list(ThreadPoolExecutor(4).map(fail, range(4)))
+hits = []
+jax.monitoring.register_event_listener(lambda event, **_: hits.append(event))
+jax.jit(lambda x: x + 3)(1.0)
+print(pj.keep_compiled_programs(), "/jax/compilation_cache/cache_hits" in hits)
+"""
+
+
+def run(**environment):
+    """Compile a program in a new process; return its output without the line's end."""
+    usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_COMP")}
+    usual.pop("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", None)
+    command = [sys.executable, "-c", SCRIPT]
+    done = subprocess.run(
+        command, env={**usual, **environment}, capture_output=True, text=True, check=True
+    )
+    assert done.stderr == ""
+    return done.stdout.strip()
+
+
+def test_the_first_plan_of_a_process_uses_the_cache_of_the_user(tmp_path):
+    folder = tmp_path / "planner-jax" / "jax"
+    assert run(XDG_CACHE_HOME=str(tmp_path)) == f"{folder} False"
+    assert any(folder.iterdir())
+    assert run(XDG_CACHE_HOME=str(tmp_path)) == f"{folder} True"
+
+
+def test_a_folder_that_the_user_set_in_jax_is_used_instead(tmp_path):
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    chosen = {"XDG_CACHE_HOME": str(ours), "JAX_COMPILATION_CACHE_DIR": str(theirs)}
+    assert run(**chosen) == f"{theirs} False"
+    assert any(theirs.iterdir()) and not ours.exists()
+
+
+def test_the_cache_can_be_switched_off(tmp_path):
+    assert run(XDG_CACHE_HOME=str(tmp_path), PLANNER_JAX_CACHE="off") == "None False"
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_folder_that_cannot_be_created_does_not_stop_the_process(tmp_path):
+    (tmp_path / "file").touch()
+    assert run(XDG_CACHE_HOME=str(tmp_path / "file")) == "None False"
+
+
+def test_programs_that_were_used_least_recently_are_deleted(tmp_path, monkeypatch):
+    monkeypatch.setattr(compile_cache, "LIMIT", 250)
+    for age, name in enumerate(("new", "middle", "old", "oldest")):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, times=(1e9 - age, 1e9 - age))
+    compile_cache._delete_oldest(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"new", "middle", "checked"}
+    (tmp_path / "more").write_bytes(bytes(200))
+    compile_cache._delete_oldest(tmp_path)  # The last check was less than an hour ago.
+    assert (tmp_path / "new").exists()
+    compile_cache._delete_oldest(tmp_path / "missing")
+
+
+@pytest.mark.parametrize("switch", ["on", "off"])
+def test_the_doctor_names_folder_size_and_limit(tmp_path, monkeypatch, switch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("PLANNER_JAX_CACHE", switch)
+    folder = compile_cache.cache_folder()
+    folder.mkdir(parents=True)
+    (folder / "program").write_bytes(bytes(3_000_000))
+    text = f"1 files, 3 MB of at most 2,000 MB of compiled programs in {folder}"
+    assert doctor._cache(folder) == doctor.Finding("cache", text)
+    assert "at most" not in doctor._cache(tmp_path).text
+    assert doctor._cache(None).good is (switch == "off")
