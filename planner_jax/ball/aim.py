@@ -35,9 +35,8 @@ def aim_with_drag(
     """Return the initial velocity with which a ball with quadratic drag reaches a target.
 
     The ball starts at `pos`, and is at `target` after `flight_time` > 0 [s]. Newton's method starts
-    from the drag-free velocity. Two steps integrate the flight coarsely with its Jacobian, and two
-    more steps integrate it finely and reuse the last Jacobian. The implicit function theorem gives
-    the derivatives of the result.
+    from the drag-free velocity: two steps on a coarse flight, then two on a fine one. The implicit
+    function theorem gives the derivatives.
     """
     return _aim(target - pos, jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity))
 

@@ -71,8 +71,8 @@ def ekf_init(
         vel: (3,) [m/s].
         pos_std: () or (3,) [m], standard deviation of each coordinate; it may be large.
         vel_std: () or (3,) [m/s], standard deviation of each coordinate. In float32 keep vel_std
-            times the time between observations below 1000 times the standard deviation of an
-            observation. At a factor of 3000 rounding destroys the covariance.
+            times the time between observations below 1000 times an observation's standard
+            deviation.
     """
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
@@ -84,9 +84,8 @@ def ekf_predict(
     """Predict the belief after `duration` [s] >= 0 without an observation.
 
     The covariance P becomes F P F' + Q. F is the Jacobian of the flight, and Q the covariance that
-    a white acceleration causes during `duration`. With `linear_drag_flight` this is
-    [Yu2023catch, eq. 10], except that the paper advances the position by v dt only. With `rk4_step`
-    the whole duration is one Runge-Kutta step.
+    a white acceleration causes during `duration`. With `linear_drag_flight` this is [Yu2023catch,
+    eq. 10], except that the paper advances the position by v dt only.
     """
 
     def transition(mean: Array) -> Array:

@@ -31,8 +31,7 @@ def table_kernel(
     Args:
         num_nodes: number N of nodes.
         moving: indices of arguments other than the position. If there are any, the kernel returns
-            derivatives by these arguments instead of states: derivatives of the positions, then of
-            the velocities, each (N, 3), or (N, 3, 3) by the velocity.
+            derivatives of positions, then of velocities, by them.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 

@@ -21,14 +21,10 @@ _INTERRUPTED = 130  # exit code after Ctrl-C
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command of `planner-jax`.
+    """Run one command of `planner-jax`, by default with the arguments of the process.
 
-    Args:
-        arguments: words of the command line; by default the arguments of the process.
-
-    Returns:
-        The exit code: 0 for success, 1 if the command fails, 2 for a bad argument, 130 after
-        Ctrl-C. In a process that handles signals by `stopping.listen`, Ctrl-C ends the process.
+    Returns the exit code: 0 for success, 1 if the command fails, 2 for a bad argument, 130 after
+    Ctrl-C.
     """
     flags: dict[str, str] = {}  # by name of an argument, its option, such as "num": "--num"
     try:

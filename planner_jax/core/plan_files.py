@@ -72,8 +72,6 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
     """Load a file of `save_arrays` as the first of several classes whose fields it contains.
 
-    A file of a derived class is read as its base class, without the fields of the derived class.
-
     Raises:
         PlanFileError: the file contains none of the classes, another version, or something else.
     """

@@ -152,10 +152,8 @@ def split_name(
 ) -> tuple[str, str]:
     """Split a name such as "policy:FILE" into the known name and the file, "" if there is none.
 
-    `kind` is the noun for the named objects, and `from_file` lists the names that may have a file.
-
     Raises:
-        UnknownName: the name is not known, or takes no file.
+        UnknownName: the name is not known as a `kind`, or takes no file (see `from_file`).
     """
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     own = require_name(known, kind, own)

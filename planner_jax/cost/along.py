@@ -1,9 +1,8 @@
 """Penalties integrated along trajectories with pieces of fixed proportions [Yu2023catch, eq. 26].
 
 This is the innermost part of every search. On a GPU one CUDA kernel computes it (`along_kernel`),
-which keeps the samples of a trajectory in registers. Further kernels compute its slopes (first
-derivatives) and their derivatives along a direction. On other devices, and for all other
-derivatives, JAX compiles the functions of this module. They are the reference for the kernels.
+which keeps the samples of a trajectory in registers. Further kernels compute derivatives. On other
+devices JAX compiles the functions of this module.
 """
 
 import dataclasses

@@ -1,10 +1,8 @@
 """Penalties of `cost.along` with second derivatives, all or some of them, for Newton's method.
 
-The samples of a motion are linear in a segment's columns (boundary rows and waypoint offsets), and
-each limit depends on few derivatives of the motion. So the Hessian is a sum over samples and pairs
-of derivatives: a number times an outer product of constant rows. This is one product with a
-constant matrix for each pair of axes, for any number of problems in a batch. `jax.hessian` would
-need one tangent for each unknown. Only the requested entries are computed.
+Samples are linear in a segment's columns (boundary rows and waypoint offsets), and a limit depends
+on few derivatives of the motion. So the Hessian is one product with a constant matrix for each pair
+of axes, where `jax.hessian` would need one tangent for each unknown.
 """
 
 import dataclasses

@@ -1,9 +1,8 @@
 """A CUDA kernel for `integrate_along` on many lanes, that is, problems of a batch.
 
-One thread computes one lane. It reads the columns of a segment once, computes its samples one after
-another from rows of the constant matrices, and sums the penalties. The transposed product gives
-their slopes (derivatives by the columns). Only columns and results pass through memory. If there
-are few lanes, several threads divide the samples of one lane among them.
+One thread computes one lane: it reads a segment's columns, computes the samples one after another,
+and sums the penalties and their slopes (derivatives by the columns). If there are few lanes,
+several threads divide the samples of one lane among them.
 """
 
 import dataclasses

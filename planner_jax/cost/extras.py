@@ -3,9 +3,8 @@
 An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, which are
 pure and for one case. The planner calls them with jax arrays, and the referee calls `excess` with
 float64 NumPy arrays: use operators and the methods of both. Other values of the arrays need no new
-compilation, but another class does. The search evaluates samples some centimetres apart. The check
-of a finished plan evaluates samples every few millimetres, and the tangents between them. Smaller
-obstacles may be missed.
+compilation, but another class does. The search evaluates samples some centimetres apart, and the
+check of a finished plan every few millimetres. Smaller obstacles may be missed.
 """
 
 from collections.abc import Sequence

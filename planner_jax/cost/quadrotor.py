@@ -36,7 +36,7 @@ def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """Return |a|^2 / a_max^2 - 1 for accelerations (..., 3) [m/s^2], or -1 without a limit."""
+    """Return |a|^2 / a_max^2 - 1 [Yu2023bat, eq. 18a] of (..., 3) [m/s^2]; -1 without limit."""
     if limits.acceleration is None:
         return 0.0 * components(acc)[0] - 1.0
     return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0

@@ -21,8 +21,8 @@ _BYTES = 4 * (4 * POWERS + 1)  # [bytes], memory of one piece
 def poly4d(plan: QuadrotorPlan) -> np.ndarray:
     """Return the M polynomial pieces of a plan as rows (M, 33) float32.
 
-    A row has the duration [s], then eight coefficients each of x, y, z [m] and yaw [rad]. They are
-    the coefficients of rising powers of the time [s] since the piece's start. The yaw is zero.
+    A row has the duration [s], then eight coefficients of rising powers each of x, y, z [m] and yaw
+    [rad].
 
     Raises:
         ArgumentError: the plan cannot be exported, its degree is above 7, it has more pieces than

@@ -34,8 +34,8 @@ def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np
         body_rate: (K, 3) [rad/s], in the body frame.
 
     Returns:
-        yaw: (K,) [rad], counter-clockwise from east; 0 if the x axis is vertical within 1e-6.
-        rate: (K,) [rad/s], rate of the yaw; 0 if the x axis is vertical within 1e-6.
+        (K,) [rad], counter-clockwise from east, and its rate (K,) [rad/s]; both are 0 if the x axis
+        is vertical within 1e-6.
     """
     forward, left, up = (rotate(quat_wxyz, axis) for axis in np.eye(3))
     moved = body_rate[:, 2:] * left - body_rate[:, 1:2] * up  # derivative of `forward`

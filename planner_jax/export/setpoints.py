@@ -98,11 +98,7 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
-    """Return the setpoints `plan.sample(rate)` of one plan, after checks of plan and rate.
-
-    Args:
-        plan: solved plan of a quadrotor, a car or an arm.
-        rate: [Hz], setpoints per second.
+    """Return the setpoints `plan.sample(rate)` of one plan of a robot at a rate [Hz].
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is

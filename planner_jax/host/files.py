@@ -24,11 +24,7 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Provide a scratch file, which replaces the file `path` if the block ends without an error.
 
     The scratch file is flushed to the disk before it is renamed, and the folder afterwards. Its
-    name holds the number of the process, and ends with the name of the file, because some writers
-    derive the format from the suffix.
-
-    Args:
-        path: file to replace.
+    name ends with the name of the file, because some writers derive the format from the suffix.
 
     Raises:
         OSError: the file cannot be written; its `filename` is `path`.

@@ -1,11 +1,10 @@
 """Handling of Ctrl-C, SIGTERM and SIGHUP: the command prints one line and exits with its own code.
 
-By default a signal ends the process at once. A separate thread does this, because the main thread
-may be inside the compiler. No file is half-written then, because files are renamed into place when
-they are complete. Within `under_way` the first signal only sets a flag. The main thread calls
-`check` where it can stop cleanly, and has `GRACE` seconds to do so. No exception is raised
-elsewhere, so that no signal is lost or causes a traceback. The process exits without shutting the
-interpreter down, because XLA's threads that still compute would crash.
+A separate thread ends the process at once, because the main thread may be inside the compiler. No
+file is half-written then, because complete files are renamed into place. Within `under_way` the
+first signal only sets a flag, and the main thread has `GRACE` seconds to call `check`, where it can
+stop cleanly. The process exits without shutting the interpreter down, because XLA's threads that
+still compute would crash.
 """
 
 import contextlib

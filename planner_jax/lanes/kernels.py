@@ -1,9 +1,8 @@
 """The functions that have a CUDA kernel for batches, and the switch for all kernels.
 
-A lane is one problem of a batch. A function of one lane that has a kernel is compiled by `jax.jit`
-under its own name, because only this name survives all transformations of an enclosing function.
-`over_lanes` finds a call with that name and calls the kernel for all lanes instead. The module of a
-kernel is imported when a program for a GPU is traced, and never on a machine without a GPU.
+A lane is one problem of a batch. `jax.jit` compiles a function that has a kernel under its own
+name, since only this name survives all transformations. `over_lanes` finds a call with that name
+and calls the kernel for all lanes instead. Kernels are imported when a program for a GPU is traced.
 """
 
 import dataclasses

@@ -1,9 +1,8 @@
 """`over_lanes`: it works as `jax.vmap`, but keeps the batch axis last in every array.
 
-A lane is one problem of the batch. `vmap` puts the lanes first, so that the few numbers of one lane
-are neighbours in memory. If a loop is limited by memory speed, neighbours should be the same number
-of different lanes. Then every read is one whole line of memory, a sum over samples needs no
-exchange between threads, and the product with a constant matrix is one large product.
+A lane is one problem of the batch. With the lanes last, neighbours in memory are the same number of
+different lanes. Then every read is one whole line of memory, a sum over samples needs no exchange
+between threads, and the product with a constant matrix is one large product.
 """
 
 import functools
@@ -56,10 +55,10 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
         function: takes pytrees of arrays of ONE lane, and returns a pytree of arrays.
 
     Returns:
-        A function of the same pytrees with the lanes as one more, last, axis on every leaf. Its
-        results have the lanes last, too. Up to rounding it equals `jax.vmap` with all axes -1. It
-        is meant for use inside a compiled function. It cannot be differentiated if `function` has
-        custom derivatives; differentiate within `function` instead.
+        A function of the same pytrees with the lanes as one more, last, axis on every leaf. Up to
+        rounding it equals `jax.vmap` with all axes -1. Call it inside a compiled function. It
+        cannot be differentiated if `function` has custom derivatives; differentiate within
+        `function`.
     """
 
     @functools.wraps(function)

@@ -1,9 +1,7 @@
 """Live planning without the socket: a packet with a measurement in, a packet with setpoints out.
 
-The robot always follows a course, a trajectory that ends at standstill: at first from its first
-reported state, later a plan that meets the ball, with a recovery trajectory. An answer has the next
-setpoints. Planning runs in a separate thread. An answer waits for a new plan only for a fraction of
-the deadline.
+The robot always follows a course, which ends at standstill, and an answer has its next setpoints.
+Planning runs in a separate thread, for which an answer waits only for a fraction of the deadline.
 """
 
 import concurrent.futures

@@ -37,7 +37,7 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
 
     Args:
         case: one case, whose limits and obstacles the recovery respects.
-        found: plan of a quadrotor, a car or an arm for this case; its motion is not changed.
+        found: plan of a quadrotor, a car or an arm for this case.
         to: "brake", or for a quadrotor also "home"; see `with_recovery.add_recovery`.
 
     Returns:

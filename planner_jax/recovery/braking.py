@@ -34,15 +34,7 @@ _SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints 
 
 
 def brake_car(case: PyTree, plan: CarPlan) -> CarPlan:
-    """Extend the plan of a car by braking, until the car stands still.
-
-    Args:
-        case: one case, with limits, body, map and obstacles.
-        plan: the plan of this case.
-
-    Raises:
-        NoRecovery: every candidate collides.
-    """
+    """Extend the plan of a car by braking; raise `NoRecovery` if every candidate collides."""
     why = ""
     knots = (jnp.asarray(plan.speed), jnp.asarray(plan.curvature))
     begin = pose_at(jnp.asarray(plan.start), plan.time, *knots, plan.time)
@@ -92,13 +84,8 @@ def _car_problem(
 ) -> str:
     """Describe the collision of a car that brakes from a pose (3,), or return "".
 
-    Args:
-        case: one case, as for `brake_car`.
-        begin: (3,), pose at the end of the plan.
-        since: [s], duration of the plan.
-        time: [s], duration of braking.
-        speed: (n + 1,) [m/s], at knots.
-        curvature: (n + 1,) [1/m], at knots.
+    The plan of `case` lasts `since` [s], and braking `time` [s]; speed and curvature are at (n +
+    1,) knots.
     """
     times = np.linspace(0.0, time, _SAMPLES)
     poses = np.asarray(_poses(begin, time, jnp.asarray(speed), jnp.asarray(curvature), times))
@@ -126,18 +113,10 @@ _poses = jax.jit(jax.vmap(pose_at, in_axes=(None, None, None, None, 0)))
 
 
 def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
-    """Extend the plan of an arm by braking, until the arm stands still.
+    """Extend the plan of an arm by braking; raise `NoRecovery` if every candidate fails.
 
-    Each joint has a constant deceleration. Candidates are that all joints stop together in the
-    shortest possible time, that each joint stops as soon as it can, and that all joints stop
-    together later.
-
-    Args:
-        case: one `BlockCase`.
-        plan: the plan of this case.
-
-    Raises:
-        NoRecovery: in every candidate a joint leaves its range, or the arm collides.
+    Each joint has a constant deceleration. Candidates: all joints stop together in the shortest
+    time, each joint stops as soon as it can, all joints stop together later.
     """
     coeffs, durations = (np.asarray(x, np.float64) for x in vars(plan.motion).values())
     state = states_at(plan.motion, np.asarray(durations.sum()))
@@ -163,10 +142,7 @@ def _arm_candidates(
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield coefficients (M, 3, 6) and durations (M,) of motions to standstill.
 
-    Args:
-        angles: (6,) [rad], at the start of the motions.
-        rates: (6,) [rad/s], at the start of the motions.
-        most: (6,) [rad/s^2], greatest accelerations.
+    Angles [rad], rates [rad/s] and greatest accelerations [rad/s^2] are (6,).
     """
     alone = np.maximum(np.abs(rates) / (_SPARE * most), 1e-3)
     together = np.full(6, alone.max())

@@ -35,8 +35,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     """Plans minimum-snap trajectories to standstill, whose durations are free.
 
     Decision variables, n = 3 (M - 1) + 4, in units of `scale`: whitened waypoint offsets, log
-    duration, and the position of standstill. With `to="home"` the position is the case's `home`,
-    and its variables have no effect.
+    duration, and the position of standstill. With `to="home"` the position is the case's `home`.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of the smoothed
     hinges of the limits, and of the case's extras.

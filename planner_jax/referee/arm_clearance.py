@@ -1,8 +1,8 @@
 """Clearance of a six-axis arm with a shield from obstacles and from itself, in float64 NumPy.
 
-The referee of blocks tests motions of the arm here. Base frame of the arm, z up, SI units. Vectors
-at S samples of B motions are (3, B, S), with S = 1 for solids that do not move. Links are modelled
-by capsules, and the shield by a square plate that is 0.01 m thick. The tested pairs of solids are:
+Base frame of the arm, z up, SI units. Vectors at S samples of B motions are (3, B, S), with S = 1
+for solids that do not move. Links are modelled by capsules, and the shield by a square plate that
+is 0.01 m thick. The tested pairs of solids are:
 
 - floor, pole and beams of the rig: with every moving link, and with the shield;
 - base: with links 2 to 6 and the shield, since link 1 is mounted on the base;

@@ -1,9 +1,9 @@
 """Float64 NumPy referee of catches: decides by physics whether a plan succeeds.
 
 A catch is a quadrotor's meeting with a moving target in the hoop of its net. `referee.quadrotor`
-checks the flight. This module checks the plan's order of targets and its catch times, computes the
-targets' positions and compares them with the net. Only the case's extra limits (`referee.extras`)
-are code that planners use too. World frame, z up, SI units.
+checks the flight, this module the plan's order of targets, its catch times and the targets'
+positions. Only extra limits (`referee.extras`) are code that planners use too. World frame, z up,
+SI units.
 
 Equations of [Yu2023catch]: eq. 9 ball with linear drag, eq. 22 net centre p + l z_d, eq. 25 angle
 between z_d and minus the ball's velocity, with the unit vector z_d along the thrust.

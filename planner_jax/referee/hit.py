@@ -1,10 +1,9 @@
 """Float64 NumPy referee of hits: decides by physics whether a plan succeeds.
 
 A hit is a quadrotor's return of a ball to a target with a racket. `referee.quadrotor` checks the
-flight. This module integrates the ball up to the impact, applies the impact, and integrates the
-ball to its landing. Only the case's extra limits (`referee.extras`) are code that planners use too.
-The referee ignores the plan's status, its cost and its planned impact, except the impact time,
-which must be the end of the trajectory. World frame, z up, ground at z = 0, SI units.
+flight. This module integrates the ball up to the impact, which is at the end of the trajectory, and
+on to its landing. Only extra limits (`referee.extras`) are code that planners use too. World frame,
+z up, ground at z = 0, SI units.
 
 Equations of [Yu2023bat]: eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits.
 """

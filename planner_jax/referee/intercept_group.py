@@ -48,8 +48,8 @@ def referee_groups(
     """Decide for every plan of a batch of group interceptions whether it succeeds.
 
     Leg k, the drive to the k-th target, must start with the pose, speed and curvature at the end of
-    leg k - 1, within the tolerance of `referee_intercepts`. It must end within the remainder of the
-    case's time. Legs to absent targets are not read.
+    leg k - 1, within the tolerance of `referee_intercepts`, and end within the remainder of the
+    case's time.
 
     Args:
         cases: object with the fields of `InterceptGroup`, leaves with leading axis B.

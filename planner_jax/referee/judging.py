@@ -130,10 +130,8 @@ def judge_in_chunks(
 ) -> dict[str, np.ndarray]:
     """Judge B plans in chunks, and return the fields of their verdict as arrays (B, ...).
 
-    At most `chunk` plans are judged together, which bounds the memory. One thread per core judges
-    chunks, since NumPy releases the interpreter lock in its loops. Processes replace the threads
-    if the batch is large (`_MANY_LANES`), there are enough cores (`_MANY_CORES`), and `judge` can
-    be pickled.
+    At most `chunk` plans are judged together, to bound the memory. One thread per core judges
+    chunks, or one process per core in batches above `_MANY_LANES` if `judge` can be pickled.
     """
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))

@@ -315,11 +315,11 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
     """Return how far a trajectory is off its state at time 0, and its jumps between pieces.
 
-    The result is four arrays (B,): the error at time 0 [m], the greatest jump between pieces [m],
-    the time of this jump [s], and a scale [m]. An error e_n of the n-th derivative (n = 0..3)
-    counts as the displacement |e_n| h^n / n! over the mean duration h of a piece, at least
-    `SHORTEST_PIECE`. The scale is the largest coordinate at the ends of the pieces, at least 1 m.
-    The head state (B, 4, 3) is position, velocity, acceleration and jerk at time 0.
+    Returns arrays (B,): error at time 0 [m], greatest jump [m], time of this jump [s], and a scale
+    [m]. An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
+    over the mean duration h of a piece, at least `SHORTEST_PIECE`. The scale is the largest
+    coordinate at the ends of the pieces, at least 1 m. The head state (B, 4, 3) is position,
+    velocity, acceleration and jerk at time 0.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)

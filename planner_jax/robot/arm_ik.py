@@ -1,9 +1,8 @@
 """Inverse kinematics in closed form, for ortho-parallel arms with a spherical wrist.
 
-The method is from [Brandstoetter2014]. Axis 2 must be perpendicular to axis 1, and axis 3 parallel
-to axis 2. Axes 4, 5 and 6 must meet in one point, the wrist centre, and axis 5 must be
-perpendicular to the axes 4 and 6. The paper's seven lengths a1, a2, b, c1, c2, c3, c4 are computed
-from an `Arm`, whose frames may have any origins and any senses of rotation.
+The method, with the seven lengths a1, a2, b, c1, c2, c3, c4, is from [Brandstoetter2014]. Axis 2 is
+perpendicular to axis 1, and axis 3 parallel to axis 2. Axes 4, 5 and 6 meet in the wrist centre,
+and axis 5 is perpendicular to axes 4 and 6.
 """
 
 import jax

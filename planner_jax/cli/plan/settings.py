@@ -19,13 +19,10 @@ _MOST_BALLS = 6
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleSettings:
-    """Options that `planner-jax plan` has for every task of a quadrotor.
+    """Options of `planner-jax plan` for every task of a quadrotor; a subclass adds the task's.
 
-    A subclass adds the options of its task. Each field is an option; the text of its `metavar` has
-    one word for each number of the option.
-
-    Raises:
-        ArgumentError: a value breaks a rule.
+    Each field is an option, whose `metavar` has one word for each of its numbers. A value that
+    breaks a rule raises `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the first planner of the task

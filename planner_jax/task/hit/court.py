@@ -1,15 +1,14 @@
 """The court of [Yu2023bat, Section VI-B]: regions, targets, 36 scenarios, and flights of serves.
 
-World frame: z up, x towards the opponent, y to the left, net at x = 0. The opponent's half has
-x > 0; the quadrotor hits in the half with x < 0. Both halves are divided into regions, which are
-mirror images in x: near and far from the net in a middle strip, and a strip at the left and right.
+World frame: z up, x towards the opponent, y to the left, net at x = 0. The opponent's half has x >
+0; the quadrotor hits in the half with x < 0. Both halves are divided into regions, which are mirror
+images in x: near and far from the net in a middle strip, and a strip at the left and right.
 
 The paper states the size of the court but not the lines between regions. They are estimated from
-the published serves, landing points and targets: in y the middle strip extends to at least
-0.8395 m, and the side strips start at 0.8418 m or less.
+the published serves, landing points and targets: in y the middle strip extends to at least 0.8395
+m, and the side strips start at 0.8418 m or less.
 
-Flights are computed by NumPy in float64, so that an invalid serve raises an error before a planner
-is compiled.
+Flights are computed by NumPy in float64.
 """
 
 import numpy as np
@@ -115,9 +114,7 @@ def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT
 def landing(position, velocity, drag, gravity):
     """Return when and where balls with quadratic drag land on the floor z = 0.
 
-    The flight is integrated in equal Runge-Kutta steps until the ball is below the floor. Then
-    Newton's method finds the time at which the height is zero; each iteration integrates by a
-    Runge-Kutta step.
+    Runge-Kutta steps lead below the floor. Newton's method then finds the time of zero height.
 
     Args:
         position: (..., 3) [m], with z > 0.

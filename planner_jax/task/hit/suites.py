@@ -87,13 +87,9 @@ def generate_serves(
     """Draw random serves with the distribution of the published serves, equally many per scenario.
 
     Serves come in groups that contain each scenario once, in random order. Serve k of a seed and a
-    list of scenarios is always the same serve.
-
-    Position and velocity are uniform under the conditions at the top of this module. If they were
-    drawn directly, 97 % of the draws would miss their landing region. Instead a landing point in
-    the region and a vertical speed are drawn, and determine the horizontal velocity. To make the
-    velocity uniform nevertheless, a draw is accepted with a probability proportional to
-    |d horizontal velocity / d landing point|.
+    list of scenarios is always the same serve. The distribution is at the top of this module.
+    Landing point p and vertical speed are drawn uniformly; to make the horizontal velocity v
+    uniform instead, a draw is accepted with a probability proportional to |dv / dp|.
 
     The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
     arguments and the errors.

@@ -6,10 +6,9 @@ by Simpson's rule. The unknowns are the speeds at the knots 1..K, the curvatures
 and the end time if it is free. Speed and curvature at knot 0 are known from the car's state.
 
 A change of the values at a knot deforms the motion only on the two pieces beside the knot. All
-later pieces are displaced as one rigid body, by a twist (a, b): it moves a point p by
-a + b (-p_y, p_x) and turns headings by b. Gradient and Hessian of a cost that is a sum over samples
-therefore follow from sums over pieces and from twists (3,). The large matrix of derivatives of all
-samples by all unknowns is never formed.
+later pieces are displaced as one rigid body, by a twist (a, b): it moves a point p by a + b (-p_y,
+p_x) and turns headings by b. Gradient and Hessian of a cost that is a sum over samples therefore
+follow from sums over pieces and from twists (3,).
 """
 
 import functools
