@@ -16,11 +16,7 @@ from typing import NoReturn
 
 GRACE = 5.0  # [s] time in which the main thread can stop cleanly
 NOTHING = "there is nothing to resume"
-_WORDS = {
-    signal.SIGINT: "interrupted",
-    signal.SIGTERM: "terminated",
-    signal.SIGHUP: "hung up",
-}
+_WORDS = {signal.SIGINT: "interrupted", signal.SIGTERM: "terminated", signal.SIGHUP: "hung up"}
 
 
 class Stopped(KeyboardInterrupt):

@@ -107,11 +107,7 @@ class BlockVerdict(Verdict):
 
 
 def referee_blocks(
-    cases,
-    plans,
-    *,
-    tolerance: float = 1e-3,
-    contact_tolerance: float = 1e-3,
+    cases, plans, *, tolerance: float = 1e-3, contact_tolerance: float = 1e-3
 ) -> BlockVerdict:
     """Decide for every plan of a batch of blocks whether it succeeds.
 

@@ -241,8 +241,7 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
     )
     peaks = {
         name: _greater(
-            _search(name, pieces, gravity, likeliest[i], u),
-            (greatest[i], _time(pieces, top[i], u)),
+            _search(name, pieces, gravity, likeliest[i], u), (greatest[i], _time(pieces, top[i], u))
         )
         for i, name in enumerate(_MEASURES)
     }

@@ -145,10 +145,7 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
 
 
 def write_verdicts(
-    axes: Axes,
-    run: RunRows,
-    plans: Sequence[tuple[str, Row]],
-    word: Callable[[Row], str],
+    axes: Axes, run: RunRows, plans: Sequence[tuple[str, Row]], word: Callable[[Row], str]
 ) -> None:
     """Write the name of each planner in its colour, with the referee's verdict on its plan."""
     axes.axis("off")

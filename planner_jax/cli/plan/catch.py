@@ -15,10 +15,7 @@ from planner_jax.task.catch.case import GRAVITY
 class SingleCatch(Single[SingleCatchSettings]):
     """One case in which a quadrotor catches one ball, or several balls one after another."""
 
-    NAMES = {
-        **Single.NAMES,
-        **{f"net.{name}": f"net_{name}" for name in ("height", "radius")},
-    }
+    NAMES = {**Single.NAMES, **{f"net.{name}": f"net_{name}" for name in ("height", "radius")}}
 
     def case(self) -> PyTree:
         """Make the case of the specified balls, which must be caught before the horizon."""

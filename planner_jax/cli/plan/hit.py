@@ -10,10 +10,7 @@ from planner_jax.cli.plan.settings import SingleHitSettings
 class SingleHit(Single[SingleHitSettings]):
     """One case in which a quadrotor returns a ball with its racket."""
 
-    NAMES = {
-        **Single.NAMES,
-        **{f"{of}{x}": x for of in ("ball.", "ball_") for x in ("pos", "vel")},
-    }
+    NAMES = {**Single.NAMES, **{f"{of}{x}": x for of in ("ball.", "ball_") for x in ("pos", "vel")}}
 
     def case(self) -> PyTree:
         """Make the case of the specified ball and target."""

@@ -110,18 +110,14 @@ class SingleCatchSettings(SingleSettings):
     pos: tuple[float, ...] | None = option(None, "X Y Z", "initial position of the only ball [m]")
     vel: tuple[float, ...] | None = option(None, "X Y Z", "initial velocity of the only ball [m/s]")
     ball: tuple[tuple[float, ...], ...] = option(
-        (),
-        "X Y Z VX VY VZ",
-        "initial position and velocity of a ball; repeat it for several balls",
+        (), "X Y Z VX VY VZ", "initial position and velocity of a ball; repeat it for several balls"
     )
     horizon: float = option(dataclasses.MISSING, "S", "latest time of a catch [s]")
     drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
     net_height: float | None = option(None, "L", "over the propellers [m] (default: the robot's)")
     net_radius: float | None = option(None, "R", "of the hoop [m] (default: the robot's)")
     max_angle: float | None = option(
-        None,
-        "A",
-        "between net's axis and reversed velocity of a ball [rad] (default: the robot's)",
+        None, "A", "between net's axis and reversed velocity of a ball [rad] (default: the robot's)"
     )
     decide: str = option("best", "NAME", f"order and first times: {', '.join(DECISIONS)}")
 

@@ -12,12 +12,7 @@ from planner_jax.runs.columns import Column, RefereedBatch
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.summary import COUNTED, Tally
 from planner_jax.studies.block.clock import CountedPlanner
-from planner_jax.studies.block.results import (
-    StudyCounts,
-    columns_of,
-    describe_study,
-    follow_study,
-)
+from planner_jax.studies.block.results import StudyCounts, columns_of, describe_study, follow_study
 from planner_jax.studies.block.seeing import SeeingArms
 from planner_jax.sweep.block.columns import COLUMNS, FRAME
 from planner_jax.sweep.block.settings import BlockSettings

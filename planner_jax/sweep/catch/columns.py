@@ -56,12 +56,7 @@ COLUMNS = [
         ("num_caught", "", "of the targets", known.COUNT),
         ("net_distance", "m", "from the net's centre to the target at each catch", LIST),
         ("net_offset", "m", "component of this distance along the net's axis", LIST),
-        (
-            "angle",
-            "rad",
-            "between net's axis and reversed target velocity at each catch",
-            LIST,
-        ),
+        ("angle", "rad", "between net's axis and reversed target velocity at each catch", LIST),
     ),
     *MOTION,
     *TRAJECTORY,

@@ -15,15 +15,7 @@ from planner_jax.ball.target import TargetPath
 from planner_jax.core.arithmetic import Numbers
 from planner_jax.core.checks import floating, require_path, require_switch, shape_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.rules import (
-    PERMUTATION,
-    POSITIVE,
-    Field,
-    Rule,
-    Table,
-    require_sound,
-    within,
-)
+from planner_jax.core.rules import PERMUTATION, POSITIVE, Field, Rule, Table, require_sound, within
 from planner_jax.cost.extras import Extra, for_batch
 from planner_jax.robot.quadrotor import QuadrotorLimits
 from planner_jax.robot.quadrotor_model import NET, PAPER_CATCHER, QuadrotorModel

@@ -51,12 +51,7 @@ def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
 
 
 def limit_terms(
-    case: InterceptCase,
-    time: Array,
-    speed: Array,
-    curvature: Array,
-    weights: Weights,
-    points: int,
+    case: InterceptCase, time: Array, speed: Array, curvature: Array, weights: Weights, points: int
 ) -> tuple[Array, Array]:
     """Compute the penalties on the car's limits, and the effort, for a motion of K pieces.
 
