@@ -33,9 +33,8 @@ def table_path(
     """Return a target path through positions at times that need not be evenly spaced.
 
     A cubic spline with continuous acceleration interpolates the positions, or a cubic Hermite
-    spline if velocities are passed. For a smooth flight with times at most d apart, the error of
-    the position is O(d^4), and the error of the velocity is O(d^3). Noisy observations should be
-    smoothed before.
+    spline if velocities are passed. With times at most d apart, the error of the position is
+    O(d^4), and of the velocity O(d^3). Noisy observations should be smoothed before.
 
     The result is a table of the spline with equal time steps, between which planner and referee
     interpolate by cubic convolution. By default the table has enough nodes to approximate the
@@ -53,8 +52,8 @@ def table_path(
         dtype: floating type of every leaf of the result.
 
     Raises:
-        ValueError: the times do not rise or exclude time 0, a shape does not fit, or the path
-            needs more than `MOST_NODES`.
+        ValueError: the times do not rise or exclude time 0, a shape does not fit, or the path needs
+            more than `MOST_NODES`.
         TypeError: an argument does not hold numbers, or `dtype` is not a floating type.
     """
     dtype, times = floating(dtype), _check_times(times)

@@ -68,8 +68,7 @@ def grid_of(
     """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
 
     `leaves` are the leaves of all arguments. `points` has columns, durations and parameters of a
-    point, and for a directional derivative also those of the direction. The result is None if
-    the kernel does not support the arguments.
+    point and of a direction. The result is None if the kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
@@ -288,8 +287,8 @@ def _of_sample(
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
     """Return the excess over each limit at one sample of a trajectory.
 
-    `unit` is the result of `unit_motion`: height to jerk for pieces of 1 s mean duration, from
-    which those for the mean `duration` [s] follow. `given` has gravity and limits.
+    `unit`, of `unit_motion`, has height to jerk for a mean duration of 1 s. `given` has gravity and
+    limits.
     """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]

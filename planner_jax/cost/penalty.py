@@ -69,8 +69,7 @@ def greatest_by_tangents(values: Array, slopes: Array, step: Array) -> Array:
     """Return the maximum () of samples (K,) and of intersections of neighbouring tangents.
 
     `slopes` (K,) are time derivatives, and samples are a time `step` apart. The result is never
-    below the true peak if the quantity is concave between samples. It is the true peak of two
-    joined lines, such as the distance to a box's edge along a straight path.
+    below the true peak if the quantity is concave between samples.
     """
     first, second = values[:-1], values[1:]
     bend = slopes[:-1] - slopes[1:]

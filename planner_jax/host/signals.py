@@ -40,8 +40,7 @@ _STATE = _State()
 def listen() -> None:
     """Start to handle SIGINT, SIGTERM and SIGHUP; call this in the main thread of a command.
 
-    A shell starts background jobs with SIGINT ignored; this function handles it there too. SIGHUP
-    stays ignored under `nohup`.
+    SIGINT is handled in background jobs too. SIGHUP stays ignored under `nohup`.
     """
     reader, writer = os.pipe()
     os.set_blocking(writer, False)

@@ -82,8 +82,8 @@ def kernel_by_lanes(
 ) -> Callable[..., Sequence[Array]]:
     """Make a `kernel_call` in float32 whose blocks contain all numbers of `width` lanes (problems).
 
-    `inputs` and `outputs` are shapes without the lanes, which are the last axis. There is one
-    thread for each lane by default. The other arguments are as for `kernel_call`.
+    `inputs` and `outputs` are shapes without the lanes, which are the last axis. Other arguments
+    are as for `kernel_call`, by default with one thread for each lane.
     """
 
     def block(shape: tuple[int, ...]) -> Block:

@@ -94,16 +94,10 @@ class Sight:
     def see(
         self, number: int, pos: tuple[float, ...], measured: float, until: float
     ) -> tuple[BallState | None, Fault]:
-        """Update the estimate; return the predicted ball, and the fault of the observation.
+        """Update the estimate; return the ball at the time `until` [s], and the fault if any.
 
-        Args:
-            number: number that identifies the ball.
-            pos: (3,) [m], observed position.
-            measured: [s], time of the observation.
-            until: [s], time of the requested prediction.
-
-        Returns:
-            The ball with NumPy leaves (3,), or None at the first observation and after a fault.
+        The ball `number` was observed at `pos` (3,) [m] at the time `measured` [s]. The predicted
+        ball has NumPy leaves (3,), or is None at the first observation and after a fault.
         """
         belief = self._belief
         if belief is None or number != self.number or measured - self._time > _FORGOTTEN:

@@ -196,7 +196,7 @@ def beyond_reach(
     """Return lower bounds (K,) [m] on a quadrotor's distances from positions at given times.
 
     Zero or less means that the position may be reached. At the time t the quadrotor is inside each
-    of these spheres, as far as the limits exist:
+    of these spheres, if the limits exist:
 
     - around the start, with the integral of the greatest speed as radius; this speed rises with the
       greatest acceleration A up to its limit;

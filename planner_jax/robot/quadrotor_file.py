@@ -1,16 +1,13 @@
 """Reading and writing of quadrotors as YAML files whose values have units, as in this example.
 
-    name: mine
-    mass: 800 g
-    inertia: 3 3 5 g m^2
-    rotors: {diagonal: 250 mm, max_thrust: 4.5 N, lag: 30 ms}
-    tool: {kind: racket, height: 6 cm, radius: 11 cm}
-    limits: {speed: 5 m/s, body_rate: 344 deg/s, thrust: 0.2 to 1.9 g}
+name: mine mass: 800 g inertia: 3 3 5 g m^2 rotors: {diagonal: 250 mm, max_thrust: 4.5 N, lag: 30
+ms} tool: {kind: racket, height: 6 cm, radius: 11 cm} limits: {speed: 5 m/s, body_rate: 344 deg/s,
+thrust: 0.2 to 1.9 g}
 
 A number without a unit is in SI units. Only an inertia must have its unit, because it is often
-stated in g m^2 and the mistake would go unnoticed. In an acceleration "g" is the standard gravity,
-elsewhere the gram. `model: mine.xml` reads body and rotors from a MuJoCo model (MJCF); fields of
-the YAML file override the model's. This module imports no JAX.
+stated in g m^2. In an acceleration "g" is the standard gravity, elsewhere the gram. `model:
+mine.xml` reads body and rotors from a MuJoCo model (MJCF); fields of the YAML file override the
+model's. This module imports no JAX.
 """
 
 import dataclasses
@@ -154,8 +151,7 @@ def model_of(description: Mapping[str, Value], place: str = "robot") -> Quadroto
     """Make a quadrotor from a dictionary: the fields of a YAML file, or `dataclasses.asdict`.
 
     Raises:
-        RobotError: a field breaks a rule, is unknown or is missing. The message begins with
-            `place`, such as the name of the file.
+        RobotError: a field breaks a rule; the message begins with `place`, such as a file's name.
     """
     _require_known(description, [*_FIELDS[""], *_PARTS], "", place)
     parts: dict[str, Value] = {}

@@ -1,8 +1,7 @@
 """Quadrotors by name: the robots of the papers, and three robots with published numbers.
 
 Numbers without a source are assumptions; the field `source` of a robot lists them. All tools are
-assumed to be massless. The tools of the three published robots are assumptions, and so are all
-limits: they are chosen such that the rotors can keep them.
+massless. The limits, and the tools of the three published robots, are assumptions.
 """
 
 import dataclasses

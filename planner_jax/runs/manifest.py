@@ -65,10 +65,7 @@ def parse_written(text: bytes | str) -> Entries:
 def read_written(path: Path, name: str, what: str) -> Entries:
     """Read a JSON file whose object `to_write` made, and return its entries.
 
-    Args:
-        path: path of the file.
-        name: name of the caller's argument that holds the folder, for error messages.
-        what: noun for the contents, such as "a run", for error messages.
+    Error messages name the argument `name` and the contents `what`, such as "a run".
 
     Raises:
         ArgumentError: the file is missing, has another format, or was edited or damaged.

@@ -131,8 +131,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
     """Return the settings of a run that is resumed, from the `parameters` in its manifest.
 
     Raises:
-        ArgumentError: a setting in `given`, which the user repeats, differs from the stored
-            setting, or the class `kind` does not accept the stored settings.
+        ArgumentError: a setting in `given` differs, or `kind` does not accept the stored settings.
     """
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)

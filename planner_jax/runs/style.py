@@ -60,11 +60,8 @@ _STYLE: "dict[RcKeyType, object]" = {
 def draw(path: Path, figure: Callable[..., None], size: tuple[float, float], *data: object) -> None:
     """Draw one figure in the common style and write it atomically as a PNG file.
 
-    Args:
-        path: path of the file.
-        figure: function that draws into an empty figure, called as `figure(canvas, *data)`.
-        size: (width, height) [inch] of the figure.
-        *data: further arguments of `figure`.
+    `size` is (width, height) [inch]. The figure is drawn by `figure(canvas, *data)` on an empty
+    canvas.
     """
     with matplotlib.rc_context(_STYLE):
         canvas = Figure(figsize=size)

@@ -134,13 +134,7 @@ def make_parts(
     """Plan every chunk whose file of rows is missing; return the records of all files by number.
 
     While one chunk is planned, the next one is drawn and the previous ones are judged and written.
-
-    Args:
-        maker: turns a chunk of cases into rows.
-        rows: dataset to which the files of rows are written.
-        there: records of the files that exist, by number.
-        workers: function that plans chunks on other processes; None plans them in this process.
-        progress: whether a progress bar is shown.
+    `there` has the records of existing files. `workers` plan on other processes, if not None.
     """
     source, records = maker.source, dict(there)
     done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))

@@ -73,11 +73,11 @@ class SampledMotion:
 def sample_motion(
     coeffs: Sequence[float] | np.ndarray, durations: Sequence[float] | np.ndarray, num: int
 ) -> SampledMotion:
-    """Sample a piecewise polynomial of M pieces at evenly spaced times, in float64.
+    """Sample a piecewise polynomial of M pieces at `num` evenly spaced times, in float64.
 
     Args:
-        coeffs: flattened coefficients (M, powers, 3): for each piece the ascending powers of the
-            time since the start of the piece, each for the axes x, y and z.
+        coeffs: flattened (M, powers, 3), for each piece of ascending powers of the time since its
+            start.
         durations: (M,) [s], durations of the pieces.
         num: number of samples from the start of the first piece to the end of the last.
     """

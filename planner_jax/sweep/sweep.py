@@ -167,10 +167,8 @@ def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
 def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> Entries:
     """Return fields of the first case of a batch as plain numbers, rounded to six decimals.
 
-    Args:
-        tree: batch of cases, or a field of it that is a dataclass, such as its limits.
-        names: names of fields; by default all. Fields that are None or dataclasses are left out.
-        prefix: text before each name in the result.
+    Names are of fields of `tree`, by default all, and get a `prefix` in the result. Fields that are
+    None or dataclasses are left out.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
     known = {name: vars(tree)[name] for name in names}

@@ -116,8 +116,6 @@ def judge_by(
 ) -> VerdictT:
     """Check the arguments of a task's `judge`, and return the verdict of its referee.
 
-    The referee judges batches only, so one case and its plan are passed to it as a batch of one.
-
     Raises:
         TypeError: cases or plans are not instances of `kinds`, or `require_settings` raises.
         ValueError: cases and plans differ in batch shape, or the referee raises.

@@ -1,26 +1,24 @@
 """MINCO splines with piece durations in fixed proportion, computed by constant matrices.
 
-MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints
-[Wang2022; Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times
-differentiable.
+MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints [Wang2022;
+Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times differentiable.
 
-Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that
-h = T / M. With times in units of h, one constant matrix maps the boundary rows and the waypoints to
-the coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
-(p, v h, a h^2, j h^3) at both ends.
+Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that h = T
+/ M. With times in units of h, one constant matrix maps the boundary rows and the waypoints to the
+coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are (p,
+v h, a h^2, j h^3) at both ends.
 
 The waypoints q are expressed by whitened offsets y from the waypoints that need the least energy
 for the boundary b: q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T. Hence y = 0
 is the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of |y|^2.
 
-The velocities at the waypoints may be variables as well. They are expressed by offsets z from the
-velocities of least energy for boundary and waypoints, whitened in the same way. With z = 0 the
-trajectory is the same as without these variables. The energy of z is the same multiple of |z|^2.
-A trajectory with z != 0 is 2s - 3 times differentiable.
+The velocities at the waypoints may be variables as well: whitened offsets z from the velocities of
+least energy for boundary and waypoints. Their energy is the same multiple of |z|^2. A trajectory
+with z != 0 is 2s - 3 times differentiable.
 
 A `Chain` is N minimum-snap segments of M pieces each. Each segment starts with the state, position
-to jerk, at which the segment before it ends. Absent segments are computed like the others and then
-ignored, so that one compiled program serves any number of present segments.
+to jerk, at which the segment before it ends. Absent segments are computed and ignored, so that one
+compiled program serves any number.
 """
 
 import dataclasses
@@ -97,14 +95,11 @@ def _hermite_energy(order: int) -> np.ndarray:
 
 
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
-    """Return the energy of all pieces as a quadratic form (C, C) in the C columns [b; y].
+    """Return the energy of M pieces as a quadratic form (C, C) in the C columns [b; y].
 
-    The form is a sum of squares. The same form in the nodes' derivatives would lose the small
-    energy of smooth motions far from the origin to rounding errors.
-
-    Args:
-        coefficients: (M, 2s, C), of the powers of each piece's unit time.
-        shares: (M,) durations of the pieces.
+    The form is a sum of squares. In the nodes' derivatives it would lose the small energy of smooth
+    motions far from the origin to rounding errors. `coefficients` (M, 2s, C) belong to powers of a
+    piece's unit time, and `shares` (M,) are the pieces' durations.
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T

@@ -56,9 +56,8 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 def nearest_upright(vel: Array, lean: Array) -> Array:
     """Return the axes (N, 3) of the net that are nearest to upright and still face the targets.
 
-    An axis faces a target if its angle from the reversed velocity -vel (N, 3) is at most `lean`
-    () [rad], from 0 to pi / 2. Targets that rise are treated as if they flew level. For targets at
-    rest the axis is upright.
+    An axis faces a target if its angle from the reversed velocity -vel (N, 3) is at most `lean` ()
+    [rad], from 0 to pi / 2. Rising targets are treated as if they flew level.
     """
     back = jnp.concatenate([-vel[:, :2], jnp.maximum(-vel[:, 2:], 0.0) + _RESTING], axis=1)
     back /= jnp.sqrt(jnp.maximum(jnp.sum(back**2, axis=1, keepdims=True), 1e-6))
@@ -79,8 +78,8 @@ def is_too_far(context: CatchContext) -> Array:
     catch is within half a step of such a time, so the distances that target and quadrotor can move
     in half a step are added.
 
-    The result false means that catches may or may not exist. It is false for optional targets, for
-    targets that are neither `BallPath` nor `HarmonicPath`, and if a number is not finite.
+    The result is also false for optional targets, for targets that are neither `BallPath` nor
+    `HarmonicPath`, and if a number is not finite.
     """
     case, targets = context.case, context.targets
     if case.optional or not isinstance(targets, BallPath | HarmonicPath):

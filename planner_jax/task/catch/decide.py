@@ -31,9 +31,8 @@ _WORD = 24  # number of targets in each integer of the bit set of caught targets
 def closest_approach(cases: CatchCase) -> Array:
     """Return by how much the net misses each target at least, (N,) or (B, N) [m].
 
-    The result is a lower bound over all motions and times; zero means that the target may be within
-    reach. The quadrotor is assumed to fly at its greatest speed in any direction, above its least
-    height. The bound is evaluated at 64 times up to the target's horizon.
+    This lower bound, zero if the target may be within reach, assumes the greatest speed in any
+    direction. It is evaluated at 64 times up to the target's horizon.
     """
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
@@ -90,9 +89,8 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """Search for the orders of one case that catch most targets, earliest; leaves (W, N).
 
     It is a beam search of width W. After each catch the W sequences of catches with the best ranks
-    continue. Among sequences with the same set of targets and the same last target only the best
-    continues. The search may miss the best order. If fewer than W orders are found, the first order
-    is repeated.
+    continue. Among sequences with the same targets and the same last target only the best
+    continues. If fewer than W orders are found, the first order is repeated.
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -206,8 +204,8 @@ class Best(CatchDecision):
 
     The estimate of an order is the time of its last catch plus 10 s for each metre of shortfall,
     the distance by which the quadrotor would miss its targets. All N! orders of up to six targets
-    are estimated. For more targets (at most 100), and for optional targets, a beam search finds the
-    orders and may miss the best order. The plan with the earliest last catch is selected.
+    are estimated. For more (at most 100) or optional targets, a beam search may miss the best
+    order. The plan with the earliest last catch is selected.
     """
 
     finalists: int = 6  # number of orders that are planned

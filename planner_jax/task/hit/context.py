@@ -49,12 +49,10 @@ class Impact:
 def is_too_far(context: HitContext) -> Array:
     """Return true only if the quadrotor provably cannot hit the ball at any time, () bool.
 
-    At an impact the quadrotor's distance from the ball is the racket's height. The quadrotor is
-    above its least height, and the ball is above the ground and not above the greatest apex. These
-    conditions are tested at the times of the ball's table. An impact is within half a step of such
-    a time, so the distances that ball and quadrotor can move in half a step are added.
-
-    The result false means that a hit may or may not exist. It is false if a number is not finite.
+    At an impact the quadrotor is at the racket's height from the ball and above its least height,
+    and the ball is between ground and greatest apex. This is tested at the times of the ball's
+    table, with the distances that ball and quadrotor can move in half a step added. The result is
+    also false if a number is not finite.
     """
     case, path = context.case, context.path
     limits, ball = case.limits, case.ball

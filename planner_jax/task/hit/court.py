@@ -96,8 +96,7 @@ def _components_first(vectors: ArrayLike) -> np.ndarray:
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
     """Return position and velocity (..., 3) of balls after a flight with quadratic drag.
 
-    Position (..., 3) [m], velocity (..., 3) [m/s], duration (...) [s], drag K_D (...) [1/m] and
-    gravity (...) [m/s^2] broadcast. The flight is integrated in equal Runge-Kutta steps.
+    The arguments, in SI units, broadcast. The flight is integrated in equal Runge-Kutta steps.
     """
     step = np.asarray(duration, float) / num_steps
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
@@ -155,9 +154,7 @@ def landing(position, velocity, drag, gravity):
 def check_cases(cases: HitCase) -> None:
     """Raise `CaseError` unless every case of a batch is valid and its ball lands at x < 0.
 
-    Numbers must keep the rules of `HitCase`. The ball must start above the floor and land in the
-    half of the court in which the quadrotor hits. The arrays must have values, so that the
-    function cannot be called inside `jax.jit`.
+    The ball must also start above the floor. Call this function outside of `jax.jit`.
     """
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball
