@@ -31,12 +31,7 @@ class BallState:
 
 
 def require_ball(ball: object) -> None:
-    """Check that the argument `ball` is one ball.
-
-    Raises:
-        TypeError: it is not a `BallState`, or does not hold numbers.
-        ValueError: its vectors have another shape than (3,).
-    """
+    """Raise `TypeError` or `ValueError` unless the argument `ball` is one ball of vectors (3,)."""
     require_kind("ball", ball, BallState)
     for name in ("pos", "vel"):
         shape = shape_of(f"ball.{name}", vars(ball)[name])

@@ -17,11 +17,7 @@ class PlannerJaxError(Exception):
     _names: ClassVar[tuple[str, ...]] = ()  # fields that hold names of arguments
 
     def with_names(self, names: Mapping[str, str]) -> Self:
-        """Return a copy of the error in which arguments have other names.
-
-        Args:
-            names: maps old names to new names; names that are missing stay.
-        """
+        """Return a copy of the error with other names of arguments: `names` maps old to new."""
         error = copy.copy(self)
         vars(error).update({k: names.get(v, v) for k, v in vars(self).items() if k in self._names})
         return error

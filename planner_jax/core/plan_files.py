@@ -34,11 +34,7 @@ class PlanFileError(ArgumentError):
 
 
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
-    """Write a dataclass of arrays, or of such dataclasses, to a file: completely or not at all.
-
-    Raises:
-        ArgumentTypeError: a leaf is not an array of numbers, or `path` is not a path.
-    """
+    """Write a dataclass of arrays, or of such dataclasses, to a file: completely or not at all."""
     require_path_name("path", path)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
     arrays = {name: np.asarray(leaf) for name, leaf in leaves_by_name(tree).items()}
@@ -50,12 +46,7 @@ def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
 
 
 def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
-    """Return the dataclass that `save_arrays` wrote, with NumPy leaves.
-
-    Raises:
-        PlanFileError: the file holds something else, another class or another version.
-        ArgumentTypeError: `path` is not a path.
-    """
+    """Return the dataclass, of NumPy leaves, that `save_arrays` wrote, or raise `PlanFileError`."""
     require_path_name("path", path)
     version, name, arrays = _read(path)
     if version != VERSION or name != kind.__name__:

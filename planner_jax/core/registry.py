@@ -101,12 +101,7 @@ class Task:
         return planner, file
 
     def make_planner(self, name: object, options: Mapping[str, object]) -> "Planner":
-        """Make the planner with a key of `all_planners`, from its file if it is in `from_file`.
-
-        Raises:
-            UnknownName: no planner has this name, or it needs a file or takes none.
-            ArgumentTypeError: the planner has no such option.
-        """
+        """Make the planner of a name and options, or raise `UnknownName` or `ArgumentTypeError`."""
         planner, file = self.split_planner(name)
         maker = _load(self.all_planners()[planner])
         _require_options(planner, maker, options)

@@ -160,11 +160,7 @@ class Dislike:
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Convert extras for a batch: all leaves get a dtype, and the batch axes () or (B,) in front.
-
-    Raises:
-        ArgumentError: the extras are not a sequence, or an entry does not fit a case or the batch.
-    """
+    """Give leaves of extras a dtype and the batch axes () or (B,); raise if they do not fit."""
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
     for extra in extras:

@@ -47,12 +47,7 @@ def write_tlog(plan: QuadrotorPlan, rate: float, file: BinaryIO) -> None:
 
 
 def stream(plan: QuadrotorPlan, port: int, rate: float = DEFAULT_RATE) -> int:
-    """Send a plan's packets to a UDP port of this machine in real time; return their number.
-
-    Raises:
-        ArgumentError: the plan cannot be exported, the rate is out of its range, or no program
-            listens on the port.
-    """
+    """Send a plan's packets to a UDP port of this machine in real time; return their number."""
     if isinstance(port, bool) or not isinstance(port, int) or not 0 < port < 2**16:
         raise ArgumentError("udp", f"a port from 1 to {2**16 - 1}", port)
     ready = list(packets(plan, rate))

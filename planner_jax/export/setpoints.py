@@ -59,11 +59,7 @@ ROBOTS = (
 
 
 def robot_of(plan: Plan) -> Robot:
-    """Return the entry of `ROBOTS` for one plan, and check that the plan can be exported.
-
-    Raises:
-        ArgumentError: the object is not one solved plan of a robot, or its arrays are wrong.
-    """
+    """Return the entry of `ROBOTS` for a plan; raise `ArgumentError` if it cannot be exported."""
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
         names = ", ".join(robot.name for robot in ROBOTS)

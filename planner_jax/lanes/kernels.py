@@ -41,11 +41,7 @@ class Kernels(enum.Enum):
 
 
 def kernels() -> Kernels:
-    """Return whether programs for CUDA use the library's kernels.
-
-    Raises:
-        ValueError: the environment variable PLANNER_JAX_KERNELS is neither "on" nor "off".
-    """
+    """Return whether CUDA programs use kernels; raise if PLANNER_JAX_KERNELS has a wrong value."""
     if not is_switched_on():
         return Kernels.OFF
     return Kernels.ON if _has_triton() else Kernels.MISSING

@@ -104,12 +104,7 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
 
 
 def link_frames(arm: Arm, angles: Array) -> tuple[Array, Array]:
-    """Return the poses of the six links' frames at joint angles (6,) [rad].
-
-    Returns:
-        rotations: (6, 3, 3), from the link's frame to the base frame.
-        positions: (6, 3) [m], of the joints in the base frame.
-    """
+    """Return links' rotations (6, 3, 3) to the base frame and joints' positions (6, 3) [m]."""
     turned = _joint_rotations(arm, angles)
     origin = jnp.asarray(arm.origin)
     rotations, positions = [turned[0]], [origin[0]]

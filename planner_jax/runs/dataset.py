@@ -67,11 +67,7 @@ def check_part(path: Path) -> Entries:
 
 
 class Dataset:
-    """All rows of a run: the Parquet files (parts) of a folder, in the order of their numbers.
-
-    Args:
-        folder: folder of the files; it is created when the first file is written.
-    """
+    """All rows of a run: the Parquet files (parts) of a folder, in the order of their numbers."""
 
     def __init__(self, folder: Path):
         self.folder = folder

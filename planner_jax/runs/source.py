@@ -82,11 +82,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return the fields of a `Source`; `num` and `batch` replace settings that are None.
-
-    Raises:
-        ArgumentError: the cases of a chunk do not fit into memory, or there are too many chunks.
-    """
+    """Return the fields of a `Source`; `num` and `batch` replace settings that are None."""
     num, batch = settings.num or num, settings.batch or batch
     if num > _MOST_PARTS * batch:
         rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"

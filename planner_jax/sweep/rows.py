@@ -28,11 +28,7 @@ class PlannedRow(NamedTuple):
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return the case of a stored row of results: drawn again from its seed, or read from files.
-
-    Raises:
-        ArgumentError: the sweep is not complete, or the case differs from the manifest.
-    """
+    """Return a stored row's case, or raise `ArgumentError` if it differs from the manifest."""
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases

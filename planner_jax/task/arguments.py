@@ -38,12 +38,7 @@ def array_of(
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
-    """Return the batch shape of an argument: its shape (..., *shape) without the trailing `shape`.
-
-    Raises:
-        TypeError: the argument does not hold numbers.
-        ValueError: the shape of the argument does not end with `shape`.
-    """
+    """Return the batch shape: the shape (..., *shape) of numbers without the trailing `shape`."""
     found = shape_of(name, vectors)
     split = len(found) - len(shape)
     if split < 0 or found[split:] != shape:
@@ -53,12 +48,7 @@ def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
 
 
 def require_draw(num: int, seed: int, first: int) -> None:
-    """Raise unless `num`, `seed` and `first` are valid arguments of a task's function `draw`.
-
-    Raises:
-        TypeError: an argument is not a whole number.
-        ValueError: an argument is too small, or memory cannot hold `num` cases.
-    """
+    """Raise unless `num`, `seed` and `first` are valid arguments of a task's function `draw`."""
     for name, value, least in (("num", num, 1), ("seed", seed, 0), ("first", first, 0)):
         require_size(name, value, least)
     require_memory("num", num, _DRAWN_BYTES)

@@ -50,12 +50,7 @@ ARGUMENTS = {
 
 
 def require_tool(robot: object, kind: str) -> Tool:
-    """Return the racket or net of a robot; raise unless the tool is of the kind that a task needs.
-
-    Raises:
-        TypeError: the robot is not a `QuadrotorModel`.
-        ValueError: the robot's tool is not of the kind `kind`, "racket" or "net".
-    """
+    """Return a robot's racket or net; raise unless the tool is of the kind that a task needs."""
     if not isinstance(robot, QuadrotorModel):
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
         raise ArgumentTypeError("robot", rule, robot)

@@ -69,12 +69,7 @@ class Answer:
 
 
 class Single(abc.ABC, Generic[SingleT]):
-    """Base class of the command `plan` for one task: it makes, plans and describes a case.
-
-    Args:
-        task: task of the case.
-        settings: options of the command; `settings.planner` is not None.
-    """
+    """Base class of the command `plan` for one task: it makes, plans and describes a case."""
 
     # By field of the case, the option that sets the field. A field that is not listed has the
     # option with the last name of its dotted path.

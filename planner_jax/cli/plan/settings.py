@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from dataclasses import MISSING
 from typing import ClassVar
 
 from planner_jax.core.choices import CHOICES, require, require_one_of
@@ -82,13 +83,9 @@ def _numbers(value: object) -> list[float]:
 class SingleHitSettings(SingleSettings):
     """Options of `planner-jax plan hit`: a ball, a target, and numbers that replace defaults."""
 
-    pos: tuple[float, ...] = option(
-        dataclasses.MISSING, "X Y Z", "initial position of the ball [m]"
-    )
-    vel: tuple[float, ...] = option(
-        dataclasses.MISSING, "X Y Z", "initial velocity of the ball [m/s]"
-    )
-    target: tuple[float, ...] = option(dataclasses.MISSING, "X Y Z", "desired landing point [m]")
+    pos: tuple[float, ...] = option(MISSING, "X Y Z", "initial position of the ball [m]")
+    vel: tuple[float, ...] = option(MISSING, "X Y Z", "initial velocity of the ball [m/s]")
+    target: tuple[float, ...] = option(MISSING, "X Y Z", "desired landing point [m]")
     acceleration: float | None = option(None, "A", "greatest [m/s^2] (default: the robot's)")
     hitting_speed: tuple[float, ...] | None = option(
         None, "X Y Z", "greatest at the impact, by axis [m/s] (default: 4 3 4)"
@@ -112,7 +109,7 @@ class SingleCatchSettings(SingleSettings):
     ball: tuple[tuple[float, ...], ...] = option(
         (), "X Y Z VX VY VZ", "initial position and velocity of a ball; repeat it for several balls"
     )
-    horizon: float = option(dataclasses.MISSING, "S", "latest time of a catch [s]")
+    horizon: float = option(MISSING, "S", "latest time of a catch [s]")
     drag: float | None = option(None, "K", "of the balls, linear [1/s] (default: none)")
     net_height: float | None = option(None, "L", "over the propellers [m] (default: the robot's)")
     net_radius: float | None = option(None, "R", "of the hoop [m] (default: the robot's)")

@@ -167,11 +167,7 @@ def meeting_terms(
 
 
 def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
-    """Compute the residuals of following: distances from positions (K, 2) [m] at the pieces' ends.
-
-    Returns:
-        squares: (K, 5, 5), the matrix `squares` of `meeting_terms` for the end of every piece.
-    """
+    """Compute `squares` (K, 5, 5) as `meeting_terms` does, for positions (K, 2) at pieces' ends."""
     x, y = (drive.pos[:, -1] - positions).T
     squares = SumOfSquares(5)
     squares.add({0: 1.0, 4: x}, weights.follow)
