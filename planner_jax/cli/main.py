@@ -117,12 +117,17 @@ def _make_parser() -> Parser:
     kinds = bench.add_subparsers(title="benchmarks", required=True, metavar="benchmark")
     words = "plans a second, with success and cost"
     kinds.add_parser("throughput", help=words, fill=runs.add_throughput, argument_default=SUPPRESS)
-    command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
+    doctor = command("doctor", "versions, devices, precision, cache and a timed plan", _doctor)
+    words = "list the compiled programs of every default planner instead, in some minutes"
+    doctor.add("--compile", action="store_true", help=words)
     return parser
 
 
 def _doctor(options: Options) -> int:
     """Run the command `doctor`, which checks the installation; return the exit code."""
-    from planner_jax.cli.doctor import report
+    from planner_jax.cli import compilation, doctor
 
-    return 0 if report() else FAILED
+    if options["compile"]:
+        compilation.report()
+        return 0
+    return 0 if doctor.report() else FAILED

@@ -61,7 +61,7 @@ def sample_at_rate(
 
 
 def _in_tiles(
-    leaves: TreeT, times: np.ndarray, setpoint_at: Callable, tile: tuple[int, int]
+    leaves: object, times: np.ndarray, setpoint_at: Callable, tile: tuple[int, int]
 ) -> dict[str, np.ndarray]:
     """Evaluate B plans at K times, in calls for `tile` plans and times: arrays (B, K, ...)."""
     num, found = jax.tree.leaves(leaves)[0].shape[0], {}

@@ -1,0 +1,113 @@
+"""`planner-jax doctor --compile`: the compiled programs of every default planner, as a table.
+
+A program is one function that JAX compiles. The table shows the size of each program and how long
+its compilation takes without the cache on the disk, so that a planner's growth is noticed.
+"""
+
+import collections
+import contextlib
+import dataclasses
+import re
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+BATCH = 64  # number of cases of the batch whose programs are listed
+# Tasks and suites (None for the task's default suite) for which the default planner is examined.
+_EXAMINED = (
+    *(("hit", None), ("catch", "throws"), ("catch", "triangle3")),
+    *(("intercept", "hard"), ("block", None)),
+)
+_SMALL = 0.05  # [s] Programs that compile faster are only part of the row "all".
+_EVENTS = {  # fields of `Program` that hold the durations of JAX's events
+    "/jax/core/compile/jaxpr_trace_duration": "tracing",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",
+    "/jax/core/compile/backend_compile_duration": "compiling",
+}
+_HEAD = (
+    "| planner | cases | program | versions | equations | tracing [s] | lowering [s] "
+    "| compiling [s] | first plan [s] |\n|---|---|---|---|---|---|---|---|---|"
+)
+
+
+@dataclasses.dataclass
+class Program:
+    """A function's compiled programs; all fields are sums over its versions."""
+
+    versions: int = 0  # number of programs, such as one for each shape of the arguments
+    equations: int = 0  # of the jaxprs (traced functions), with those of inner functions
+    tracing: float = 0.0  # [s]
+    lowering: float = 0.0  # [s]
+    compiling: float = 0.0  # [s]
+
+
+@contextlib.contextmanager
+def record_programs() -> Iterator[dict[str, Program]]:
+    """Record the programs that JAX compiles in a `with` block, by the names of their functions.
+
+    The dictionary is filled at the end of the block.
+    """
+    import jax
+
+    programs: dict[str, Program] = collections.defaultdict(Program)
+    found: dict[str, Program] = {}
+
+    def listen(event: str, seconds: float, fun_name: str = "", **_: object) -> None:
+        if field := _EVENTS.get(event):
+            program = programs[fun_name.removeprefix("jit(").removesuffix(")")]
+            setattr(program, field, getattr(program, field) + seconds)
+            program.versions += field == "compiling"
+
+    with tempfile.TemporaryDirectory() as folder:
+        jax.config.update("jax_dump_ir_modes", "jaxpr")
+        jax.config.update("jax_dump_ir_to", folder)  # JAX writes a text file for each program
+        jax.monitoring.register_event_duration_secs_listener(listen)
+        try:
+            yield found
+        finally:
+            jax.monitoring.unregister_event_duration_listener(listen)
+            jax.config.update("jax_dump_ir_to", "")
+        for path in Path(folder).iterdir():
+            name = re.sub(r"^jax_\d+_|\.jaxpr\.txt$", "", path.name)
+            programs[name].equations += len(re.findall(r"^\s*\S.* = ", path.read_text(), re.M))
+    # Functions within a program are traced as well, but are not compiled by themselves.
+    found |= {name: program for name, program in programs.items() if program.versions}
+
+
+def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
+    """Format rows of the table: the programs of a planner for `num` cases, the slowest first.
+
+    The last row holds their sums and the duration [s] of the first plan.
+    """
+    columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
+    shown = [row for row in programs.items() if row[1].compiling >= _SMALL]
+    shown.sort(key=lambda row: -row[1].compiling)
+    rows = [*shown, ("all", Program(*map(sum, columns)))]
+    return [
+        f"| {planner} | {num} | {name} | {made.versions} | {made.equations:,} | {made.tracing:.1f} "
+        f"| {made.lowering:.1f} | {made.compiling:.1f} | {f'{seconds:.1f}' * (name == 'all')} |"
+        for name, made in rows
+    ]
+
+
+def report() -> None:
+    """Print the programs of all default planners, for one case and for a batch."""
+    import jax
+    import numpy as np
+
+    from planner_jax.core.protocol import take
+    from planner_jax.core.registry import task_named
+    from planner_jax.planning.plan import plan
+
+    jax.config.update("jax_enable_compilation_cache", False)
+    print(f"Compiling the default planners, which takes minutes.\n{_HEAD}", flush=True)
+    for name, suite in _EXAMINED:
+        task = task_named(name)
+        batch = jax.tree.map(np.asarray, task.draw(BATCH, *filter(None, [suite])))
+        for num, cases in ((1, take(batch, 0)), (BATCH, batch)):
+            start = time.perf_counter()
+            with record_programs() as programs:
+                jax.block_until_ready(plan(task.planner(), cases))
+            shown, seconds = f"{name} {suite or ''}".strip(), time.perf_counter() - start
+            print("\n".join(format_rows(shown, num, seconds, programs)), flush=True)

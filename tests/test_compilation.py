@@ -1,0 +1,59 @@
+"""The table of compiled programs that `planner-jax doctor --compile` prints."""
+
+import jax
+import numpy as np
+import pytest
+
+from planner_jax.cli import compilation
+from planner_jax.cli.main import main
+
+
+def test_rows_show_slow_programs_and_sums_of_all():
+    programs = {
+        "finish": compilation.Program(1, 200, 0.12, 0.01, 0.5),
+        "refine": compilation.Program(2, 10_000, 1.0, 0.25, 7.96),
+        "tiny": compilation.Program(3, 6, 0.0, 0.0, 0.04),
+    }
+    assert compilation.format_rows("hit", 64, 11.31, programs) == [
+        "| hit | 64 | refine | 2 | 10,000 | 1.0 | 0.2 | 8.0 |  |",
+        "| hit | 64 | finish | 1 | 200 | 0.1 | 0.0 | 0.5 |  |",
+        "| hit | 64 | all | 6 | 10,206 | 1.1 | 0.3 | 8.5 | 11.3 |",
+    ]
+    assert compilation.format_rows("hit", 1, 0.0, {})[0].startswith("| hit | 1 | all | 0 | 0 |")
+
+
+def test_programs_are_recorded_with_their_equations():
+    @jax.jit
+    def inner(x):
+        return x * 2.0
+
+    def sum_of_products(x):
+        return inner(x).sum()
+
+    with compilation.record_programs() as programs:
+        compiled = jax.jit(sum_of_products)
+        compiled(np.ones(3, np.float32)), compiled(np.ones(4, np.float32))
+    assert list(programs) == ["sum_of_products"]
+    program = programs["sum_of_products"]
+    assert program.versions == 2 and program.equations == 6
+    assert min(program.tracing, program.lowering, program.compiling) > 0.0
+
+
+@pytest.mark.slow
+def test_the_doctor_lists_programs_of_planners(monkeypatch, capsys):
+    monkeypatch.setattr(compilation, "_EXAMINED", (("hit", None), ("catch", "throws")))
+    monkeypatch.setattr(compilation, "BATCH", 2)
+    usual = jax.config.jax_enable_compilation_cache
+    try:
+        assert main(["doctor", "--compile"]) == 0
+    finally:
+        jax.config.update("jax_enable_compilation_cache", usual)
+    lines = capsys.readouterr().out.splitlines()
+    sums = [line for line in lines if "| all |" in line]
+    assert [line.split(" | ")[:2] for line in sums] == [
+        ["| hit", "1"],
+        ["| hit", "2"],
+        ["| catch throws", "1"],
+        ["| catch throws", "2"],
+    ]
+    assert all(int(line.split(" | ")[4].replace(",", "")) > 1000 for line in sums)
