@@ -17,8 +17,7 @@ from planner_jax.core.arithmetic import reciprocal
 
 # Runge-Kutta steps of a flight; the landing point of a 2 s flight then has an error of 0.2 mm.
 _FLIGHT_STEPS = 10
-# Runge-Kutta steps of the coarse flight that gives Newton's method its first Jacobians. With fewer
-# steps the computation diverges for strong drag.
+# Runge-Kutta steps of a coarse flight; with fewer steps the method diverges for strong drag.
 _COARSE_STEPS = 8
 
 Tangent = Array | SymbolicZero

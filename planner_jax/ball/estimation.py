@@ -13,8 +13,7 @@ from jaxtyping import Float
 
 from planner_jax.ball.flight import BallState, linear_drag_flight
 
-# A flight model: a function (ball, duration, drag, gravity) -> ball after the duration, such as
-# `linear_drag_flight` or `rk4_step`.
+# A flight model, such as `rk4_step`: a function (ball, duration, drag, gravity) -> ball.
 Flight = Callable[[BallState, Array, Array, Array], BallState]
 
 

@@ -52,8 +52,7 @@ def table_kernel(
 class _Direction:
     """One scalar input by which the states at the nodes are differentiated."""
 
-    # Index of the result with the positions' derivatives. All results for positions come before
-    # the results for velocities.
+    # Index of the result with derivatives of positions; results for velocities come later.
     result: int
     index: tuple[int, ...]  # index in this result, after the indices of node and axis
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0

@@ -28,8 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     flags: dict[str, str] = {}  # by name of an argument, its option, such as "num": "--num"
     try:
-        # Other packages may warn, for example if a task of theirs cannot be imported. Print every
-        # warning in one line.
+        # Print warnings of other packages, such as a task that is not imported, in one line each.
         with warnings.catch_warnings():
             warnings.simplefilter("always")
             warnings.showwarning = lambda text, *_, **__: print(

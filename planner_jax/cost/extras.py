@@ -26,8 +26,7 @@ from planner_jax.cost.penalty import greatest_by_tangents
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, by_pieces
 
-# Number of intervals of each piece at which a finished plan is checked against extra limits. It is
-# large because near an edge or a small sphere the excess peaks between the samples of the search.
+# Intervals of each piece for the check of a finished plan: many, since excesses may be narrow.
 _CLOSE_NODES = 64
 
 

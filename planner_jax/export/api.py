@@ -36,8 +36,7 @@ class Format:
 
     summary: str  # short description for the command's help
     robots: tuple[str, ...]  # names of the supported robots of `export.setpoints.ROBOTS`
-    # By file extension, the function "module:name" of this package that writes the file. The first
-    # extension is the default.
+    # By file extension, the function "module:name" that writes the file; the first is the default.
     writers: Mapping[str, str]
     is_sampled: bool = True  # whether the format holds setpoints at a rate, not polynomials
 

@@ -8,8 +8,7 @@ from planner_jax.core.protocol import Plan
 from planner_jax.export.setpoints import robot_of, setpoints_of
 
 _AXES, _JOINTS = ("x", "y", "z"), ("1", "2", "3", "4", "5", "6")
-# For each robot, the columns of its table: a field of the setpoints, the names of the field's
-# columns, and their unit.
+# For each robot, the columns of its table: a field of the setpoints, the columns' names, unit.
 _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
     "quadrotor": [
         ("time", ["time"], "s"),

@@ -21,8 +21,7 @@ def to_ned_yaw(yaw: np.ndarray) -> np.ndarray:
     return np.mod(1.5 * np.pi - yaw, 2.0 * np.pi) - np.pi
 
 
-# The yaw is undefined if the horizontal part of the body's x axis, a unit vector, is shorter than
-# this number.
+# The yaw is undefined if the body's x axis has a shorter horizontal part than this number.
 _VERTICAL = 1e-6
 
 

@@ -23,8 +23,7 @@ WORLD, BODY = "world", "base_link"
 JOINTS = [f"joint_{k}" for k in range(1, 7)]  # joint names in the ROS packages of the arm's maker
 BODIES, ARM = "trajectory_msgs/MultiDOFJointTrajectory", "trajectory_msgs/JointTrajectory"
 TOPICS = {BODIES: "/command/trajectory", ARM: "/joint_trajectory_controller/joint_trajectory"}
-# By ROS message type, the types and names of its fields: both trajectory messages, and all types
-# that their fields use.
+# By ROS message type, the types and names of its fields, also for the types of these fields.
 TYPES = {
     BODIES: "std_msgs/Header header\nstring[] joint_names\n"
     "trajectory_msgs/MultiDOFJointTrajectoryPoint[] points",

@@ -51,8 +51,7 @@ class Fault(enum.IntEnum):
         return self.name.lower().replace("_", " ")
 
 
-# Faults of packets that get no answer, since their header cannot be read. The texts complete the
-# warning "a packet from ADDRESS ...".
+# Faults of packets that get no answer; the texts complete "a packet from ADDRESS ...".
 SILENT = {
     Fault.STRANGE: f"does not begin with {MAGIC.decode()}",
     Fault.CUT: "has another length than its kind",

@@ -45,8 +45,7 @@ from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
 _ASTRAY = 0.5  # [m], distance of the robot from its course above which a new course starts
-# [m] and [m/s] Greatest difference in position and velocity between a plan that was found too late
-# for its start and the current course.
+# [m] and [m/s] Greatest jump to a plan that was found too late for its start.
 _JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
 _NOTHING = np.zeros((0, WIDTH), np.float32)
@@ -108,8 +107,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _forget(self) -> None:
         """Delete the robot's course, the search for a plan and the ball's estimate."""
         self._flight: _Flight[PlanT] | None = None
-        # Course before the current plan, to which the robot returns if the plan has no recovery
-        # trajectory within the limits.
+        # Course before the plan, for a return if the plan has no recovery within the limits.
         self._before: _Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
         self._done = -1  # number of the last ball that the robot met

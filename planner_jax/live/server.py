@@ -14,8 +14,7 @@ from planner_jax.live.planner import LivePlanner
 
 HOST = "127.0.0.1"
 _LISTENED = 0.25  # [s], longest wait for a packet before the server checks whether to stop
-# Number of Linux's socket option SO_TIMESTAMPNS, and the format of its value: the arrival time of a
-# packet as whole seconds and nanoseconds.
+# Number of Linux's socket option SO_TIMESTAMPNS, and format of its value: seconds, nanoseconds.
 _STAMPS, _STAMP = 35, struct.Struct("@ll")
 
 

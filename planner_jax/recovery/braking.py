@@ -26,8 +26,7 @@ _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
 _GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
 _DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
-# Final curvatures that are tried, as fractions of the car's greatest curvature, positive to the
-# left. The plan's last curvature is tried before them.
+# Final curvatures to try, as fractions of the greatest curvature, after the plan's last one.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
 _SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints can stop

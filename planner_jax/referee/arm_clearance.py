@@ -137,8 +137,7 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
             case[f"arm.{name}"][:, k].T[..., None] for name in ("origin", "turn", "axis")
         )
         position = position + rotate(turn, origin)
-        # Multiply by the fixed rotation of the joint's frame, and then by the rotation about the
-        # joint's axis (Rodrigues' formula).
+        # Multiply by the joint's fixed rotation, and by the rotation about its axis (Rodrigues).
         cos, sin = np.cos(angles[k]), np.sin(angles[k])
         own, along = _rotation(quaternion), axis[:, None] * axis[None]
         still = _product(own, along)
@@ -289,8 +288,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     lanes = np.arange(num_lanes)
     first = np.zeros(bounds.shape, bool)
-    # One exact distance is an upper bound of the least distance. Entries whose lower bound is above
-    # this upper bound need no exact distance.
+    # Entries whose lower bound is above one exact distance need no exact distance.
     first[lanes, bounds.argmin(axis=1)] = True
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK

@@ -52,8 +52,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         hits = np.flatnonzero(bound == lowest[of])
         return hits[np.unique(of[hits], return_index=True)[1]]
 
-    # The exact distance of any pair is an upper bound of the least distance. A second pair, chosen
-    # with better lower bounds, reduces this upper bound.
+    # Any exact distance is an upper bound of the least distance; a second pair may lower it.
     lanes = np.arange(num_lanes)
     sample, which = np.divmod(apart.reshape(num_lanes, num_samples * num).argmin(axis=1), num)
     upper = exact(lanes, sample, which) + _SLACK

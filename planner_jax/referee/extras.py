@@ -25,8 +25,7 @@ class ExtraLimit(Protocol):
         ...
 
 
-# Number of sample intervals in which the maximum of the excess is refined, and number of
-# refinements. Each refinement narrows an interval to a quarter of its length.
+# Number of refined intervals, and of refinements, each to a quarter of the interval's length.
 _REFINED, _REFINEMENTS = 6, 4
 # Assumed change of the excess between two samples where a neighbouring sample is missing.
 _STEEP = 1e9
@@ -70,9 +69,8 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
     values = excess(coeffs[..., None], durations[:, None] * u)  # (M, S)
     piece, sample = np.unravel_index(values.argmax(), values.shape)
     worst, time = values[piece, sample], starts[piece] + durations[piece] * u[sample]
-    # Inside an interval a concave excess lies below two lines: through the two samples up to the
-    # interval's start, and through the two samples from its end on. The intersection of these
-    # lines bounds the excess. The first and the last interval of a piece have only one such line.
+    # Inside an interval a concave excess lies below two lines: through the two samples before it
+    # and through the two samples after it. Their intersection bounds the excess.
     rise = np.diff(values, axis=1)
     before = np.pad(rise[:, :-1], ((0, 0), (1, 0)), constant_values=_STEEP)
     after = np.pad(rise[:, 1:], ((0, 0), (0, 1)), constant_values=-_STEEP)

@@ -48,8 +48,7 @@ _UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
 
 LONGEST_STEP = 0.02  # [s], greatest time between two samples of the motion
 LONGEST_PLAN = 3600.0  # [s], greatest time of a plan that the referee accepts
-# Gauss-Legendre nodes and weights on (0, 1), exact for polynomials up to degree 5. They integrate
-# the position between two samples.
+# Gauss-Legendre nodes and weights on (0, 1) for the position, exact for degree 5.
 _NODES = np.polynomial.legendre.leggauss(3)
 _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
@@ -320,8 +319,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
         name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
         for name, (value, time) in peaks.items()
     }
-    # The car may not drive backwards, so a negative speed fails the same test as a speed above the
-    # limit.
+    # The car may not drive backwards: a negative speed fails the same test as too high a speed.
     limit = case["limits.speed"][:, None]
     scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
     excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)

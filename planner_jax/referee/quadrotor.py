@@ -97,14 +97,12 @@ MOTION_SENTENCES = {
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
-# [s] Least duration h with which an error e of the n-th derivative counts as the displacement
-# |e| h^n / n!.
+# [s] Least h with which an error e of the n-th derivative counts as |e| h^n / n! of displacement.
 SHORTEST_PIECE = 0.1
 _INTERVALS = 400  # least number of sample intervals between two contacts
 _FEWEST_INTERVALS = 16  # least number of sample intervals of one polynomial piece
 # Greatest number of multiplications in one matrix product, and of plans whose maxima are searched
-# together. Both limits keep the data in the cache. Above 2^18 multiplications OpenBLAS would also
-# start its own threads, which would compete with the referee's threads.
+# together. Both keep the data in the cache, and OpenBLAS from starting its own threads.
 _PRODUCT, _SEARCHED = 250_000, 1024
 
 

@@ -70,8 +70,7 @@ def rotor_thrusts(
     before, after = (
         _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
     )
-    # The angular velocity has the same derivative in the world frame and in the body frame, since
-    # the two differ by omega x omega = 0.
+    # Omega has the same derivative in world and body frame: they differ by omega x omega = 0.
     change = (after - before) / (2.0 * _MOMENT)
     axes = _body_axes(pull)
     own = np.einsum("...ij,...i->...j", axes, rate)
@@ -92,8 +91,7 @@ def _pull_and_rate(
     pull[..., 2] += gravity[:, None, None]
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
-    # omega = tau x jerk / |tau|^2 + r tau / |tau|, with the thrust tau. The rate r about the thrust
-    # is the rate that keeps the heading zero.
+    # omega = tau x jerk / |tau|^2 + r tau / |tau|; the rate r about the thrust tau keeps heading 0.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
     return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
 

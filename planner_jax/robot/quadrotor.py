@@ -17,8 +17,7 @@ from planner_jax.core.arithmetic import Components, at_least, components, invers
 from planner_jax.core.protocol import Plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
-# Factor on the limits in bounds on reach. A plan that is solved may exceed its limits slightly
-# between the samples at which they are checked, but by far less than 1 %. The bounds hold for it.
+# Factor on the limits in bounds on reach: solved plans exceed limits by far less than 1 %.
 ALLOWED = 1.01
 _SHORTEST = 1e-3  # [s], least time in bounds on reach; avoids the product of zero and infinity
 

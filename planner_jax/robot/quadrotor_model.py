@@ -216,8 +216,7 @@ PAPER_CATCHER = QuadrotorModel(
     ),
     source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A]. Body and rotors are taken from
-# `PAPER_CATCHER`, since the paper does not state them.
+# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A], with the body of `PAPER_CATCHER`.
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",

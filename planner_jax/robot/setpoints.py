@@ -14,8 +14,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
 _MOST = 10**8  # greatest number of setpoints that one call may compute
-# Numbers of plans and of times that one compiled call evaluates, for one plan and for a batch. They
-# are constants, so that another number of plans or of times compiles nothing.
+# Numbers of plans and of times in a compiled call, for one plan and for a batch.
 _ONE, _BATCH = (1, 1024), (64, 64)
 TreeT = TypeVar("TreeT")
 

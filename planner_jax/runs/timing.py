@@ -12,9 +12,8 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
-# Prefix of JAX's events of tracing, lowering and compiling, which includes reading the compile
-# cache. Inner functions are traced within outer functions, so that the time spans of events
-# overlap. Their union is measured, because their sum would count the overlaps twice.
+# Prefix of JAX's events of tracing, lowering, compiling and reading the compile cache. Their time
+# spans overlap, since functions are traced within functions, so their union is measured.
 _COMPILING = "/jax/core/compile/"
 _WARM_CALLS = 3  # greatest number of calls by which `measure_warm` tries to avoid compilation
 

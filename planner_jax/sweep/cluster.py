@@ -36,8 +36,7 @@ _AHEAD = 2  # Number of chunks per worker that are being made or wait to be writ
 # Greatest number of workers that share one GPU. Several workers keep the GPU busy, because a worker
 # judges its plans on the CPU while another worker plans on the GPU.
 WORKERS_OF_GPU = 8
-# Fraction of a GPU's memory that all its workers may allocate for arrays. The remainder is left for
-# what every process needs to start.
+# Fraction of a GPU's memory for all its workers' arrays; the remainder starts the processes.
 _MEMORY = 0.6
 
 

@@ -124,8 +124,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # If no case is solved by exactly one run, the interval ends at the Clopper-Pearson bound of a
-    # probability after 0 events in `num` trials.
+    # If no case is solved by exactly one run, the bound is Clopper-Pearson's for 0 of `num` events.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)

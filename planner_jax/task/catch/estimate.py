@@ -24,8 +24,7 @@ INSTANT = 0.05  # [s], least time between two catches
 _ACCELERATION = 7.0  # [m/s^2], of the point that models the quadrotor
 _TURNING = 0.2  # [s], time to tilt before the point starts to move
 _STEEPEST = 0.2  # greatest sine of a target's angle of ascent at a catch
-# [m], greatest shortfall of an optional target that is tried. It is positive, because plans reach
-# farther than the estimate.
+# [m], greatest shortfall of a tried optional target: plans reach farther than the estimate.
 _MARGIN = 0.8
 
 

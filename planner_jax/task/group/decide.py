@@ -123,8 +123,7 @@ class Best(Decision):
         is_proposed = is_last & ~jnp.any(falls, axis=1)
         ranking = jnp.argsort(jnp.where(is_proposed, rank, jnp.inf))
         chosen = ranking[: min(self.finalists, len(orders))]
-        # Repeat the best order if there are fewer than F orders. Repetitions cost little, because
-        # `GroupIntercept` plans equal legs only once.
+        # Repeat the best order if there are fewer than F; `GroupIntercept` plans equal legs once.
         chosen = jnp.where(is_proposed[chosen], chosen, chosen[0])
         return GroupChoice(order=orders[chosen])
 

@@ -2,16 +2,14 @@
 
 from planner_jax.core.registry import Task
 
-# [1/m], coefficient K_D of the ball's quadratic drag, fitted to the published landing points. The
-# residual of the fit is 1 cm.
+# [1/m], coefficient K_D of the ball's quadratic drag, fitted to the published landing points.
 DRAG = 0.0616
 # [m], hover position of the quadrotor at time 0. The paper gives no numbers; its figure shows the
 # quadrotor at the line between the near and the far region.
 START = (-3.0, 0.0, 1.5)
 
-# The six scenarios of the real experiments of [Yu2023bat, Section VI-C], as names in
-# `court.SCENARIOS`: region of serve, landing and target. The names are an assumption, because the
-# paper describes these scenarios only in words.
+# The six scenarios of the real experiments of [Yu2023bat, Section VI-C] as names in
+# `court.SCENARIOS`: an assumption, because the paper describes them only in words.
 REAL_SCENARIOS = {
     "S.1": ("FNN", "FFN"),  # serves from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions

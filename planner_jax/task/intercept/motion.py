@@ -35,8 +35,7 @@ class Motion:
     # Derivatives of x, y, heading and time of each sample by 8 variables: the five variables of its
     # own piece, and the three components of a twist of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    # Derivatives of the twist (rigid displacement) of all later pieces, by speed and curvature at
-    # the piece's end.
+    # Derivatives of the later pieces' twist (rigid displacement) by the piece's last values.
     right: Array  # (K, 2, 3)
     left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
 
@@ -139,8 +138,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
     # Twists (rigid displacements) of each piece that its variables cause by deforming earlier
-    # pieces. The end time deforms all earlier pieces, and the values at the piece's start deform
-    # the previous piece.
+    # pieces: the end time deforms all of them, the values at the piece's start the previous one.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
