@@ -22,6 +22,7 @@ import operator
 import os
 import resource
 import statistics
+import sys
 import time
 from typing import Any
 
@@ -89,6 +90,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     )
     beside = []
     for num in settings.batch:
+        _tell(f"Compiling the planner for {num:,} cases.")
         host = jax.tree.map(np.asarray, card.draw(num, suite, settings.seed))
         timed = _time_calls(made, host, used, repeat)
         _add_row(bench, card, made, host, used, timed)
@@ -151,11 +153,19 @@ def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
     return _Timed(first, clock.seconds, seconds, plans)
 
 
+def _tell(text: str) -> None:
+    """Print to stderr what the command waits for, or a first figure."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def _add_row(
     bench: Bench, card: Task, planner: Any, host: Any, devices: list, timed: _Timed
 ) -> None:
     plans = jax.device_get(timed.plans)
     success = card.judge(*jax.tree.map(lambda leaf: leaf[:_JUDGED], (host, plans))).success
+    speed = plans.status.size / timed.fastest
+    _tell(f"{speed:,.0f} plans/s, of which the referee accepts {100.0 * success.mean():.3f} %.")
+    _tell("Comparing costs with a longer search, if the task has one; it compiles first.")
     gaps = cost_gaps(planner, host, plans, devices, card=card)
     bench.count(success, gaps)
     figures = gap_figures(gaps)
@@ -166,7 +176,7 @@ def _add_row(
         "compiling_seconds": timed.compiling,
         "fastest_seconds": timed.fastest,
         "median_seconds": statistics.median(timed.seconds),
-        "plans_per_second": plans.status.size / timed.fastest,
+        "plans_per_second": speed,
         "judged": success.size,
         "success": success.mean(),
         **figures,

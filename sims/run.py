@@ -5,6 +5,7 @@ import datetime
 import html
 import json
 import os
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -122,6 +123,7 @@ def _fly_into(
     folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
 ) -> dict[str, Any]:
     """Fly all cases, write all files of the run, and return the manifest."""
+    print(f"Writing {folder.path}; the simulation compiles first.", file=sys.stderr, flush=True)
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.plans.write_rows(rows)
     recording = flight.recording(cases, flights, np.arange(kept))

@@ -151,7 +151,10 @@ def test_throughput_is_measured_of_any_task(halving, tmp_path, capsys):
     assert (manifest["summary"]["num"], manifest["summary"]["success_rate"]) == (12, 0.5)
     assert manifest["summary"]["cost_gap_median"] is None
     assert [row["success"] for row in read(tmp_path / "run", "rows.json")] == [0.75, 0.375]
-    assert "status equal on 100.00 %" in capsys.readouterr().out
+    out, err = capsys.readouterr()
+    assert "status equal on 100.00 %" in out
+    told = [line for line in err.splitlines() if "plans/s" in line or "longer" in line]
+    assert "the referee accepts 75.000 %" in told[0] and told[1].startswith("Comparing costs")
 
 
 def test_costs_without_rounds_are_compared_with_those_of_the_tasks_yardstick():

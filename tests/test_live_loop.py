@@ -315,6 +315,7 @@ def test_a_signal_ends_it_with_the_report(number):
     assert process.stdout is not None and "Answering" in process.stdout.readline()
     process.send_signal(number)
     out, err = process.communicate(timeout=30.0)
+    assert err.startswith("Compiling the planner.\n")
     assert process.returncode == 128 + number and "0 packets answered" in err
     assert "compiled after the start: 0" in out
 

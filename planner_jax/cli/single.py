@@ -177,6 +177,7 @@ def _serve(settings: ServeSettings) -> None:
     options = {name: vars(settings)[name] for name in names}
     planner = LivePlanner(settings.stroke(), **options)
     server = Server(planner, settings.port)
+    print("Compiling the planner.", file=sys.stderr, flush=True)
     server.warm_up()
     report = server.planner.report
     remainder = lambda: f"{report.counts['answered']:,} packets answered"  # noqa: E731
