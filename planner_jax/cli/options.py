@@ -5,11 +5,11 @@ The fields' metadata have `metavar` and `help`, which `planner_jax.runs.settings
 
 import argparse
 import dataclasses
-import functools
 import re
 import sys
 import typing
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, NoReturn
 
 from planner_jax.core.errors import ArgumentError, MissingExtra, PlannerJaxError, format_value
@@ -47,9 +47,7 @@ class Parser(argparse.ArgumentParser):
     """
 
     def __init__(self, *, fill: Callable[["Parser"], None] = lambda parser: None, **look: Any):
-        shape = functools.partial(
-            argparse.RawDescriptionHelpFormatter, max_help_position=28, width=100
-        )
+        shape = partial(argparse.RawDescriptionHelpFormatter, max_help_position=28, width=100)
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill, self._flags = fill, {}
         # A word that starts like this is a negative number and not an option. The own pattern of
@@ -65,7 +63,7 @@ class Parser(argparse.ArgumentParser):
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
         """Add the option `flag`; with `type` int or float its word must be a number."""
         if type in (int, float):
-            how["type"] = functools.partial(_read_number, flag, type)
+            how["type"] = partial(_read_number, flag, type)
         self._flags[self.add_argument(flag, **how).dest] = flag
 
     def error(self, message: str) -> NoReturn:

@@ -2,13 +2,13 @@
 
 import contextlib
 import datetime
-import functools
 import os
 import pkgutil
 import shlex
 import sys
 from argparse import SUPPRESS
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 from planner_jax.baselines.block.library.options import add_commands
@@ -51,7 +51,7 @@ def _sweep(task: Task, given: Options) -> None:
     from planner_jax.sweep import run
 
     again = f"finish with: planner-jax sweep {task.name} --resume --out {shlex.quote(str(out))}"
-    remainder = functools.partial(_how_to_continue, Path(out), again)
+    remainder = partial(_how_to_continue, Path(out), again)
     with stopping.under_way(remainder), _tell_how_to_continue(remainder):
         if resume:
             manifest = run.resume_sweep(task, out, workers=workers, **given)
@@ -128,7 +128,7 @@ def _train(given: Options) -> None:
         from planner_jax.policies.training import train_from_settings
     except ModuleNotFoundError as error:
         raise MissingExtra("train", error.name, "policies") from None
-    remainder = functools.partial(
+    remainder = partial(
         _how_to_continue, Path(out), f"continue with: {_quote_command()}", "training.json"
     )
     with stopping.under_way(remainder), _tell_how_to_continue(remainder):
@@ -243,7 +243,7 @@ def add_library(library: Parser) -> None:
     def command(name: str, words: str) -> Callable[..., None]:
         added = commands.add_parser(name, help=words, description=words, argument_default=SUPPRESS)
         added.add_argument("path", metavar="FILE", help="of the library")
-        added.set_defaults(command=functools.partial(_library, name))
+        added.set_defaults(command=partial(_library, name))
         return added.add
 
     add_commands(command)
@@ -253,9 +253,7 @@ def _library(name: str, given: Options) -> None:
     keep_compiled_programs()
     run = pkgutil.resolve_name(f"planner_jax.baselines.block.library.command:{name}_library")
     parts = Path(f"{given['path']}.parts")
-    remainder = functools.partial(
-        _how_to_continue, parts, f"continue with: {_quote_command()}", "what.json"
-    )
+    remainder = partial(_how_to_continue, parts, f"continue with: {_quote_command()}", "what.json")
     rule = "FILE must be one that can be written"
     with stopping.under_way(remainder, patient=False), _tell_how_to_continue(remainder, rule):
         run(**given)

@@ -27,10 +27,7 @@ def format_shapes(tree: PyTree) -> str:
 
 
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
-    """Raise unless an argument is one finite number that keeps a rule.
-
-    A jax array may be traced or on another device, so only its shape and type are checked.
-    """
+    """Raise unless an argument is one finite number that keeps a rule, or is a jax array ()."""
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
         words = rule.words if rule is FINITE else f"{FINITE.words} and {rule.words}"

@@ -1,7 +1,4 @@
-"""Named choices and ranges that planners, settings and exports share, and their checks.
-
-This module imports neither JAX nor NumPy, because the command line checks its options with it.
-"""
+"""Named choices and ranges that planners, settings and exports share; no import of JAX."""
 
 import os
 from collections.abc import Iterable

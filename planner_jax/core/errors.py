@@ -1,8 +1,4 @@
-"""The exceptions of the library; `PlannerJaxError` is the base class of all.
-
-An error about an argument stores its parts as fields. Code that uses another name for the argument,
-such as the command line, renames it by `with_names`. This module does not import JAX.
-"""
+"""The exceptions of the library; `PlannerJaxError` is the base class of all."""
 
 import copy
 import numbers

@@ -64,10 +64,7 @@ PERMUTATION = Rule("a permutation", _is_permutation)
 
 @dataclasses.dataclass(frozen=True)
 class Field:
-    """One array of a case: its name, its shape in one case, its rule, and its kind of numbers.
-
-    An array that is None, or that belongs to a part that is None, is not checked.
-    """
+    """One array of a case: its name, its shape in one case, its rule, and its kind of numbers."""
 
     name: str  # dotted name of the array, as in "limits.speed"
     shape: tuple[int | str, ...] | None = ()  # equal letters are equal sizes; None allows any shape

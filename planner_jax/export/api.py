@@ -1,7 +1,4 @@
-"""Export of one plan to a controller: `export` writes a file, and `stream` sends it to a UDP port.
-
-A format's module is imported when it is requested, since it may need an optional package.
-"""
+"""Export of one plan to a controller: `export` writes a file, `stream` sends it to a UDP port."""
 
 import dataclasses
 import difflib

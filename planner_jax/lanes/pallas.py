@@ -1,8 +1,4 @@
-"""Helpers for CUDA kernels: the only module that imports Pallas, JAX's language for kernels.
-
-The kernels use Pallas' Triton backend. If JAX removes this backend, only this module must be
-rewritten (docs/lanes_and_kernels.md).
-"""
+"""Helpers for CUDA kernels: the only module that imports Pallas, JAX's language for kernels."""
 
 import importlib.util
 import math

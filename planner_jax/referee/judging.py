@@ -93,16 +93,10 @@ def check_leaf(name: str, value: ArrayLike, shape: tuple[int, ...]) -> np.ndarra
 def read_leaves(
     tree: object, shapes: Mapping[str, tuple[int, ...]], num_lanes: int, prefix: str = ""
 ) -> dict[str, np.ndarray]:
-    """Read arrays of cases or plans by name, and check their shapes.
+    """Read arrays of cases or plans, by the dotted paths of their fields, and check their shapes.
 
-    Args:
-        tree: object whose arrays have a leading axis B.
-        shapes: shape of each array without that axis, by the path of its fields, as "ball.pos".
-        num_lanes: the batch size B.
-        prefix: text before each name in the result and in error messages.
-
-    Returns:
-        Arrays by name. Fields of `tree` that are None are left out.
+    `shapes` lack the batch axis B. Names in the result and in errors start with `prefix`. Fields of
+    `tree` that are None are left out.
 
     Raises:
         ValueError: an array does not have the shape (B, ...) that `shapes` requires.

@@ -331,17 +331,13 @@ def _to_numbers(value: Value, quantity: _Quantity) -> Value:
 
 
 def parse_numbers(value: Value, kind: str, count: int, *, span: bool = False) -> tuple[float, ...]:
-    """Parse the numbers of a value and convert them to SI units.
+    """Parse the numbers of a value, such as "3 3 5 g m^2", and convert them to SI units.
 
-    Args:
-        value: text such as "3 3 5 g m^2", whose unit applies to all its numbers; a number in SI
-            units; or a list of texts and numbers.
-        kind: kind of quantity, a key of `UNITS`.
-        count: number of numbers that the value must have.
-        span: whether the word "to" may stand between two numbers.
+    A value is a text, a number, or a list of them. `kind` is a key of `UNITS`, and `count` the
+    required number of numbers. With `span` the word "to" may stand between two numbers.
 
     Raises:
-        QuantityError: the value has another unit or another count, or is not made of numbers.
+        QuantityError: the value has another unit or count, or is not made of numbers.
     """
     parts = value if isinstance(value, list | tuple) else [value]
     numbers = tuple(number for part in parts for number in _parse(part, kind, span))

@@ -31,12 +31,10 @@ def sample_at_rate(
         rate: [Hz], number of samples in a second.
         ends: () or (B,) [s], end of each plan.
         leaves: pytree of the arrays that describe the plans, with their batch shape.
-        setpoint_at: pure function of (leaves of one plan, time () [s]). It returns the quantities
-            of a setpoint by name.
+        setpoint_at: pure function (leaves of a plan, time () [s]) -> quantities by name.
 
     Returns:
-        "time" (K,) [s], and every quantity by name: (K, ...) for one plan, (B, K, ...) for a batch.
-        Entries after the end of a plan are NaN.
+        "time" (K,) [s], and quantities (K, ...) or (B, K, ...), NaN after the end of a plan.
 
     Raises:
         TypeError: the rate is not a number.

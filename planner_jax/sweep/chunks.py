@@ -182,10 +182,7 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return the times for the manifest, except `wall_seconds`.
-
-    If few cases were planned without compilation, chunk 0 is planned again to measure the speed.
-    """
+    """Return the times for the manifest; may plan chunk 0 again to measure the warm speed."""
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

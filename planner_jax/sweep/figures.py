@@ -67,14 +67,10 @@ def quadrotor_figure(
     first: Callable[[Axes, Entries, list[Drawn]], None],
     word: Callable[[Row], str],
 ) -> None:
-    """Draw several planners' plans for the same case over time, together with the limits.
+    """Draw several planners' plans for the run's example case over time, together with the limits.
 
-    Args:
-        figure: empty figure.
-        run: run whose example case is drawn.
-        panels: four names in `PANELS`, for the second to the fifth panel.
-        first: function that draws the first panel, which differs between tasks.
-        word: function that describes the plan of a successful row in a few words.
+    The function `first` draws the first panel, which differs between tasks; `panels` names four of
+    `PANELS`. The function `word` describes a successful plan in a few words.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)

@@ -37,10 +37,7 @@ class RunFigure:
 
 
 class Sweep(Generic[AnySettings]):
-    """What a sweep does for one task: provide cases, plan, judge, and report.
-
-    A task may name a subclass in `SweepSettings.RUN`, for example with its own columns and figures.
-    """
+    """What a sweep does for one task: provide cases, plan, judge, and report."""
 
     frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns
     own_columns: ClassVar[Sequence[Column]] = ()  # columns of the rows; () stores every leaf

@@ -104,12 +104,7 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Check the arguments of a task's `judge`, and return the verdict of its referee.
-
-    Raises:
-        TypeError: cases or plans are not instances of `kinds`, or `require_settings` raises.
-        ValueError: cases and plans differ in batch shape, or the referee raises.
-    """
+    """Return the verdict of a task's referee, after checks of the arguments of `judge`."""
     require_kind("cases", cases, kinds[0])
     require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)

@@ -88,11 +88,8 @@ def limits_of(
 ) -> QuadrotorLimits:
     """Return the limits of a case: the arguments that are not None, and else the robot's limits.
 
-    Args:
-        robot: quadrotor with its tool. Thrust is limited if the robot carries a net, or if
-            `robot.limits.thrust` is not None.
-        leaf: `leaf(name, value, *shape)` broadcasts a value to an array with the batch's shape.
-        **given: limits by name, such as `speed` [m/s]; None stands for the robot's limit.
+    Without a net, thrust is limited only if `robot.limits.thrust` is not None. The function
+    `leaf(name, value, *shape)` gives a value the batch's shape.
     """
     own = robot.limits
     least, most = own.thrust or (None, None)

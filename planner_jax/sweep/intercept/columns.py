@@ -1,7 +1,4 @@
-"""Columns of the rows that a sweep of interceptions stores: case, plan and verdict.
-
-For N obstacles of V corners, a list column has N entries, or the coordinates of N x V corners.
-"""
+"""Columns of the rows that a sweep of interceptions stores: case, plan and verdict."""
 
 from collections.abc import Callable
 

@@ -1,7 +1,4 @@
-"""The box that the arm protects, and the obstacles [Natarajan2024, Sections IV-C and V-A].
-
-Positions are in the robot's base frame, z up, SI units.
-"""
+"""The box that the arm protects, and obstacles, in the robot's base frame [Natarajan2024]."""
 
 import jax.numpy as jnp
 import numpy as np

@@ -188,10 +188,7 @@ class CatchDecision:
         return plans.times[..., -1] + 100.0 * left.astype(dtype)
 
     def explain(self, case: CatchCase, status: Array) -> Array:
-        """Return OUT_OF_REACH if a case is unsolved and a target is provably out of reach.
-
-        `closest_approach` gives the proof. Every other status is returned unchanged.
-        """
+        """Return OUT_OF_REACH if a case is unsolved and a target is provably out of reach."""
         away = jnp.max(_closest_approach(case)) > 0.0
         unsolved = is_unsolved(status) | (status == Status.OUT_OF_TIME)
         return jnp.where(unsolved & away, jnp.int32(Status.OUT_OF_REACH), status)

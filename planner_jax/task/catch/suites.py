@@ -4,9 +4,9 @@
 """
 
 import dataclasses
-import functools
 import zlib
 from collections.abc import Callable
+from functools import partial
 from types import ModuleType
 
 import jax
@@ -265,29 +265,22 @@ def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
     return _lines(pos, vel), ((height - CATCH_HEIGHT) / sinking)[..., 0]
 
 
-_hexagon = functools.partial(_polygon, num=6)
+_hexagon = partial(_polygon, num=6)
 
 # Suite -> (C, function). A case takes C random numbers. The function maps uniform random numbers
 # (B, C) of [0, 1), NumPy or JAX, to targets, leaves (B, N, ...), and horizons (B, N) [s].
 _PATHS: dict[str, tuple[int, Callable[[PyTree], tuple[TargetPath, PyTree]]]] = {
     **{
-        name: (3 * len(throws), functools.partial(_throws, throws=throws))
-        for name, throws in _THROWS.items()
+        name: (3 * len(throws), partial(_throws, throws=throws)) for name, throws in _THROWS.items()
     },
     "harmonic2": (18, _harmonic),
     "triangle3": (7, _triangle),
     "hexagon6": (8, _hexagon),
-    "square4": (8, functools.partial(_polygon, num=4)),
-    "pentagon5": (8, functools.partial(_polygon, num=5)),
-    "heptagon7": (8, functools.partial(_polygon, num=7)),
-    "rush3": (
-        7 + 6,
-        functools.partial(_rush, of=_triangle, num=3, first=2.35, after=0.9, spread=0.5),
-    ),
-    "rush6": (
-        8 + 12,
-        functools.partial(_rush, of=_hexagon, num=6, first=3.8, after=0.9, spread=0.6),
-    ),
-    "swarm8": (8 * 6, functools.partial(_swarm, num=8)),
-    "swarm12": (12 * 6, functools.partial(_swarm, num=12)),
+    "square4": (8, partial(_polygon, num=4)),
+    "pentagon5": (8, partial(_polygon, num=5)),
+    "heptagon7": (8, partial(_polygon, num=7)),
+    "rush3": (7 + 6, partial(_rush, of=_triangle, num=3, first=2.35, after=0.9, spread=0.5)),
+    "rush6": (8 + 12, partial(_rush, of=_hexagon, num=6, first=3.8, after=0.9, spread=0.6)),
+    "swarm8": (8 * 6, partial(_swarm, num=8)),
+    "swarm12": (12 * 6, partial(_swarm, num=12)),
 }
