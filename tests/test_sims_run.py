@@ -146,8 +146,8 @@ def test_a_run_of_flights_writes_all_its_files(tmp_path, capsys):
     out = tmp_path / "run"
     command = ["fly", "catch", "--num", "3", "--batch", "2", "--noise", "none", "--replan", "0"]
     assert main([*command, "--video", "--out", str(out)]) == 0
-    out, err = capsys.readouterr()
-    assert "100.00 % of 3 flights caught all balls" in out and "compiles first" in err
+    printed, told = capsys.readouterr()
+    assert "100.00 % of 3 flights caught all balls" in printed and "compiles first" in told
     names = {path.name for path in out.glob("[!.]*")}
     assert names == {
         "manifest.json",
