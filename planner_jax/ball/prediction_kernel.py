@@ -31,7 +31,7 @@ def table_kernel(
     Args:
         num_nodes: number N of nodes.
         moving: indices of arguments other than the position. If there are any, the kernel returns
-            derivatives of positions, then of velocities, by them.
+            derivatives by these arguments instead of states: of positions, then of velocities.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 

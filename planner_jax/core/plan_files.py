@@ -61,11 +61,7 @@ def load_arrays(path: str | os.PathLike, kind: type[Kind]) -> Kind:
 
 
 def load_fitting(path: str | os.PathLike, kinds: Sequence[type[Kind]]) -> Kind:
-    """Load a file of `save_arrays` as the first of several classes whose fields it contains.
-
-    Raises:
-        PlanFileError: the file contains none of the classes, another version, or something else.
-    """
+    """Load a file of `save_arrays` as the first of several classes whose fields it contains."""
     version, name, arrays = _read(path)
     if version == VERSION:
         for kind in kinds:

@@ -145,11 +145,7 @@ def suite_named(name: object, default: str) -> str:
 def split_name(
     known: Collection[str], kind: str, name: object, from_file: Collection[str] = ()
 ) -> tuple[str, str]:
-    """Split a name such as "policy:FILE" into the known name and the file, "" if there is none.
-
-    Raises:
-        UnknownName: the name is not known as a `kind`, or takes no file (see `from_file`).
-    """
+    """Split a name such as "policy:FILE" into the known name and file, or raise `UnknownName`."""
     own, _, file = name.partition(":") if isinstance(name, str) else (name, "", "")
     own = require_name(known, kind, own)
     if own != name and own not in from_file:

@@ -208,10 +208,7 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Return the penalties of all limits along a flight, for `integrate_along`.
-
-    Only the existence of the case's limits and extras matters, not their values.
-    """
+    """Return the penalties of all limits along a flight, for `integrate_along`."""
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
     margins = tuple(margin * factor for factor in factors)

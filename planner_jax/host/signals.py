@@ -38,10 +38,7 @@ _STATE = _State()
 
 
 def listen() -> None:
-    """Start to handle SIGINT, SIGTERM and SIGHUP; call this in the main thread of a command.
-
-    SIGINT is handled in background jobs too. SIGHUP stays ignored under `nohup`.
-    """
+    """Start to handle SIGINT, SIGTERM and SIGHUP; call this in the main thread of a command."""
     reader, writer = os.pipe()
     os.set_blocking(writer, False)
     signal.set_wakeup_fd(writer, warn_on_full_buffer=False)

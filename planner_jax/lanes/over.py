@@ -135,11 +135,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
 def _by_kernel(
     eqn: JaxprEqn, closed: ClosedJaxpr, kernel: kernels.Kernel, inputs: list[_Value], lanes: int
 ) -> list[_Value]:
-    """Evaluate a call of a function that has a kernel.
-
-    The program contains the kernel, compiled for CUDA, and the function's operations, for other
-    devices and for shapes that the kernel does not support.
-    """
+    """Evaluate a call by its kernel on CUDA, and by the function's operations elsewhere."""
     pairs = zip(inputs, eqn.invars, strict=True)
     arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]
     shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]

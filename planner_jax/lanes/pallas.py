@@ -113,10 +113,7 @@ def grid_index(axis: int) -> Array:
 
 
 def _spare_searches() -> None:
-    """Provide an empty module that JAX looks for, which makes kernels a third faster to lower.
-
-    MLIR tries to import this module of Triton's dialect for every value that it passes to Python.
-    """
+    """Provide an empty module that JAX looks for, which makes kernels a third faster to lower."""
     name = "jaxlib.mlir.dialects.tt"
     if name not in sys.modules and importlib.util.find_spec(name) is None:
         sys.modules[name] = types.ModuleType(name)

@@ -1,7 +1,4 @@
-"""Braking of cars and arms from the end of a plan to standstill.
-
-A few candidate motions keep the robot's limits. The first one without a collision is selected.
-"""
+"""Braking of cars and arms to standstill, by the first candidate motion without a collision."""
 
 import dataclasses
 from collections.abc import Iterator

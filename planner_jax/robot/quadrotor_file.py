@@ -1,13 +1,16 @@
 """Reading and writing of quadrotors as YAML files whose values have units, as in this example.
 
-name: mine mass: 800 g inertia: 3 3 5 g m^2 rotors: {diagonal: 250 mm, max_thrust: 4.5 N, lag: 30
-ms} tool: {kind: racket, height: 6 cm, radius: 11 cm} limits: {speed: 5 m/s, body_rate: 344 deg/s,
-thrust: 0.2 to 1.9 g}
+    name: mine
+    mass: 800 g
+    inertia: 3 3 5 g m^2
+    rotors: {diagonal: 250 mm, max_thrust: 4.5 N, lag: 30 ms}
+    tool: {kind: racket, height: 6 cm, radius: 11 cm}
+    limits: {speed: 5 m/s, body_rate: 344 deg/s, thrust: 0.2 to 1.9 g}
 
 A number without a unit is in SI units. Only an inertia must have its unit, because it is often
-stated in g m^2. In an acceleration "g" is the standard gravity, elsewhere the gram. `model:
-mine.xml` reads body and rotors from a MuJoCo model (MJCF); fields of the YAML file override the
-model's. This module imports no JAX.
+stated in g m^2. In an acceleration "g" is the standard gravity, elsewhere the gram. The field
+`model`, a path such as mine.xml, reads body and rotors from a MuJoCo model (MJCF); fields of the
+YAML file override the model's. This module imports no JAX.
 """
 
 import dataclasses

@@ -30,12 +30,7 @@ _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] paus
 
 
 class RunFolder:
-    """The folder of one run, with methods that create, lock, read and write it.
-
-    Args:
-        path: path of the folder, which need not exist.
-        name: name of the caller's argument that holds the path, for error messages.
-    """
+    """The folder of one run; errors about its `path` name the caller's argument `name`."""
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name

@@ -1,8 +1,4 @@
-"""Settings of runs, which are checked before anything is read, compiled or written.
-
-They are frozen dataclasses, whose fields are the options of the command line. Nothing here imports
-JAX, so that the help of a command appears at once.
-"""
+"""Settings of runs, whose fields are the options of the command line. JAX is not imported."""
 
 import dataclasses
 import os
@@ -128,11 +124,7 @@ class SweepSettings:
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the settings of a run that is resumed, from the `parameters` in its manifest.
-
-    Raises:
-        ArgumentError: a setting in `given` differs, or `kind` does not accept the stored settings.
-    """
+    """Return the settings of a resumed run; raise if one in `given` differs from the stored one."""
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:

@@ -3,10 +3,10 @@
 MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints [Wang2022;
 Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times differentiable.
 
-Piece i of M lasts r_i h seconds. The proportions r_i are constant and have mean one, so that h = T
-/ M. With times in units of h, one constant matrix maps the boundary rows and the waypoints to the
-coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are (p,
-v h, a h^2, j h^3) at both ends.
+Piece i of M lasts r_i h seconds. The proportions r_i are constant with mean one, so that h = T / M.
+With times in units of h, one constant matrix maps the boundary rows and the waypoints to the
+coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
+(p, v h, a h^2, j h^3) at both ends.
 
 The waypoints q are expressed by whitened offsets y from the waypoints that need the least energy
 for the boundary b: q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T. Hence y = 0

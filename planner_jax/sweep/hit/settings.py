@@ -18,11 +18,7 @@ _FARTHEST = 1e6  # [m] greatest absolute coordinate of the start that is accepte
 
 @dataclasses.dataclass(frozen=True)
 class HitSettings(QuadrotorSettings):
-    """Settings of a sweep of hits, which plans and judges many drawn or published cases.
-
-    `num` is the number of serves: by default all serves of the folder `serves`, or `DEFAULT_NUM`.
-    `seed` determines the drawn serves, and the starts if `start` is "uniform".
-    """
+    """Settings of a sweep of hits, which plans and judges many drawn or published cases."""
 
     serves: str | None = option(None, "DIR", "read published trial files (default: draw serves)")
     start: tuple[float, ...] | str = option(

@@ -94,10 +94,7 @@ def _components_first(vectors: ArrayLike) -> np.ndarray:
 
 
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
-    """Return position and velocity (..., 3) of balls after a flight with quadratic drag.
-
-    The arguments, in SI units, broadcast. The flight is integrated in equal Runge-Kutta steps.
-    """
+    """Return position and velocity (..., 3) of balls after a flight with quadratic drag."""
     step = np.asarray(duration, float) / num_steps
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
     position, velocity = np.asarray(position, float), np.asarray(velocity, float)
@@ -152,10 +149,7 @@ def landing(position, velocity, drag, gravity):
 
 
 def check_cases(cases: HitCase) -> None:
-    """Raise `CaseError` unless every case of a batch is valid and its ball lands at x < 0.
-
-    The ball must also start above the floor. Call this function outside of `jax.jit`.
-    """
+    """Raise `CaseError` unless all cases are valid and their balls land at x < 0."""
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball
     position, velocity = np.asarray(ball.pos, float), np.asarray(ball.vel, float)
