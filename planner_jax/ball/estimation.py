@@ -48,7 +48,7 @@ def _congruence(A: Array, P: Array) -> Array:
 
 
 def solve_definite(A: Array, B: Array) -> Array:
-    """Solve A X = B for X (m, n), with a small symmetric positive definite A (m, m), unrolled."""
+    """Solve A X = B for X (m, n) by unrolled elimination; A (m, m) is positive definite."""
     U, X = list(A), list(B)
     size = len(U)
     for i in range(size):

@@ -26,7 +26,7 @@ class TargetPath(Protocol):
 
 
 def state_at(path: TargetPath, time: Array) -> BallState:
-    """Return position and velocity of a target at one time () [s], by `at` or its derivative."""
+    """Return a target's position and velocity at a time () [s]; `at` may give only positions."""
     state = path.at(time)
     if isinstance(state, BallState):
         return state

@@ -27,7 +27,7 @@ def format_shapes(tree: PyTree) -> str:
 
 
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
-    """Raise unless an argument is one finite number that keeps a rule, or is a jax array ()."""
+    """Raise unless an argument is one finite number that keeps a rule; jax arrays () pass."""
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
         words = rule.words if rule is FINITE else f"{FINITE.words} and {rule.words}"

@@ -159,7 +159,7 @@ class Dislike:
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Give leaves of extras a dtype and the batch axes () or (B,); raise if they do not fit."""
+    """Convert leaves of extras to a dtype with batch axes () or (B,), or raise `ArgumentError`."""
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
     for extra in extras:

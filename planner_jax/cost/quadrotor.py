@@ -36,7 +36,7 @@ def speed_excess(vel: Components, limits: QuadrotorLimits) -> Array:
 
 
 def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
-    """Return |a|^2 / a_max^2 - 1 [Yu2023bat, eq. 18a] of (..., 3) [m/s^2]; -1 without limit."""
+    """Return |a|^2 / a_max^2 - 1 [Yu2023bat, eq. 18a], or -1 if acceleration has no limit."""
     if limits.acceleration is None:
         return 0.0 * components(acc)[0] - 1.0
     return _size_squared(acc) * reciprocal(limits.acceleration) ** 2 - 1.0
@@ -51,7 +51,7 @@ def body_rate_excess(
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
-    """Return z_min - z [m] for heights z (...) [m]: [Yu2023catch, eq. 28] without its square."""
+    """Return z_min - z [m] for heights z (...) [m], as [Yu2023catch, eq. 28] without the square."""
     return limits.min_height - height
 
 

@@ -21,7 +21,7 @@ _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kern
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return the number of lanes (problems) of a block, a divisor up to `most`, or None."""
+    """Return how many lanes (problems) a kernel's block has, up to `most`; None if too few."""
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
 

@@ -45,7 +45,7 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send position [m], velocity and acceleration (3,); return the answer or None."""
+        """Send the robot's state (3,), SI units; return the answer, or None after the timeout."""
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

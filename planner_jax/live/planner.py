@@ -269,7 +269,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery from the plan's end; without any, return to the previous course."""
+        """Plan the recovery from the plan's end; if it fails, return to the previous course."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return

@@ -229,7 +229,7 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return angles, rates and accelerations (K, 6, B, M) at K extrema and ends, with times [s]."""
+    """Return angles, rates and accelerations at their extrema and at ends of pieces, with times."""
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []

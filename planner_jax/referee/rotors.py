@@ -14,7 +14,7 @@ _NUMBERS = 250_000  # greatest number of samples computed at once, so that they 
 
 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure the least and greatest rotor thrust (B,) [N] at fractions `u`, and test both."""
+    """Measure the least and the greatest thrust (B,) [N] of any rotor, and test both limits."""
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))

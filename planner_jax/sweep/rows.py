@@ -28,7 +28,7 @@ class PlannedRow(NamedTuple):
 
 
 def case_of_row(folder: RunFolder, row: int) -> PyTree:
-    """Return a stored row's case, or raise `ArgumentError` if it differs from the manifest."""
+    """Return the case of a stored row; raise `ArgumentError` if it does not fit the manifest."""
     manifest, sweep = read_finished(folder)
     settings = settings_of_manifest(settings_of(sweep.task), manifest["parameters"], folder.name)
     cases = sweep.open_source(settings.of(sweep.task), 1).cases(row, row + 1).cases

@@ -38,7 +38,7 @@ class Timetable:
 
 
 def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Return K times (N, K) [s] up to N targets' horizons, and states (N, 3, K) and speeds then."""
+    """Return times (N, K) [s] up to N horizons, with the targets' states (N, 3, K) and speeds."""
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares[None]
     along = lambda target, at: over_lanes(functools.partial(state_at, target))(at)  # noqa: E731

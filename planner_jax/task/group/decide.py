@@ -55,7 +55,7 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the car's earliest meeting with the target of an index after the meeting `last`."""
+    """Estimate the car's earliest meeting with the target `target` after the meeting `last`."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]

@@ -47,7 +47,7 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return bounds (4, 2, 2) [m] of the regions: region, coordinate |x| or y, lower or upper."""
+    """Return bounds (4, 2, 2) [m] of the regions; axes: region, |x| or y, lower or upper bound."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)

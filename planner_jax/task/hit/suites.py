@@ -185,7 +185,7 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return serves' horizontal speeds [m/s] for landing distances [m], slopes and flight times."""
+    """Return serves' speeds [m/s] for landing distances [m], derivatives [1/s] and times [s]."""
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])

@@ -205,7 +205,7 @@ _earliest = jax.jit(earliest_arrival)
 def _polygons(
     uniform: np.ndarray, corners: tuple[int, int], radius: tuple[float, float]
 ) -> np.ndarray:
-    """Make convex polygons (..., 6, 2) [m], corners on circles around the origin, from numbers."""
+    """Make convex polygons (..., 6, 2) [m] with corners on circles from uniform random numbers."""
     size, num = _between(uniform[..., 0], *radius), _integer(uniform[..., 1], *corners)[..., None]
     index = np.minimum(np.arange(6), num - 1)
     shift = 0.6 * np.take_along_axis(uniform[..., 3:], index, axis=-1)
