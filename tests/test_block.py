@@ -17,7 +17,7 @@ from planner_jax.referee.arm_clearance import clearances as referee_clearances
 from planner_jax.robot.arm import REGIMES
 from planner_jax.robot.arm_mjcf import irb1600
 from planner_jax.sweep.block.settings import REGIMES as SWEPT
-from planner_jax.task.block.clearance import clearance_slopes, clearances, num_of_pole
+from planner_jax.task.block.clearance import clearances, clearances_and_slopes, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search, rank_poses
 from planner_jax.task.block.end_poses import contact_terms, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, polynomial, profiles, step_weights
@@ -132,9 +132,11 @@ def test_clearances_change_with_the_joints_as_their_slopes_say(float64):
     def both(angles):
         each = jax.jacfwd(lambda angles: clearances(arm, scene, angles[None])[:, 0])
         expected = jnp.moveaxis(jax.vmap(each)(angles), 0, -1)
-        return clearances(arm, scene, angles), clearance_slopes(arm, scene, angles), expected
+        own, slopes_at = clearances_and_slopes(arm, scene, angles)
+        return clearances(arm, scene, angles), own, slopes_at(jnp.arange(20)), expected
 
-    values, found, expected = both(angles)
+    values, own, found, expected = both(angles)
+    np.testing.assert_allclose(own, values, atol=1e-12)
     assert found.shape == expected.shape == (values.shape[0], 6, 20)
     np.testing.assert_allclose(found, expected, atol=1e-9)
 

@@ -351,6 +351,26 @@ def test_a_second_batch_of_the_same_bucket_is_not_traced_again(entry, traces):
     assert found == []
 
 
+@pytest.mark.parametrize(
+    ("planner", "case", "num"),
+    [
+        # Rounds with other variables, limits' margins or starts have programs of their own.
+        (pj.hit.planner("exact"), pj.hit.draw(1), 5),
+        (pj.catch.planner("exact").planner, pj.catch.draw(1), 2),
+        (pj.intercept.planner("spacetime"), pj.intercept.draw(1), 1),
+        (pj.intercept.planner("quick"), pj.intercept.draw(1), 1),
+        (pj.block.planner("online"), pj.block.draw(1), 1),
+        (pj.block.planner("brisk"), pj.block.draw(1), 1),
+    ],
+    ids=["hit", "catch", "intercept", "quick intercept", "block", "brisk block"],
+)
+def test_the_attempts_of_a_planner_share_programs(planner, case, num):
+    loaded = [planner.load_attempt(attempt, case) for attempt in planner.attempts]
+    layouts = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(each)] for each in loaded]
+    programs = zip(map(jax.tree.structure, loaded), map(tuple, layouts), strict=True)
+    assert len(set(programs)) == num < len(planner.attempts)
+
+
 def test_other_arrays_of_the_same_shapes_in_a_planner_are_not_traced_again(traces):
     cases = places(NUM)
     first = LibraryPlanner(library(1))

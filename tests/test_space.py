@@ -13,6 +13,7 @@ from planner_jax.space.distances import (
     approach,
     lowest_of_rectangle,
     lowest_of_segment,
+    nearest_points,
     rectangle_to_vertical_line,
     segment_to_box,
     segment_to_rectangle,
@@ -174,7 +175,8 @@ def test_an_approach_gives_the_derivative_by_a_rotation_and_a_translation(name, 
             ]
             return distance(*moved, *others)
 
-        line = approach(distance, *first, *others)
+        _, nearest = nearest_points(distance, *first, *others)
+        line = approach(distance, nearest, *first, *others)
         expected = jax.grad(at)(jnp.zeros(6))
         return expected, jnp.concatenate([jnp.stack(line.moment), jnp.stack(line.direction)])
 

@@ -14,13 +14,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
-from jax.extend.backend import backends
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import EFFORTS, require_one_of
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
+from planner_jax.core.platforms import has_only_cpu, traced_platform
 from planner_jax.core.protocol import Attempt, Plan
 from planner_jax.core.rules import Case
+from planner_jax.core.run_time import Fixed
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -96,6 +97,15 @@ class Planner(Generic[CaseT, PlanT]):
         """The attempts, in order; each is made at the cases that are still unsolved."""
         return (Attempt(),)
 
+    def load_attempt(self, attempt: PyTree, cases: CaseT, /) -> PyTree:
+        """Return what `solve` takes as its attempt, as an argument of a compiled program.
+
+        By default each attempt is static, and compiles a program of its own. Attempts that are
+        pytrees of the same structure share one program; see `run_time`. Only the class and the
+        shapes of the cases may be used.
+        """
+        return Fixed(attempt)
+
     @property
     def inner(self) -> "Planner":
         """The planner inside a planner that wraps another one; otherwise the planner itself."""
@@ -110,11 +120,11 @@ class Planner(Generic[CaseT, PlanT]):
         if not self.is_sequential:
             return self.solve_at_once(cases, attempt)
         in_turn = functools.partial(solve_in_turn, lambda case: self.solve(case, attempt))
-        if has_only_cpu():  # saves the time to trace the program for other devices
-            return in_turn(cases)
-        return lax.platform_dependent(
-            cases, cpu=in_turn, default=lambda cases: self.solve_at_once(cases, attempt)
-        )
+        at_once = lambda cases: self.solve_at_once(cases, attempt)  # noqa: E731
+        platform = "cpu" if has_only_cpu() else traced_platform()
+        if platform is None:
+            return lax.platform_dependent(cases, cpu=in_turn, default=at_once)
+        return in_turn(cases) if platform == "cpu" else at_once(cases)
 
     def solve_at_once(self, cases: CaseT, attempt: PyTree, /) -> PlanT:
         """Return the plans that one attempt makes for a batch, all cases together; pure."""
@@ -228,11 +238,6 @@ def require_fit(planner: Planner, cases: object) -> None:
         raise ArgumentError(
             type(planner).__name__, "at least one attempt", verb="have", shown="none"
         )
-
-
-def has_only_cpu() -> bool:
-    """Return whether all devices of JAX are CPUs."""
-    return set(backends()) == {"cpu"}
 
 
 def solve_in_turn(solve: Callable[[PyTree], PyTree], cases: PyTree) -> PyTree:

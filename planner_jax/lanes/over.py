@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
+from planner_jax.core.platforms import traced_platform
 from planner_jax.lanes import kernels
 from planner_jax.lanes.kernels import shape_of
 
@@ -153,7 +154,11 @@ def _by_kernel(
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))
         return results if as_called else by_operations(*leaves)
 
-    results = lax.platform_dependent(*arrays, cuda=in_kernel, default=by_operations)
+    platform = traced_platform()
+    if platform is None:
+        results = lax.platform_dependent(*arrays, cuda=in_kernel, default=by_operations)
+    else:
+        results = (by_operations if platform == "cpu" else in_kernel)(*arrays)
     return [_Lanes(leaf) for leaf in results]
 
 

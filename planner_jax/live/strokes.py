@@ -105,12 +105,13 @@ def _state_in(task: Replanning) -> Array:
 
 
 def _hit_first(attempt: Round, planner: ExactHit, case: HitCase) -> HitPlan:
-    return solve_cases(planner, case, attempt)
+    return solve_cases(planner, case, planner.load_attempt(attempt, case))
 
 
 def _hit_again(attempt: Round, planner: ReplanHit, task: Replanning) -> HitPlan:
     case = dataclasses.replace(task.case, head_state=_state_in(task))
-    return solve_cases(planner, dataclasses.replace(task, case=case), attempt)
+    task = dataclasses.replace(task, case=case)
+    return solve_cases(planner, task, planner.load_attempt(attempt, task))
 
 
 class HitStroke(Stroke[HitCase, HitPlan]):
@@ -164,7 +165,8 @@ def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchP
     """Plan a catch from scratch; the first guess is the earliest catch that the robot can reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
-    return solve_cases(planner, case.with_choice(choice), attempt)
+    case = case.with_choice(choice)
+    return solve_cases(planner, case, planner.load_attempt(attempt, case))
 
 
 def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> CatchPlan:
@@ -176,7 +178,8 @@ def _catch_again(attempt: Round, planner: ReplanCatch, task: Replanning) -> Catc
         times=previous.times - task.elapsed,
         head_state=_state_in(task),
     )
-    return solve_cases(planner, dataclasses.replace(task, case=case), attempt)
+    task = dataclasses.replace(task, case=case)
+    return solve_cases(planner, task, planner.load_attempt(attempt, task))
 
 
 class CatchStroke(Stroke[CatchCase, CatchPlan]):

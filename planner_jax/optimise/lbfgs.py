@@ -212,7 +212,8 @@ def _choose(
     there = jax.tree.map(lambda new, old: jnp.where(decreased, of_chosen(new), old), trials, here)
     best = jax.tree.map(lambda a, b: jnp.where(numbers.iteration == 0, a, b), here, numbers.best)
     is_best = is_better(there, best, tolerance=0.0) | ~jnp.isfinite(best.cost)
-    progress = here.cost - there.cost > config.tolerance * jnp.abs(here.cost)
+    tolerance = jnp.asarray(config.tolerance, here.cost.dtype)
+    progress = here.cost - there.cost > tolerance * jnp.abs(here.cost)
     after = LbfgsNumbers(
         best=jax.tree.map(lambda a, b: jnp.where(is_best, a, b), there, best),
         # If no trial lowers the cost, the next trial steps are shorter.

@@ -15,6 +15,8 @@ from flax import struct
 from jax import Array, lax
 from jax.scipy.linalg import cho_factor, cho_solve
 
+from planner_jax.core.run_time import with_run_time_numbers
+
 
 @struct.dataclass
 class Model:
@@ -26,6 +28,7 @@ class Model:
     violation: Array  # (), largest relative excess over a limit; feasible if <= 0
 
 
+@with_run_time_numbers("max_steps", "tolerance", "settled")
 @dataclasses.dataclass(frozen=True)
 class LevenbergConfig:
     """Settings of a Levenberg-Marquardt search; hashable, so static under jit."""

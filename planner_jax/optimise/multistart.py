@@ -53,13 +53,13 @@ def minimise(
     `curved` returns the derivatives for Newton's method. By default these are computed from the
     objective, with one automatic differentiation for each product with the Hessian.
     """
-    if config.max_steps == 0:
+    if _has_steps(config, 0):
         return _optimum_at(start, objective(start), config)
     if isinstance(config, NewtonConfig):
         config = _with_stragglers(config)
     step = lambda s: _step(objective, curved, s, config)  # noqa: E731
     state = _method(config).init(start, config)
-    if config.max_steps == 1:  # without a loop, so that XLA can fuse across the iteration
+    if _has_steps(config, 1):  # without a loop, so that XLA can fuse across the iteration
         return _optimum_of(step(state), config)
     state = lax.while_loop(lambda s: _method(config).is_unfinished(s.numbers, config), step, state)
     return _optimum_of(state, config)
@@ -77,18 +77,18 @@ def minimise_lanes(
     The starts are (n, B). The B problems are on the last axis of every leaf of contexts and optima.
     `objective` and `curved` take one point and one context.
     """
-    if config.max_steps == 0:
+    if _has_steps(config, 0):
         evaluate = lambda x, context: _optimum_at(x, objective(x, context), config)  # noqa: E731
         return over_lanes(evaluate)(starts, contexts)
 
-    def search(state: PyTree, contexts: PyTree, config: Solver, steps: int) -> PyTree:
+    def search(state: PyTree, contexts: PyTree, config: Solver, steps: int | Array) -> PyTree:
         @over_lanes
         def step(state: PyTree, context: PyTree) -> PyTree:
             own = curved
             by_point = own and (lambda x: own(x, context))
             return _step(lambda x: objective(x, context), by_point, state, config)
 
-        if steps <= _COUNTED:
+        if isinstance(steps, int) and steps <= _COUNTED:
             return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
         return lax.while_loop(
             lambda s: jnp.any(_method(config).is_unfinished(s.numbers, config)),
@@ -116,6 +116,11 @@ def minimise_lanes(
 
         _, state = lax.while_loop(is_open, next_group, (jnp.zeros((), jnp.int32), state))
     return _optimum_of(state, config)
+
+
+def _has_steps(config: Solver, num: int) -> bool:
+    """Return whether the settings state this number of iterations, and not at run time."""
+    return isinstance(config.max_steps, int) and config.max_steps == num
 
 
 def _method(config: Solver) -> ModuleType:

@@ -21,6 +21,7 @@ from planner_jax.optimise.settings import (
     Settings,
     Solver,
     Stage,
+    load_round,
 )
 
 # Settings of Newton's method, which continues from the first search to the optimum.
@@ -116,6 +117,10 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def attempts(self) -> tuple[Round, ...]:
         """The rounds of the planner, in order."""
         return self.rounds
+
+    def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
+        """Return a round with the settings of its searches by L-BFGS as run-time numbers."""
+        return load_round(attempt)
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
         """Return the plan that one round (attempt) finds for one case."""

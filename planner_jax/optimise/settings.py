@@ -13,6 +13,7 @@ from planner_jax.core.choices import require_size
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
+from planner_jax.core.run_time import Fixed, cached_by_precision, with_run_time_numbers
 
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
@@ -44,6 +45,7 @@ class Curvature(NamedTuple):
 Curved = Callable[[Array], Curvature]
 
 
+@with_run_time_numbers("max_steps", "tolerance", "patience")
 @dataclasses.dataclass(frozen=True)
 class LbfgsConfig:
     """Settings of the L-BFGS solver; hashable, so static under jit."""
@@ -116,6 +118,7 @@ Solver = LbfgsConfig | NewtonConfig
 Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their values
 
 
+@with_run_time_numbers()
 @dataclasses.dataclass(frozen=True)
 class Stage:
     """A preliminary search on an easier problem; the round's next search starts at its result."""
@@ -130,6 +133,7 @@ class Stage:
             require_size("keep", self.keep, 1)
 
 
+@with_run_time_numbers()
 @dataclasses.dataclass(frozen=True)
 class Round(Attempt):
     """One attempt of a planner that minimises: its solver, settings and preliminary searches."""
@@ -141,3 +145,15 @@ class Round(Attempt):
     def __post_init__(self) -> None:
         super().__post_init__()
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
+
+
+@cached_by_precision
+def load_round(attempt: Round) -> Round | Fixed:
+    """Return a round as an argument of a compiled program, static if it has a search of no steps.
+
+    Rounds with the same starts, settings and kinds of searches share one program.
+    """
+    solvers = [attempt.solver, *(stage.solver for stage in attempt.stages)]
+    if any(solver.max_steps == 0 for solver in solvers):
+        return Fixed(attempt)
+    return dataclasses.replace(attempt, within=None)

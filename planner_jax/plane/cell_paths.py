@@ -68,7 +68,7 @@ def draw_path(
     cells: Array,
     is_reached: Array,
     noise: PathNoise,
-    directness: float,
+    directness: Array | float,
 ) -> CellPath:
     """Draw several random paths to a goal, step by step back from the goal; return the smoothest.
 

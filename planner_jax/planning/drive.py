@@ -1,12 +1,14 @@
 """The driver, which runs the attempts of planners of every kind for `plan` and `solve`."""
 
 import dataclasses
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
+from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Kind, Planner
@@ -90,15 +92,42 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
     """Return plans as jax arrays. An attempt is made at all cases if it is due for at least one."""
     require_pure(planner)
-    first, *others = attempts
-    plans = solve_cases(planner, cases, first)
-    for attempt in others:
-        due = attempt.is_due(plans)
-        again = lambda plans, attempt=attempt, due=due: select(  # noqa: E731
-            solve_cases(planner, cases, attempt), plans, due
-        )
-        plans = lax.cond(jnp.any(due), again, lambda plans: plans, plans)
+    plans: PyTree = None
+    pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]
+    # Attempts of the same structure share one program, which a loop runs for each of them.
+    for _, same in itertools.groupby(pairs, lambda pair: jax.tree.structure(pair[1])):
+        group, loaded = zip(*same, strict=True)
+        solve_by = functools.partial(_solve_by, planner, cases, loaded)
+        is_start = plans is None
+        if is_start:
+            shapes = jax.eval_shape(solve_by, 0)
+            plans = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
+        within = [np.inf if each.within is None else each.within for each in group]
+        greatest = jnp.asarray(within, plans.violation.dtype)
+
+        def try_next(
+            k: Array, plans: PyTree, solve_by=solve_by, greatest=greatest, is_start=is_start
+        ) -> PyTree:
+            is_first = is_start & (k == 0)
+            due = is_unsolved(plans.status) & (plans.violation <= greatest[k])
+
+            def solve_again(plans: PyTree) -> PyTree:
+                later = solve_by(k)
+                better = select(later, plans, due)
+                return jax.tree.map(lambda a, b: jnp.where(is_first, a, b), later, better)
+
+            return lax.cond(is_first | jnp.any(due), solve_again, lambda plans: plans, plans)
+
+        plans = lax.fori_loop(0, len(group), try_next, plans)
     return plans
+
+
+def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:
+    """Return the plans of the k-th of attempts that have the same structure; pure."""
+    if len(loaded) == 1:
+        return solve_cases(planner, cases, loaded[0])
+    chosen = jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded)
+    return solve_cases(planner, cases, chosen)
 
 
 def require_pure(planner: Planner) -> None:

@@ -21,8 +21,10 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDev
 from jaxtyping import PyTree
 
 from planner_jax.core.planner import Planner
+from planner_jax.core.platforms import trace_for
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
+from planner_jax.core.run_time import Fixed
 
 # Lanes (cases) of a device in one call. The sizes are few, because each needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
@@ -112,6 +114,11 @@ def replicated_sharding(mesh: Mesh) -> Sharding:
 @functools.lru_cache(maxsize=4096)
 def put_number(mesh: Mesh, value: int) -> Array:
     """Return an integer as an array on every device; cached, because each transfer takes time."""
+    if mesh.size == 1:
+        # The number is not bound to its device. Lanes that are bound to none, as the arrays of most
+        # users are, then stay so, and every attempt runs the same program.
+        with jax.default_device(mesh.devices[0]):
+            return jnp.asarray(value, jnp.int32)
     return jax.device_put(np.int32(value), replicated_sharding(mesh))
 
 
@@ -148,28 +155,36 @@ _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
-def solve_cases(planner: Planner, cases: PyTree, attempt: Attempt) -> PyTree:
+def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
     """Return the plans of one case, or of a batch with a leading axis on every leaf; pure.
 
-    All compiled programs call this function. It gives the status `BAD_INPUT` to every case that
-    breaks a rule of its class.
+    `loaded` is an attempt as `Planner.load_attempt` returns it. All compiled programs call this
+    function. It gives the status `BAD_INPUT` to every case that breaks a rule of its class.
     """
     require_shapes(cases)
+    attempt = loaded.attempt if isinstance(loaded, Fixed) else loaded
     alone = cases.batch_shape == ()
     plans = planner.solve(cases, attempt) if alone else planner.solve_lanes(cases, attempt)
     return mark_bad_input(plans, cases)
 
 
-@functools.partial(jax.jit, static_argnames=("attempt", "mesh"), compiler_options=_COMPILER_OPTIONS)
 def solve_on_devices(
     planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree
 ) -> tuple[PyTree, Array]:
     """Return plans of each device's lanes (cases), and its number of unsolved ones, (devices,)."""
+    return _solve_on_devices(planner, planner.load_attempt(attempt, cases), mesh, cases)
 
-    def solve(planner: Planner, cases: PyTree) -> tuple[PyTree, Array]:
-        return with_unsolved(solve_cases(planner, cases, attempt))
 
-    return run_per_device(mesh, solve, PartitionSpec(), LANES)(planner, cases)
+@functools.partial(jax.jit, static_argnames="mesh", compiler_options=_COMPILER_OPTIONS)
+def _solve_on_devices(
+    planner: Planner, loaded: PyTree, mesh: Mesh, cases: PyTree
+) -> tuple[PyTree, Array]:
+    def solve(planner: Planner, loaded: PyTree, cases: PyTree) -> tuple[PyTree, Array]:
+        return with_unsolved(solve_cases(planner, cases, loaded))
+
+    specs = PartitionSpec(), PartitionSpec(), LANES
+    with trace_for(mesh.devices[0].platform):
+        return run_per_device(mesh, solve, *specs)(planner, loaded, cases)
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
@@ -185,16 +200,18 @@ def program_key(planner: Planner, attempt: Attempt, num: int, cases: PyTree) -> 
     """Return the key in `compiled` of the program that solves `num` lanes (cases) of a device."""
     own = tuple((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(planner))
     lanes = tuple((leaf.shape[1:], leaf.dtype) for leaf in jax.tree.leaves(cases))
-    return jax.tree.structure((planner, cases)), own, lanes, attempt, num
+    loaded = planner.load_attempt(attempt, cases)
+    return jax.tree.structure((planner, loaded, cases)), own, lanes, num
 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
     """Return the plan of one case, with NumPy leaves; the case is sent as one vector."""
-    return call_packed(_solve_one, attempt, planner, case)
+    return call_packed(_solve_one, None, (planner, planner.load_attempt(attempt, case)), case)
 
 
-def _solve_one(attempt: Attempt, planner: Planner, case: PyTree) -> PyTree:
-    return solve_cases(planner, case, attempt)
+def _solve_one(_: None, own: PyTree, case: PyTree) -> PyTree:
+    planner, loaded = own
+    return solve_cases(planner, case, loaded)
 
 
 def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree) -> PyTree:

@@ -81,7 +81,22 @@ class Approach(NamedTuple):
     moment: Vector  # three components () [m], p x direction for any point p of the line
 
 
-def approach(distance: Callable, *bodies: Array) -> Approach:
+def nearest_points(distance: Callable, *bodies: Array) -> tuple[Array, Any]:
+    """Return a distance () [m], and the parameters of the nearest points for `approach`.
+
+    Args:
+        distance: function of this module that returns a distance or a height.
+        bodies: the arguments of the function `distance`.
+    """
+    nearest_of, gap_of, _ = _PARTS[distance]
+    # Without the barrier XLA would compute the nearest points again for every use.
+    nearest = lax.optimization_barrier(nearest_of(*bodies))
+    if gap_of is _gap_to_ground:
+        return distance(*bodies), nearest
+    return _length(gap_of(nearest, *bodies)), nearest
+
+
+def approach(distance: Callable, nearest: Any, *bodies: Array) -> Approach:
     """Return the line through the nearest points of two bodies.
 
     If the first body rotates about an axis a through a point o, the derivative of the distance by
@@ -90,10 +105,10 @@ def approach(distance: Callable, *bodies: Array) -> Approach:
     Args:
         distance: function of this module that returns a distance or a height. For a height the
             second body is the ground.
+        nearest: parameters of the nearest points, from `nearest_points`.
         bodies: the arguments of the function `distance`.
     """
-    nearest_of, gap_of, point_of = _PARTS[distance]
-    nearest = nearest_of(*bodies)
+    _, gap_of, point_of = _PARTS[distance]
     point, gap = point_of(nearest, *bodies), gap_of(nearest, *bodies)
     # A horizontal gap has two components; add a third that is zero.
     gap = (*gap, *[jnp.zeros_like(gap[0])] * (3 - len(gap)))

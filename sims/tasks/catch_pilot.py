@@ -114,7 +114,8 @@ class CatchPilot:
         left = asked.case
         choices = find_decision(DECISIONS, self.decide, TRAINED).propose(left)
         choice = jax.tree.map(lambda leaf: leaf[0], choices)
-        return self.planner.planner.solve(left.with_choice(choice), self.search)
+        planner, case = self.planner.planner, left.with_choice(choice)
+        return planner.solve(case, planner.load_attempt(self.search, case))
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:

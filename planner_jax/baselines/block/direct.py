@@ -19,7 +19,7 @@ from planner_jax.core.protocol import Attempt, require_settings, select_first_so
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses, end_poses, flight_of
-from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan, mark_blocked
 from planner_jax.trajectory.polynomial import evaluate
 
 _BANG_BANG_PIECES = 13  # number of polynomial pieces of a bang-bang motion of six joints
@@ -73,7 +73,8 @@ class DirectBlock(Planner):
             return self.plan_to(case, poses.angles[index], poses.time[index], times[index])
 
         best = select_first_solved(plan_of, num, make_empty_plan(case, _BANG_BANG_PIECES))
-        return dataclasses.replace(best, status=explain_status(case, poses, best.status))
+        status = explain_status(poses, mark_blocked(case, best.status))
+        return dataclasses.replace(best, status=status)
 
     def plan_to(self, case: BlockCase, goal: Array, contact: Array, duration: Array) -> BlockPlan:
         """Return the bang-bang motion to one end pose as a plan, with its violation.

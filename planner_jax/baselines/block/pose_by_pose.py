@@ -30,7 +30,7 @@ from planner_jax.core.choices import require
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import Attempt, Status, require_settings, take
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.plan import BlockPlan, explain_status
+from planner_jax.task.block.plan import BlockPlan, explain_status, mark_blocked
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 Clock = Callable[[], float]  # returns the remaining search time [s]
@@ -162,7 +162,7 @@ def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Arra
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
-    status = explain_status(case, poses, jnp.asarray(Status.NO_PATH))
+    status = explain_status(poses, mark_blocked(case, jnp.asarray(Status.NO_PATH)))
     return status, poses.angles, poses.time, share
 
 

@@ -23,6 +23,7 @@ from planner_jax.space.distances import (
     dot,
     lowest_of_rectangle,
     lowest_of_segment,
+    nearest_points,
     rectangle_to_vertical_line,
     segment_to_box,
     segment_to_rectangle,
@@ -76,26 +77,40 @@ def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
-def clearance_slopes(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the derivatives of the distances `clearances` by the joint angles, (R, 6, N) [m/rad].
+def clearances_and_slopes(
+    arm: Arm, scene: Scene, angles: Array
+) -> tuple[Array, Callable[[Array], Array]]:
+    """Return the `clearances` (R, N) [m] at angles (N, 6), and a function for their derivatives.
 
-    The derivative by a joint that moves both bodies of a pair as one is zero.
+    The function takes indices (W,) of poses, and returns the derivatives of the distances at these
+    poses by the joint angles, (R, 6, W) [m/rad]. The derivative by a joint that moves both bodies
+    of a pair as one is zero.
     """
     poses = _poses(arm, angles)
-    # A joint turns about the axis a through the point o. The derivative of a distance along the
-    # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
-    axes, origins = (tuple(jnp.moveaxis(each, 1, 0)[:, None]) for each in poses[3:])
-    arms = cross(axes, origins)  # 3 times (1, 6, N)
+    every = _pairs(arm, scene, poses)
+    found = [nearest_points(pairs.measure, *pairs.bodies) for pairs in every]
+    distances = [each - pairs.thick for (each, _), pairs in zip(found, every, strict=True)]
     joint = np.arange(6)[:, None]
-    slopes = []
-    for pairs in _pairs(arm, scene, poses):
-        line = approach(pairs.measure, *pairs.bodies)
-        direction, moment = (tuple(each[:, None] for each in vector) for vector in line)
-        slope = dot(axes, moment) - dot(arms, direction)  # (P, 6, N)
-        of_link, of_fixed = (np.reshape(each, (-1, 1, 1)) for each in (pairs.link, pairs.fixed))
-        between = (joint > of_fixed) & (joint <= of_link)
-        slopes.append(jnp.where(between, slope if pairs.first else -slope, 0.0))
-    return jnp.concatenate(slopes)
+
+    def slopes_at(index: Array) -> Array:
+        def at(array: Array) -> Array:  # arrays without poses have one axis
+            return array[..., index] if array.ndim > 1 and array.shape[-1] > 1 else array
+
+        # A joint turns about the axis a through the point o. The derivative of a distance along the
+        # unit vector n at the point p is  a . ((p - o) x n), and  a . (o x n) = (a x o) . n.
+        axes, origins = (tuple(jnp.moveaxis(at(each), 1, 0)[:, None]) for each in poses[3:])
+        arms = cross(axes, origins)  # 3 times (1, 6, W)
+        slopes = []
+        for (_, nearest), pairs in zip(found, every, strict=True):
+            line = approach(pairs.measure, *jax.tree.map(at, (nearest, *pairs.bodies)))
+            direction, moment = (tuple(each[:, None] for each in vector) for vector in line)
+            slope = dot(axes, moment) - dot(arms, direction)  # (P, 6, W)
+            of_link, of_fixed = (np.reshape(each, (-1, 1, 1)) for each in (pairs.link, pairs.fixed))
+            between = (joint > of_fixed) & (joint <= of_link)
+            slopes.append(jnp.where(between, slope if pairs.first else -slope, 0.0))
+        return jnp.concatenate(slopes)
+
+    return jnp.concatenate(distances), slopes_at
 
 
 def num_of_pole(arm: Arm) -> int:
@@ -178,6 +193,11 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     thick, plate, shield = radius[:, None], (middle, edges), _SHIELD_LINK
     to_pole = thick[turning] + pole
 
+    # The capsules of the links 3 to 6 and the edges of the shield, against the base.
+    boxed = jnp.concatenate([poses.ends[:, :, swung], outline], axis=2)
+    boxed_radius = jnp.concatenate([thick[swung], jnp.full((4, 1), _HALF_THICKNESS, thick.dtype)])
+    boxed_link = np.append(link[swung], np.full(4, shield))
+
     def ends(index: np.ndarray) -> Array:
         return poses.ends[:, :, index]
 
@@ -188,6 +208,5 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
         _Pairs(segment_to_rectangle, (near, *plate), near_radius, shield, of_near, first=False),
         _Pairs(lowest_of_segment, (ends(swung),), thick[swung] + scene.floor, link[swung]),
         _Pairs(lowest_of_rectangle, plate, _HALF_THICKNESS + scene.floor, shield),
-        _Pairs(segment_to_box, (ends(swung), lower, upper), thick[swung], link[swung]),
-        _Pairs(segment_to_box, (outline, lower, upper), _HALF_THICKNESS, shield),
+        _Pairs(segment_to_box, (boxed, lower, upper), boxed_radius, boxed_link),
     ]

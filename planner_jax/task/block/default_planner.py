@@ -11,7 +11,6 @@ every limit. [Natarajan2024] takes its motions from a library; this planner stor
 import dataclasses
 import functools
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,12 +23,14 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
     Attempt,
+    Status,
     is_solved,
     require_settings,
     select,
     select_first_solved,
     status_of,
 )
+from planner_jax.core.run_time import place_numbers, with_run_time_numbers
 from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,
@@ -40,8 +41,7 @@ from planner_jax.optimise.levenberg import (
 )
 from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import (
-    clearance_slopes,
-    clearances,
+    clearances_and_slopes,
     least_clearances,
     num_of_pole,
 )
@@ -67,9 +67,10 @@ from planner_jax.task.block.motion import (
 from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
 
 _HIGHEST = lax.Precision.HIGHEST
-Refine = Callable[[BlockCase, Flight, Array, "Search", BlockPlan], BlockPlan]
+_GROUP, _WIDTH = 4, 2  # starts in a group, and starts that a GPU refines at the same time
 
 
+@with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
     """An attempt: a number of straight motions, then least squares from some starts; static.
@@ -192,60 +193,140 @@ class OnlineBlock(Planner):
         """The searches (attempts), in order."""
         return self.searches
 
+    def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
+        """Return a search as arguments of the program that all searches share."""
+        return place_numbers(attempt)
+
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plan of one case: a straight motion, else least squares from the starts."""
-        refine = self.refine_in_turn if attempt.in_turn else self.refine_cheapest_first
-        return self._solve_by(refine, case, attempt)
+        """Return the plan of one case: a straight motion, else least squares from the starts.
+
+        One loop takes all turns. A turn checks a straight motion, or makes the solver's trial steps
+        from a start, or refines a start to its end. Starts with trial steps are refined in order of
+        their cost after these steps.
+        """
+        flight, poses, order = self._rank(case)
+        model = lambda point: self.model(point, case, flight)  # noqa: E731
+        solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
+        straight = self._count_straight(flight, poses, attempt)
+        kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
+
+        def take_turn(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
+            k, searches, costs, best = turn
+            is_straight, index = k < straight, jnp.maximum(k - straight, 0)
+            is_trial = ~is_straight & ~attempt.in_turn & (index < tries)
+            is_new = is_straight | is_trial | attempt.in_turn
+            index = jnp.where(is_new, index, jnp.argmin(costs))
+            start = self._encode_start(case, poses, order, attempt.first + index)
+            straight_start = self.encode_straight(case, poses, order[k])
+            begin = start_search(jnp.where(is_straight, straight_start, start), solver)
+            search = jax.tree.map(
+                lambda new, old: jnp.where(is_new, new, old[index]), begin, searches
+            )
+            most = jnp.where(is_trial, solver.trial, solver.max_steps)
+            search = continue_search(model, search, solver, jnp.where(is_straight, -1, most))
+            searches = jax.tree.map(lambda old, new: old.at[index].set(new), searches, search)
+            costs = costs.at[index].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
+            plan = lax.cond(
+                is_trial,
+                lambda search: best,
+                lambda search: self.finish(
+                    case, flight, search.point, jnp.maximum(search.steps, 0)
+                ),
+                search,
+            )
+            return k + 1, searches, costs, select(plan, best)
+
+        def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
+            k, best = turn[0], turn[-1]
+            compares = (k < straight) if self.brisk else False
+            return (k < straight + tries + kept) & (compares | ~is_solved(best.status))
+
+        num, dtype = len(read_learned_starts()[0]), case.angles.dtype
+        empty = start_search(jnp.zeros(6 * self.pieces + 1, dtype), solver)
+        searches = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (num, *leaf.shape)), empty)
+        costs, best = jnp.full(num, jnp.inf, dtype), make_empty_plan(case, self.pieces)
+        turn = (jnp.zeros((), jnp.int32), searches, costs, best)
+        plan = lax.while_loop(is_open, take_turn, turn)[-1]
+        return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; the starts of all cases are refined together."""
-        return jax.vmap(lambda case: self._solve_by(self.refine_in_step, case, attempt))(cases)
+        """Return the plans of a batch; the starts of all cases are refined in step."""
+        return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
 
-    def _solve_by(self, refine: Refine, case: BlockCase, attempt: Search) -> BlockPlan:
-        flight, poses, plan, starts = self.propose(case, attempt)
-        if attempt.tries:
-            plan = refine(case, flight, starts, attempt, plan)
-        return dataclasses.replace(plan, status=explain_status(case, poses, plan.status))
+    def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
+        """Return the plan of one case, in the same order of steps for every case.
 
-    def propose(
-        self, case: BlockCase, attempt: Search
-    ) -> tuple[Flight, EndPoses, BlockPlan, Array]:
-        """Search the straight motions of one case, and choose the starts of least squares.
-
-        Returns:
-            flight: times at which the ball can be met.
-            poses: end poses at which the shield meets the ball.
-            plan: the best straight motion, solved or not.
-            starts: (N, n), unknowns of least squares; a row for each of the attempt's tries.
+        Of each group of `_GROUP` starts, the `_WIDTH` with the least cost after the solver's trial
+        steps are refined to their end.
         """
-        flight = flight_of(case)
-        poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
-        tried = slice(attempt.first, attempt.first + attempt.tries)
-        ranks, bumps = (each[tried] for each in read_learned_starts())
-        num = max(attempt.straight, 1 + max(ranks, default=0))
-        order = rank_poses(poses, num, 1.0 - self.slack)
-        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
-        straight = jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
+        flight, poses, order = self._rank(case)
+        straight = self._count_straight(flight, poses, attempt)
 
         def plan_straight(k: Array) -> BlockPlan:
             point = self.encode_straight(case, poses, order[k])
             return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
 
-        def keep_quicker(k: Array, best: BlockPlan) -> BlockPlan:
-            return select(plan_straight(k), best)
-
         best = make_empty_plan(case, self.pieces)
         if self.brisk:
+            keep_quicker = lambda k, best: select(plan_straight(k), best)  # noqa: E731
             best = lax.fori_loop(0, straight, keep_quicker, best)
         else:
             best = select_first_solved(plan_straight, straight, best)
-        if not attempt.tries:
-            return flight, poses, best, jnp.zeros((0, 6 * self.pieces + 1), case.angles.dtype)
-        starts = jax.vmap(lambda rank: self.encode_straight(case, poses, order[rank]))(ranks)
-        heights = jnp.asarray(bumps, starts.dtype)
-        turns = jax.vmap(lambda height: bump_steps(height, self.pieces))(heights)
-        starts = starts.at[:, :-1].add(turns.reshape(attempt.tries, -1))
-        return flight, poses, best, starts
+        is_open = ~is_solved(best.status)
+        model = lambda point: self.model(point, case, flight)  # noqa: E731
+        solver = attempt.solver
+
+        def refine(searches: LevenbergState, most: Array) -> LevenbergState:
+            return jax.vmap(lambda each: continue_search(model, each, solver, most))(searches)
+
+        def try_group(number: Array, best: BlockPlan) -> BlockPlan:
+            index = _GROUP * number + jnp.arange(_GROUP)
+            encode = functools.partial(self._encode_start, case, poses, order)
+            begin = lambda k: start_search(encode(attempt.first + k), solver)  # noqa: E731
+
+            def take_turn(turn: Array, searches: LevenbergState) -> LevenbergState:
+                is_trial = turn < _GROUP // _WIDTH
+                costs = jnp.where(index < attempt.tries, _trial_cost(searches, solver), jnp.inf)
+                chosen = lax.top_k(-costs, _WIDTH)[1]
+                lanes = jnp.where(is_trial, _WIDTH * turn + jnp.arange(_WIDTH), chosen)
+                some = jax.tree.map(lambda leaf: leaf[lanes], searches)
+                later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
+                searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
+                # The refined searches of the last turn are moved to the front.
+                moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
+                return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
+
+            turns = _GROUP // _WIDTH + 1
+            ends = lax.fori_loop(0, turns, take_turn, jax.vmap(begin)(index))
+            ends = jax.tree.map(lambda leaf: leaf[:_WIDTH], ends)
+            plans = jax.vmap(lambda end: self.finish(case, flight, end.point, end.steps))(ends)
+            least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
+            return select(jax.tree.map(lambda leaf: leaf[least], plans), best, is_open)
+
+        groups = (attempt.tries + _GROUP - 1) // _GROUP
+        plan = lax.fori_loop(0, groups, try_group, best)
+        return dataclasses.replace(plan, status=explain_status(poses, plan.status))
+
+    def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
+        """Return when a ball can be met, the end poses, and the indices of the first of them."""
+        flight = flight_of(case)
+        poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
+        ranks, _ = read_learned_starts()
+        num = max(1 + max(ranks), *(search.straight for search in self.searches))
+        return flight, poses, rank_poses(poses, num, 1.0 - self.slack)
+
+    def _count_straight(self, flight: Flight, poses: EndPoses, attempt: Search) -> Array:
+        """Return the number of straight motions to check, () int32."""
+        in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
+        return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
+
+    def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
+        """Return the unknowns (n,) of the k-th learned start: a straight motion with a bump."""
+        ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
+        k = jnp.minimum(k, len(ranks) - 1)
+        point = self.encode_straight(case, poses, order[ranks[k]])
+        bump = bump_steps(bumps[k].astype(point.dtype), self.pieces)
+        return point.at[:-1].add(bump.reshape(-1))
 
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
@@ -253,63 +334,6 @@ class OnlineBlock(Planner):
         """Return the plan that least squares find from a start (n,)."""
         end = least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
-
-    def refine_in_turn(
-        self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
-    ) -> BlockPlan:
-        """Refine the starts (N, n) one by one until one of them leads to a solved plan."""
-        tries = jnp.where(flight.comes, attempt.tries, 0)
-        refine = lambda k: self.refine(case, flight, starts[k], attempt.solver)  # noqa: E731
-        return select_first_solved(refine, tries, best)
-
-    def refine_cheapest_first(
-        self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
-    ) -> BlockPlan:
-        """Try each start (N, n) for a few steps; refine the cheapest, until one is solved."""
-        model = lambda point: self.model(point, case, flight)  # noqa: E731
-        solver, tries = attempt.solver, attempt.tries
-        total = jnp.where(flight.comes, tries + min(attempt.kept, tries), 0)
-
-        def take_turn(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
-            k, searches, costs, best = turn
-            is_trial = k < tries
-            index = jnp.where(is_trial, k, jnp.argmin(costs))
-            most = jnp.where(is_trial, solver.trial, solver.max_steps)
-            search = jax.tree.map(lambda leaf: leaf[index], searches)
-            search = continue_search(model, search, solver, most)
-            searches = jax.tree.map(lambda old, new: old.at[index].set(new), searches, search)
-            costs = costs.at[index].set(jnp.where(is_trial, _trial_cost(search, solver), jnp.inf))
-            plan = lax.cond(
-                is_trial,
-                lambda search: best,
-                lambda search: self.finish(case, flight, search.point, search.steps),
-                search,
-            )
-            return k + 1, searches, costs, select(plan, best)
-
-        def is_open(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> Array:
-            return (turn[0] < total) & ~is_solved(turn[-1].status)
-
-        searches = jax.vmap(lambda point: start_search(point, solver))(starts)
-        turn = (jnp.zeros((), jnp.int32), searches, jnp.full(tries, jnp.inf, starts.dtype), best)
-        return lax.while_loop(is_open, take_turn, turn)[-1]
-
-    def refine_in_step(
-        self, case: BlockCase, flight: Flight, starts: Array, attempt: Search, best: BlockPlan
-    ) -> BlockPlan:
-        """Try all starts (N, n) for a few steps at once, then refine the cheapest at once."""
-        model = lambda point: self.model(point, case, flight)  # noqa: E731
-        solver = attempt.solver
-        begin = lambda point: start_search(point, solver)  # noqa: E731
-        trial = lambda point: continue_search(model, begin(point), solver, solver.trial)  # noqa: E731
-        tried = jax.vmap(trial)(starts)
-        _, chosen = lax.top_k(-_trial_cost(tried, solver), min(attempt.kept, attempt.tries))
-        kept = jax.tree.map(lambda leaf: leaf[chosen], tried)
-        ends = jax.vmap(lambda state: continue_search(model, state, solver))(kept)
-        plans = jax.vmap(lambda end: self.finish(case, flight, end.point, end.steps))(ends)
-        least = jnp.argmin(jnp.where(jnp.isnan(plans.violation), jnp.inf, plans.violation))
-        plan = jax.tree.map(lambda leaf: leaf[least], plans)
-        return select(plan, best, ~is_solved(best.status))
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
         """Return the unknowns (n,) of the straight motion to the end pose with this index."""
@@ -343,11 +367,12 @@ class OnlineBlock(Planner):
         # Derivatives are computed at the end and at the samples with the least distances.
         shares = tuple(np.arange(1, self.samples + 1) / self.samples)
         angles = angles_at(case.angles, first, steps, shares)
-        gaps = lax.optimization_barrier(clearances(case.arm, case.scene, angles))  # (R, S)
+        gaps, slopes_at = clearances_and_slopes(case.arm, case.scene, angles)
+        gaps = lax.optimization_barrier(gaps)  # (R, S)
         is_of_pole = np.arange(gaps.shape[0]) < num_of_pole(case.arm)
         margins = np.where(is_of_pole, self.pole_margin, 1.3 * self.margin)[:, None]
         near, worst = lax.top_k(jnp.max(margins - gaps, axis=0), self.worst)
-        slopes = clearance_slopes(case.arm, case.scene, angles[worst])  # (R, 6, W)
+        slopes = slopes_at(worst)  # (R, 6, W)
         short = jnp.maximum(margins - gaps[:, worst], 0.0) * self.weights.clearance  # (R, W)
         active = jnp.where(short > 0.0, -self.weights.clearance, 0.0)
         # The barrier keeps the compiler from repeating this computation in each product.
@@ -386,7 +411,7 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
-        shares = tuple(np.arange(1, self.checked + 1) / self.checked)
+        shares = tuple(np.arange(self.checked + 1) / self.checked)
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
         # A joint may exceed its position limit between two knots and turn back: check all samples.
@@ -394,15 +419,17 @@ class OnlineBlock(Planner):
         half = 0.5 * (case.arm.upper - case.arm.lower)
         joints = jnp.maximum(joints, jnp.max(jnp.abs(angles - middle[None]) / half[None]) - 1.0)
         contact = contact_terms(case, flight, angles[-1], point[-1], self.weights)[2]
-        excess = _combine_excess(joints, contact, self.margin - jnp.min(gaps))
+        excess = _combine_excess(joints, contact, self.margin - jnp.min(gaps[1:]))
         violation = jnp.where(point[-1] > case.delay, excess, jnp.inf)
+        status = status_of(duration, violation, violation > FEASIBILITY_TOLERANCE)
+        is_blocked = (gaps[0] < 0.0) & ~is_solved(status)  # by something that touches the start
         plan = BlockPlan(
             motion=polynomial(case.angles, first, moves, duration),
             contact_time=point[-1],
             cost=duration,
             violation=violation,
             iterations=jnp.asarray(steps, jnp.int32),
-            status=status_of(duration, violation, violation > FEASIBILITY_TOLERANCE),
+            status=jnp.where(is_blocked, Status.BLOCKED, status).astype(jnp.int32),
         )
         if not self.brisk:
             return plan

@@ -7,7 +7,6 @@ from jax import Array, lax
 from planner_jax.core.protocol import Status, is_solved
 from planner_jax.robot.arm import ArmPlan
 from planner_jax.task.block.case import BlockCase
-from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.end_poses import EndPoses
 from planner_jax.task.block.motion import polynomial
 
@@ -38,18 +37,21 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
     )
 
 
-def explain_status(case: BlockCase, poses: EndPoses, status: Array) -> Array:
-    """Return the status () int32 of a plan, replaced by the reason if the plan is not solved.
+def explain_status(poses: EndPoses, status: Array) -> Array:
+    """Return the status () int32 of a plan: OUT_OF_REACH if it is unsolved for want of an end pose.
 
-    The reason is OUT_OF_REACH if the ball does not enter both boxes, or the shield cannot reach it
-    between them; BLOCKED if the arm touches an obstacle at the start; else the status is unchanged.
+    There is no end pose if the ball does not enter both boxes, or the shield reaches it nowhere.
     """
+    is_kept = is_solved(status) | jnp.any(jnp.isfinite(poses.effort))
+    return jnp.where(is_kept, status, Status.OUT_OF_REACH).astype(jnp.int32)
 
-    def explain() -> Array:
-        nearest = least_clearances(case.arm, case.scene, case.angles[None])[0]
-        why = jnp.where(nearest < 0.0, Status.BLOCKED, status)
-        is_reached = jnp.any(jnp.isfinite(poses.effort))
-        return jnp.where(is_reached, why, Status.OUT_OF_REACH).astype(jnp.int32)
 
-    # If only one case is planned, `cond` skips the check of obstacles when the case is solved.
-    return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), explain)
+def mark_blocked(case: BlockCase, status: Array) -> Array:
+    """Return the status () of a plan: BLOCKED if it is unsolved and the arm starts in contact."""
+
+    def check() -> Array:
+        is_blocked = case.clearances(case.angles[None])[0] < 0.0
+        return jnp.where(is_blocked, Status.BLOCKED, status).astype(jnp.int32)
+
+    # `cond` skips the check of a single case that is solved.
+    return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), check)

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 from planner_jax.optimise.chain import ChainEnds, ChainPlanner
@@ -155,13 +156,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
-    def solve(self, case: CatchCase, attempt: Round) -> CatchPlan:
-        """Return the plan that one round (attempt) finds for one case."""
-        return super().solve(case, self._for_start(attempt, case))
-
-    def solve_lanes(self, cases: CatchCase, attempt: Round) -> CatchPlan:
-        """Return the plans that one round (attempt) finds for a batch."""
-        return super().solve_lanes(cases, self._for_start(attempt, cases))
+    def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
+        """Return a round as run-time numbers, adapted to how near its starting point is."""
+        return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
         """Return whether the first round is long: for many targets that must all be caught."""

@@ -43,9 +43,11 @@ from planner_jax.task.intercept.searches import (
     BEST,
     QUICK,
     SEARCHES,
+    LoadedSearch,
     Reachability,
     Search,
     draw_cell_path,
+    load_search,
     make_grid,
     search_reach,
 )
@@ -124,14 +126,14 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
         With `tries_all`, or if the meeting time is free, all paths are tried for the best plan.
         """
-        problem = self.problem
+        problem, attempt = self.problem, self._load(attempt)
         found = search_reach(case, attempt, is_time_free=problem.is_time_free)
-        stages, noises = problem.list_stages(attempt), attempt.draw_noise()
+        stages = problem.list_stages(attempt)
         num = jnp.where(found.is_reached, attempt.paths, 0)
 
         def try_path(state: tuple) -> tuple:
             k, best = state
-            noise = jax.tree.map(lambda leaf: leaf[k], noises)
+            noise = jax.tree.map(lambda leaf: leaf[k], attempt.noise)
             guess = self._guess(case, found, noise, attempt)
             return k + 1, select(problem.refine(case, found.field, guess, attempt, stages), best)
 
@@ -144,15 +146,16 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch: try all paths together, select the best of each case."""
-        # All cases compute as many time layers as the case that needs most, to run together.
+        """Return the plans of a batch: try all paths in groups, select the best of each case."""
+        attempt = self._load(attempt)
+        # All cases compute as many time layers as the case that needs most, to stay in step.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
 
     def _solve_all_paths(
         self, case: InterceptCase, attempt: Search, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case together, and run the last stage for the best path alone.
+        """Try all paths of one case in groups, and run the last stage for the best path alone.
 
         With `tries_all` the last stage runs for all paths.
         """
@@ -166,12 +169,26 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             points, steps = problem.run_stages(case, found.field, guess, attempt, stages[:-1])
             return problem.decode(case, points[-1], steps)
 
-        plans = jax.vmap(solve_along)(attempt.draw_noise())
-        best = index_of_best(plans)
-        plan = jax.tree.map(lambda leaf: leaf[best], plans)
+        def try_group(number: Array, best: InterceptPlan) -> InterceptPlan:
+            index = number * attempt.group + jnp.arange(attempt.group)
+            plans = jax.vmap(solve_along)(jax.tree.map(lambda leaf: leaf[index], attempt.noise))
+            chosen = index_of_best(plans)
+            return select(jax.tree.map(lambda leaf: leaf[chosen], plans), best)
+
+        groups = (attempt.paths + attempt.group - 1) // attempt.group
+        plan = lax.fori_loop(0, groups, try_group, make_straight_plan(case, self.pieces))
         if not self.tries_all:
             plan = problem.refine_solved(case, found.field, plan, attempt)
         return self._explain(case, attempt, found, plan)
+
+    def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
+        """Return a search as arguments of the program that all searches share."""
+        return self._load(attempt)
+
+    def _load(self, attempt: Search) -> LoadedSearch:
+        if isinstance(attempt, LoadedSearch):
+            return attempt
+        return load_search(attempt, self.attempts if attempt in self.attempts else (attempt,))
 
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search
@@ -191,12 +208,11 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self.problem.guess_along(case, found.grid, path, layer)
 
     def _explain(
-        self, case: InterceptCase, attempt: Search, found: Reachability, plan: InterceptPlan
+        self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
         """Set the status of an unsolved plan to the reason why the case has no plan."""
         reason = plan.status
-        if attempt == self.attempts[-1]:
-            reason = jnp.where(found.is_reached, reason, Status.NO_PATH)
+        reason = jnp.where(found.is_reached | ~attempt.is_last, reason, Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 
 

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from planner_jax.core.checks import require_beginning, require_kind, require_path
@@ -111,6 +112,12 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
             movers=movers,
         )
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
+
+    def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
+        """Return a search as arguments of a program; the warm attempt has a program of its own."""
+        if isinstance(attempt, Search):
+            return self.planner.load_attempt(attempt, tasks.case)
+        return super().load_attempt(attempt, tasks)
 
     def solve(self, task: Replanning, attempt: Search | Warm) -> InterceptPlan:
         """Return the plan of one case, from the previous plan or from scratch by a `Search`."""

@@ -14,6 +14,7 @@ from jax import Array
 
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
+from planner_jax.core.run_time import cached_by_precision, with_run_time_numbers
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field
@@ -24,12 +25,16 @@ from planner_jax.task.intercept.terms import discs_of, wrap
 # with few unknowns needs for one starting point, as for `Attempt.starts`.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
+_PADDED = ("paths", "candidates")
 _FIELD = 128  # number of nodes of the grid of distances from walls, along each side of the map
 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """Settings of one attempt: draw random paths, and run least squares from each; static."""
+    """An attempt at a case: random paths, and least squares from each.
+
+    Searches with the same `solver` rules, `discs`, `lattice` and `group` share a compiled program.
+    """
 
     starts: int = dataclasses.field(init=False, default=1)
     paths: int = 16  # number of paths from which least squares run
@@ -43,6 +48,7 @@ class Search(Attempt):
     candidates: int = 4  # number of random paths of which the smoothest is used as one path
     directness: float = 2.0  # preference for straight paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
+    group: int = 2  # number of paths that a GPU tries at the same time, group after group
     # Factor on the body's radius in the reach set. The set is conservative, because obstacles are
     # rounded to whole cells. A factor below 1 admits narrow passages that are open in truth.
     body_scale: float = 1.0
@@ -52,12 +58,42 @@ class Search(Attempt):
             raise ArgumentError("paths", ">= 1", self.paths)
         lattice = self.lattice
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
-        starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
+        starts = max(_PATH_STARTS * self.group, round(_WORD_STARTS * words))
         object.__setattr__(self, "starts", starts)
 
-    def draw_noise(self) -> cell_paths.PathNoise:
-        """Draw the random numbers that select each path; leaves have a leading axis `paths`."""
-        return cell_paths.draw_noise(self.lattice, self.paths, self.seed, self.candidates)
+
+@with_run_time_numbers(
+    *("paths", "following", "settling", "margin", "slack", "directness", "body_scale"),
+    *("noise", "is_last"),
+)
+@dataclasses.dataclass(frozen=True)
+class LoadedSearch(Search):
+    """A search as arguments of the program that all searches of a planner share."""
+
+    _: dataclasses.KW_ONLY
+    noise: cell_paths.PathNoise  # random numbers that select each path
+    is_last: bool  # whether the planner makes no search after this one
+
+
+@cached_by_precision
+def load_search(search: Search, searches: tuple[Search, ...]) -> LoadedSearch:
+    """Return one of a planner's searches as arguments of their program.
+
+    The random numbers have leading axes for the largest numbers of paths and of candidates.
+    """
+    paths, candidates = (max(getattr(each, name) for each in searches) for name in _PADDED)
+    noise = cell_paths.draw_noise(search.lattice, search.paths, search.seed, search.candidates)
+    path = np.minimum(np.arange(-(-paths // search.group) * search.group), search.paths - 1)
+    candidate = np.arange(candidates) % search.candidates
+    noise = cell_paths.PathNoise(
+        layers=noise.layers[path],
+        ends=noise.ends[path][:, candidate],
+        steps=noise.steps[path][:, candidate],
+    )
+    fields = {field.name: getattr(search, field.name) for field in dataclasses.fields(search)}
+    del fields["starts"]
+    fields |= {"seed": 0, "candidates": candidates, "within": None}
+    return LoadedSearch(**fields, noise=noise, is_last=search == searches[-1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,11 +133,12 @@ _EARLY = Search(
     body_scale=0.85,
     candidates=1,
     directness=0.0,
+    group=8,
 )
-_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
+_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4), group=8)
 _LATER = (
-    Search(8, seed=1, body_scale=0.9),
-    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
+    Search(8, seed=1, body_scale=0.9, group=8),
+    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30), group=8),
 )
 SEARCHES = {
     "given": _GIVEN,
@@ -189,7 +226,7 @@ def draw_cell_path(
     found: Reachability,
     layer: Array,
     noise: cell_paths.PathNoise,
-    directness: float,
+    directness: Array | float,
 ) -> cell_paths.CellPath:
     """Draw a random path of cells to the target, which it meets at a time (a layer) () int32."""
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)

@@ -34,7 +34,7 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock
 from planner_jax.task.block.end_poses import EndPoses, Flight, end_poses, flight_of
 from planner_jax.task.block.motion import angles_at, profiles, step_weights
-from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan
+from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_plan, mark_blocked
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
@@ -124,8 +124,8 @@ class AdaptBlock(Planner):
             there = jnp.sum(jnp.isfinite(candidates.penalty))
             most = jnp.where(is_possible, jnp.minimum(there, attempt.refined), 0)
             best = select_first_solved(refine_one, most, best)
-        status = explain_status(case, poses, jnp.where(fits, best.status, Status.BLOCKED))
-        return dataclasses.replace(best, status=status)
+        status = mark_blocked(case, jnp.where(fits, best.status, Status.BLOCKED))
+        return dataclasses.replace(best, status=explain_status(poses, status))
 
     def warp(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort

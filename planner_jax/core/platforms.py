@@ -1,0 +1,32 @@
+"""The platform for which a program is being traced: on a GPU some functions have other methods."""
+
+import contextlib
+import contextvars
+from collections.abc import Iterator
+
+from jax.extend.backend import backends
+
+_TRACED: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)
+
+
+@contextlib.contextmanager
+def trace_for(platform: str) -> Iterator[None]:
+    """State within the context that a program is traced for one platform, such as "cpu"."""
+    token = _TRACED.set(platform)
+    try:
+        yield
+    finally:
+        _TRACED.reset(token)
+
+
+def traced_platform() -> str | None:
+    """Return the only platform for which a program is being traced, or None if it is unknown.
+
+    If it is known, the methods of other platforms need not be traced.
+    """
+    return _TRACED.get()
+
+
+def has_only_cpu() -> bool:
+    """Return whether all devices of JAX are CPUs."""
+    return set(backends()) == {"cpu"}

@@ -1,0 +1,89 @@
+"""Settings whose numbers are arguments of compiled programs, so that other numbers compile nothing.
+
+An attempt of a planner, such as a number of iterations from a starting point, is mostly numbers. If
+these are arguments of a compiled program, all attempts of a planner share one program.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+Settings = TypeVar("Settings")
+
+_RUN_TIME: set[type] = set()
+
+
+def with_run_time_numbers(*names: str) -> Callable[[type[Settings]], type[Settings]]:
+    """Make a frozen dataclass a pytree whose leaves are the fields with these names.
+
+    Fields that hold objects of another such class, or tuples of them, become subtrees. All other
+    fields are static and must be hashable. A field that is None is static, too.
+    """
+
+    def register(cls: type[Settings]) -> type[Settings]:
+        _RUN_TIME.add(cls)
+
+        def flatten(settings: Settings) -> tuple[tuple, tuple]:
+            values = vars(settings)
+            inner = [key for key, value in values.items() if key in names or _is_run_time(value)]
+            static = tuple((key, value) for key, value in values.items() if key not in inner)
+            return tuple(values[key] for key in inner), (tuple(inner), static)
+
+        def unflatten(aux: tuple, leaves: tuple) -> Settings:
+            settings = object.__new__(cls)  # the leaves may be tracers, which no check accepts
+            inner, static = aux
+            for key, value in (*zip(inner, leaves, strict=True), *static):
+                object.__setattr__(settings, key, value)
+            return settings
+
+        jax.tree_util.register_pytree_node(cls, flatten, unflatten)
+        return cls
+
+    return register
+
+
+def _is_run_time(value: object) -> bool:
+    """Return whether a field's value is an object, or a tuple of objects, of a registered class."""
+    if isinstance(value, tuple):
+        return bool(value) and all(type(each) in _RUN_TIME for each in value)
+    return type(value) in _RUN_TIME
+
+
+@jax.tree_util.register_static
+@dataclasses.dataclass(frozen=True)
+class Fixed:
+    """An attempt without run-time numbers: a compiled program of its own."""
+
+    attempt: object
+
+
+def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings]:
+    """Decorate a function that returns settings: cache the result, with all numbers as jax arrays.
+
+    The arguments must be hashable. Each precision of JAX has results of its own.
+    """
+
+    def place(leaf: object) -> jax.Array:
+        is_whole = isinstance(leaf, int) and not isinstance(leaf, bool)
+        return jnp.asarray(leaf, jnp.int32 if is_whole else None)
+
+    @functools.lru_cache(maxsize=1024)
+    def load_once(is_float64: bool, *args: object) -> Settings:
+        with jax.ensure_compile_time_eval():
+            return jax.tree.map(place, load(*args))
+
+    @functools.wraps(load)
+    def load_cached(*args: object) -> Settings:
+        return load_once(bool(jax.config.jax_enable_x64), *args)  # type: ignore[attr-defined]
+
+    return load_cached
+
+
+@cached_by_precision
+def place_numbers(settings: Settings) -> Settings:
+    """Return settings with their run-time numbers as jax arrays on JAX's default device."""
+    return settings
