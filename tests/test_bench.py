@@ -16,6 +16,8 @@ import planner_jax as pj
 from planner_jax import benchmarks
 from planner_jax.benchmarks.block_rows import METHODS, ROWS
 from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
+from planner_jax.benchmarks.first_plan import ROWS as FIRST_PLANS
+from planner_jax.benchmarks.first_plan import plan_in_new_process
 from planner_jax.benchmarks.run import Bench
 from planner_jax.benchmarks.throughput import report
 from planner_jax.core import registry
@@ -176,3 +178,11 @@ def test_a_yardstick_for_cases_of_another_class_is_none():
 def test_a_planner_without_rounds_has_no_iterations_to_set(halving, tmp_path):
     with pytest.raises(ArgumentError, match="iterations must be left out"):
         report(task="halve", batch=[4], repeat=1, iterations=7, out=tmp_path / "run")
+
+
+def test_a_second_process_loads_the_programs_of_the_first(tmp_path):
+    folder = str(tmp_path / "compiled")
+    empty, warm = (plan_in_new_process(FIRST_PLANS["hit"], folder) for _ in range(2))
+    assert empty["success"] == warm["success"] == [True]
+    assert empty["programs"] >= 1 and warm["cpu"] < 0.8 * empty["cpu"]
+    assert 0.0 < warm["again"] < 0.1 * warm["cpu"]
