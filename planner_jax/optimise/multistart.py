@@ -17,6 +17,7 @@ from planner_jax.core.protocol import Status, index_of_best, is_unsolved, status
 from planner_jax.lanes import over_lanes
 from planner_jax.optimise import lbfgs
 from planner_jax.optimise.settings import (
+    COUNTED,
     Curvature,
     Curved,
     Evaluation,
@@ -30,9 +31,6 @@ from planner_jax.optimise.settings import (
 
 if TYPE_CHECKING:
     from planner_jax.optimise.planner import OptimisedPlanner
-
-# Up to this number of iterations the loop has a fixed length, which saves a test in every pass.
-_COUNTED = 16
 
 
 @struct.dataclass
@@ -88,7 +86,7 @@ def minimise_lanes(
             by_point = own and (lambda x: own(x, context))
             return _step(lambda x: objective(x, context), by_point, state, config)
 
-        if isinstance(steps, int) and steps <= _COUNTED:
+        if isinstance(steps, int) and steps <= COUNTED:
             return lax.fori_loop(0, steps, lambda _, s: step(s, contexts), state)
         return lax.while_loop(
             lambda s: jnp.any(_method(config).is_unfinished(s.numbers, config)),

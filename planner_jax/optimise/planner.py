@@ -5,6 +5,7 @@ import dataclasses
 from collections.abc import Callable
 from typing import ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import PyTree
@@ -120,7 +121,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
         """Return a round with the settings of its searches by L-BFGS as run-time numbers."""
-        return load_round(attempt)
+        return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
         """Return the plan that one round (attempt) finds for one case."""

@@ -15,6 +15,8 @@ from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 from planner_jax.core.run_time import Fixed, cached_by_precision, with_run_time_numbers
 
+# Up to this number of iterations a loop has a fixed length, which saves a test in every pass.
+COUNTED = 16
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
 
@@ -147,13 +149,30 @@ class Round(Attempt):
         require_kind("solver", self.solver, LbfgsConfig, NewtonConfig)
 
 
+@with_run_time_numbers("tolerance", "patience")
+@dataclasses.dataclass(frozen=True)
+class CountedLbfgs(LbfgsConfig):
+    """Settings of L-BFGS with a number of iterations that is known when the program is compiled."""
+
+
 @cached_by_precision
-def load_round(attempt: Round) -> Round | Fixed:
+def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
     """Return a round as an argument of a compiled program, static if it has a search of no steps.
 
-    Rounds with the same starts, settings and kinds of searches share one program.
+    Rounds with the same starts, settings and kinds of searches share one program. If `is_counted`,
+    the program knows numbers of iterations up to `COUNTED`: a GPU then need not ask the host after
+    every iteration whether the loop has ended.
     """
+
+    def load(solver: Solver) -> Solver:
+        is_long = not is_counted or solver.max_steps > COUNTED
+        if is_long or not isinstance(solver, LbfgsConfig):
+            return solver
+        return CountedLbfgs(**vars(solver))
+
     solvers = [attempt.solver, *(stage.solver for stage in attempt.stages)]
     if any(solver.max_steps == 0 for solver in solvers):
         return Fixed(attempt)
-    return dataclasses.replace(attempt, within=None)
+    stages = [dataclasses.replace(each, solver=load(each.solver)) for each in attempt.stages]
+    own = load(attempt.solver)
+    return dataclasses.replace(attempt, solver=own, stages=tuple(stages), within=None)

@@ -411,7 +411,8 @@ class OnlineBlock(Planner):
         """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
-        shares = tuple(np.arange(self.checked + 1) / self.checked)
+        # The start replaces the sample next to it: with one more, a GPU would be slower by a third.
+        shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)
         # A joint may exceed its position limit between two knots and turn back: check all samples.

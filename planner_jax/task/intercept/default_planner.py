@@ -146,7 +146,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, best)
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch: try all paths in groups, select the best of each case."""
+        """Return the plans of a batch: try all paths together, select the best of each case."""
         attempt = self._load(attempt)
         # All cases compute as many time layers as the case that needs most, to stay in step.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
@@ -155,7 +155,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _solve_all_paths(
         self, case: InterceptCase, attempt: Search, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case in groups, and run the last stage for the best path alone.
+        """Try all paths of one case together, and run the last stage for the best path alone.
 
         With `tries_all` the last stage runs for all paths.
         """
@@ -169,14 +169,9 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
             points, steps = problem.run_stages(case, found.field, guess, attempt, stages[:-1])
             return problem.decode(case, points[-1], steps)
 
-        def try_group(number: Array, best: InterceptPlan) -> InterceptPlan:
-            index = number * attempt.group + jnp.arange(attempt.group)
-            plans = jax.vmap(solve_along)(jax.tree.map(lambda leaf: leaf[index], attempt.noise))
-            chosen = index_of_best(plans)
-            return select(jax.tree.map(lambda leaf: leaf[chosen], plans), best)
-
-        groups = (attempt.paths + attempt.group - 1) // attempt.group
-        plan = lax.fori_loop(0, groups, try_group, make_straight_plan(case, self.pieces))
+        plans = jax.vmap(solve_along)(attempt.noise)
+        best = index_of_best(plans)
+        plan = jax.tree.map(lambda leaf: leaf[best], plans)
         if not self.tries_all:
             plan = problem.refine_solved(case, found.field, plan, attempt)
         return self._explain(case, attempt, found, plan)
@@ -188,7 +183,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _load(self, attempt: Search) -> LoadedSearch:
         if isinstance(attempt, LoadedSearch):
             return attempt
-        return load_search(attempt, self.attempts if attempt in self.attempts else (attempt,))
+        attempts = self.attempts if attempt in self.attempts else (attempt,)
+        return load_search(attempt, attempts, jax.default_backend() != "cpu")
 
     def _guess(
         self, case: InterceptCase, found: Reachability, noise: PathNoise, attempt: Search

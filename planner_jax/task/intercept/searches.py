@@ -33,7 +33,7 @@ _FIELD = 128  # number of nodes of the grid of distances from walls, along each 
 class Search(Attempt):
     """An attempt at a case: random paths, and least squares from each.
 
-    Searches with the same `solver` rules, `discs`, `lattice` and `group` share a compiled program.
+    Searches with the same `solver` rules, `discs` and `lattice` share a compiled program.
     """
 
     starts: int = dataclasses.field(init=False, default=1)
@@ -48,7 +48,6 @@ class Search(Attempt):
     candidates: int = 4  # number of random paths of which the smoothest is used as one path
     directness: float = 2.0  # preference for straight paths; see `cell_paths.draw_path`
     lattice: reach.Lattice = reach.Lattice()
-    group: int = 2  # number of paths that a GPU tries at the same time, group after group
     # Factor on the body's radius in the reach set. The set is conservative, because obstacles are
     # rounded to whole cells. A factor below 1 admits narrow passages that are open in truth.
     body_scale: float = 1.0
@@ -58,7 +57,7 @@ class Search(Attempt):
             raise ArgumentError("paths", ">= 1", self.paths)
         lattice = self.lattice
         words = lattice.cells**2 // 32 * lattice.levels * lattice.headings * lattice.layers
-        starts = max(_PATH_STARTS * self.group, round(_WORD_STARTS * words))
+        starts = max(_PATH_STARTS * self.paths, round(_WORD_STARTS * words))
         object.__setattr__(self, "starts", starts)
 
 
@@ -74,16 +73,22 @@ class LoadedSearch(Search):
     noise: cell_paths.PathNoise  # random numbers that select each path
     is_last: bool  # whether the planner makes no search after this one
 
+    def __post_init__(self) -> None:
+        """Do nothing: `starts` is used only before a search is loaded."""
+
 
 @cached_by_precision
-def load_search(search: Search, searches: tuple[Search, ...]) -> LoadedSearch:
-    """Return one of a planner's searches as arguments of their program.
+def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
+    """Return one of a planner's searches as arguments of a compiled program.
 
-    The random numbers have leading axes for the largest numbers of paths and of candidates.
+    All searches share the program, which tries path after path: the random numbers have leading
+    axes for the largest numbers of paths and of candidates. If the search `is_apart`, it has a
+    program of its own, which tries its paths together, as a GPU does.
     """
-    paths, candidates = (max(getattr(each, name) for each in searches) for name in _PADDED)
+    sizes = (search,) if is_apart else searches
+    paths, candidates = (max(getattr(each, name) for each in sizes) for name in _PADDED)
     noise = cell_paths.draw_noise(search.lattice, search.paths, search.seed, search.candidates)
-    path = np.minimum(np.arange(-(-paths // search.group) * search.group), search.paths - 1)
+    path = np.minimum(np.arange(paths), search.paths - 1)
     candidate = np.arange(candidates) % search.candidates
     noise = cell_paths.PathNoise(
         layers=noise.layers[path],
@@ -133,12 +138,11 @@ _EARLY = Search(
     body_scale=0.85,
     candidates=1,
     directness=0.0,
-    group=8,
 )
-_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4), group=8)
+_LEAST = Search(16, LevenbergConfig(60, tolerance=5e-4))
 _LATER = (
-    Search(8, seed=1, body_scale=0.9, group=8),
-    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30), group=8),
+    Search(8, seed=1, body_scale=0.9),
+    dataclasses.replace(_GIVEN[2], solver=LevenbergConfig(30)),
 )
 SEARCHES = {
     "given": _GIVEN,
