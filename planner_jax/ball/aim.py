@@ -15,9 +15,10 @@ from jax.custom_derivatives import SymbolicZero
 from planner_jax.ball.flight import BallState, fly, gravity_vector
 from planner_jax.core.arithmetic import reciprocal
 
-# Runge-Kutta steps of a flight; the landing point of a 2 s flight then has an error of 0.2 mm.
+# Number of Runge-Kutta steps of a flight; the error at the end of a 2 s flight is then 0.2 mm.
 _FLIGHT_STEPS = 10
-# Runge-Kutta steps of a coarse flight; with fewer steps the method diverges for strong drag.
+# Number of steps of a coarse flight, for the first two Newton steps; with fewer steps, Newton's
+# method diverges for strong drag.
 _COARSE_STEPS = 8
 
 Tangent = Array | SymbolicZero
@@ -42,7 +43,7 @@ def aim_with_drag(
 
 @jax.custom_jvp
 def _aim(displacement: Array, flight_time: Array, drag: Array, gravity: Array) -> Array:
-    """Compute `aim_with_drag` for a displacement (3,) [m]."""
+    """Return the velocity of `aim_with_drag` for the displacement (3,) [m] to the target."""
 
     def newton_step(_: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
         def landing(vel: Array) -> tuple[Array, Array]:
@@ -76,7 +77,7 @@ def _aim_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Arr
 
 
 def _changing(tangents: Sequence[Tangent]) -> list[int]:
-    """Return the indices of the arguments whose tangent is not symbolically zero."""
+    """Return the indices of the tangents that are not symbolic zeros."""
     return [k for k, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
 
 
@@ -101,8 +102,9 @@ def _solve3(matrix: Array, rhs: Array) -> Array:
 def apex_with_drag(ball: BallState, flight_time: Array, drag: Array, gravity: Array) -> Array:
     """Return the greatest height [m] of a ball with quadratic drag within `flight_time` [s].
 
-    The flight is integrated in steps. From the last step that starts with v_z > 0, the remaining
-    climb is approximated by v_z^2 / (2 (g + 2/3 K_D |v| v_z)). A falling ball is highest at time 0.
+    The flight is integrated in steps. From the last step whose initial vertical velocity v_z is
+    positive, the remaining climb is approximated by v_z^2 / (2 (g + 2/3 K_D |v| v_z)) with the drag
+    coefficient K_D. A falling ball is highest at time 0.
     """
     numbers = jnp.asarray(flight_time), jnp.asarray(drag), jnp.asarray(gravity)
     return ball.pos[2] + _climb(ball.vel, *numbers)

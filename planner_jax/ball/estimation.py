@@ -19,7 +19,7 @@ Flight = Callable[[BallState, Array, Array, Array], BallState]
 
 @struct.dataclass
 class EkfModel:
-    """Parameters of the Kalman filter: of the ball's flight and of the position sensor."""
+    """Parameters of the Kalman filter: the ball's flight, and the noise of flight and sensor."""
 
     drag: Array  # (3,) K_i [1/s] for `linear_drag_flight`, () K_D [1/m] for `rk4_step`
     gravity: Array  # () [m/s^2], magnitude
@@ -48,7 +48,7 @@ def _congruence(A: Array, P: Array) -> Array:
 
 
 def solve_definite(A: Array, B: Array) -> Array:
-    """Solve A X = B for X (m, n) by unrolled elimination; A (m, m) is positive definite."""
+    """Solve A X = B for X (m, n) by unrolled elimination; A (m, m) must be positive definite."""
     U, X = list(A), list(B)
     size = len(U)
     for i in range(size):
@@ -63,15 +63,15 @@ def solve_definite(A: Array, B: Array) -> Array:
 def ekf_init(
     pos: Float[Array, "3"], vel: Float[Array, "3"], *, pos_std: Array, vel_std: Array
 ) -> EkfState:
-    """Make the Gaussian belief about a ball's state before the first observation.
+    """Make the Gaussian belief about a ball's position and velocity before any observation.
 
     Args:
-        pos: (3,) [m].
-        vel: (3,) [m/s].
-        pos_std: () or (3,) [m], standard deviation of each coordinate; it may be large.
-        vel_std: () or (3,) [m/s], standard deviation of each coordinate. In float32 keep vel_std
-            times the time between observations below 1000 times an observation's standard
-            deviation.
+        pos: (3,) [m], expected position of the ball.
+        vel: (3,) [m/s], expected velocity of the ball.
+        pos_std: () or (3,) [m], standard deviation of each coordinate of the position.
+        vel_std: () or (3,) [m/s], standard deviation of each coordinate of the velocity. In
+            float32 the product of vel_std and the time between observations should be below 1000
+            times the standard deviation of an observed position.
     """
     std = jnp.concatenate([jnp.ones_like(pos) * pos_std, jnp.ones_like(vel) * vel_std])
     return EkfState(mean=jnp.concatenate([pos, vel]), covariance=jnp.diag(std**2))
@@ -84,7 +84,7 @@ def ekf_predict(
 
     The covariance P becomes F P F' + Q. F is the Jacobian of the flight, and Q the covariance that
     a white acceleration causes during `duration`. With `linear_drag_flight` this is [Yu2023catch,
-    eq. 10], except that the paper advances the position by v dt only.
+    eq. 10], except that the paper adds only velocity times duration to the position.
     """
 
     def transition(mean: Array) -> Array:
@@ -102,10 +102,10 @@ def ekf_predict(
 def ekf_update(state: EkfState, observation: Float[Array, "3"], model: EkfModel) -> EkfState:
     """Update the belief with an observed position Z (3,) [m] [Yu2023bat, eq. 5].
 
-    The mean s becomes s + K_a (Z - H s), with H = [I 0] and the Kalman gain K_a. Joseph's form of
-    the covariance stays positive definite in float32, even if a wide prior meets a precise
-    observation. Only `observation_std` of the model is used. If a coordinate of the observation is
-    not finite, the belief is returned unchanged.
+    The mean s becomes s + K_a (Z - H s), where H = [I 0] selects the position and K_a is the Kalman
+    gain. The covariance is updated in Joseph's form, which stays positive definite in float32. Only
+    `observation_std` of the model is used. If a coordinate of the observation is not finite, the
+    belief is returned unchanged.
     """
     observed = jnp.all(jnp.isfinite(observation))
     dtype = state.mean.dtype

@@ -31,7 +31,7 @@ class BallState:
 
 
 def require_ball(ball: object) -> None:
-    """Raise `TypeError` or `ValueError` unless the argument `ball` is one ball of vectors (3,)."""
+    """Raise an error unless the argument `ball` is one `BallState` with vectors of shape (3,)."""
     require_kind("ball", ball, BallState)
     for name in ("pos", "vel"):
         shape = shape_of(f"ball.{name}", vars(ball)[name])
@@ -48,7 +48,8 @@ def gravity_vector(gravity: Array) -> Array:
 def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
     """Return the acceleration g - K_D |v| v [m/s^2] of a ball in flight [Yu2023bat, eq. 2].
 
-    The result is a tuple if the velocity is a tuple. The gradient is finite at zero velocity.
+    `vel` is its velocity v, and `drag` is K_D [1/m]. The result is a tuple if the velocity is a
+    tuple. The gradient is finite at zero velocity.
     """
     x, y, z = components(vel)
     speed_squared = x * x + y * y + z * z
@@ -63,7 +64,10 @@ def ball_acceleration(vel: Vector, drag: Array, gravity: Array) -> Vector:
 
 
 def rk4_step(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
-    """Advance a ball with quadratic drag by one Runge-Kutta step of order 4, forward or back."""
+    """Return the ball after a time `duration` [s], by one Runge-Kutta step of order 4.
+
+    The drag is quadratic. A negative duration goes back in time.
+    """
 
     def rate(state: BallState) -> BallState:
         slopes: PyTree = ball_acceleration(state.vel, drag, gravity)
@@ -114,9 +118,9 @@ def fly(
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
     """Return the ball after a flight with drag acceleration -K_i v_i on each axis i.
 
-    On each axis s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K, with signed g. This is
-    [Yu2023bat, eq. 4a] with the constant of integration, which the paper omits. The result is exact
-    to rounding for any K >= 0.
+    On each axis the position is s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K, where g is the
+    component of the gravitational acceleration. [Yu2023bat, eq. 4a] omits the constant of
+    integration. The result is exact to rounding for any K >= 0.
     """
     x = drag * duration
     phi_1, phi_2 = _phi(x)
@@ -130,7 +134,7 @@ def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: A
 def _phi(x: Array) -> tuple[Array, Array]:
     """Return phi_1 = (1 - exp(-x))/x and phi_2 = (1 - phi_1)/x, exact to rounding for any x.
 
-    For |x| < 1/2 a series of thirteen terms avoids the cancellation in the formula of phi_2.
+    For |x| < 1/2 a power series of thirteen terms avoids the cancellation in 1 - phi_1.
     """
     small = jnp.abs(x) < 0.5
     near = jnp.where(small, x, 0.0)
@@ -151,7 +155,8 @@ def drag_free_flight(ball: BallState, duration: Array, gravity: Array) -> BallSt
 def drag_free_apex(ball: BallState, gravity: Array) -> Array:
     """Return the greatest future height [m] of a drag-free ball [Yu2023bat, eq. 22].
 
-    The height is z + v_z^2 / (2 g) for a rising ball, and z for a falling ball. The paper omits z.
+    The height is z + v_z^2 / (2 g) for a rising ball, and its present height z for a falling ball.
+    The paper prints v_z^2 / (2 g) alone.
     """
     return ball.pos[2] + jnp.maximum(ball.vel[2], 0.0) ** 2 / (2.0 * gravity)
 
@@ -170,10 +175,10 @@ def drag_free_fall_time(ball: BallState, height: Array, gravity: Array) -> tuple
 
 
 def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution: Array) -> Array:
-    """Return the ball's velocity v+ (3,) [m/s] after the bounce.
+    """Return a ball's velocity v+ (3,) [m/s] after its bounce from a racket.
 
-    v+ = v- - (1 + beta) ((v- - u) . z) z. [Yu2023bat, eq. 3] prints (1 - beta), but the paper's
-    definition of beta and its eq. 12 need the plus sign. The tangential velocity is unchanged.
+    v+ = v- - (1 + beta) ((v- - u) . z) z, so that the tangential velocity is unchanged. [Yu2023bat,
+    eq. 3] prints (1 - beta), but its beta is the coefficient of restitution, which needs the plus.
 
     Args:
         ball_vel: v- (3,) [m/s], velocity of the ball before the bounce.
@@ -187,8 +192,8 @@ def racket_impact(ball_vel: Array, racket_vel: Array, normal: Array, restitution
 def solve_impact(ball_vel: Array, ball_vel_after: Array, restitution: Array) -> tuple[Array, Array]:
     """Return the racket's unit normal (3,) and its speed () along the normal for a desired bounce.
 
-    The bounce changes the velocity v- to v+, and the normal is along v+ - v- [Yu2023bat, eqs 11 and
-    12, with the opposite sign].
+    The bounce changes the ball's velocity v- to v+. The normal has the direction of v+ - v-; in
+    [Yu2023bat, eqs 11 and 12] normal and speed have the opposite sign.
     """
     change = ball_vel_after - ball_vel
     size_squared = jnp.sum(change**2)

@@ -1,7 +1,8 @@
 """Prediction of a ball's flight: a table of integrated states, interpolated between its nodes.
 
 The flight is integrated once into a table [Yu2023bat, Section III-C, eqs 8 to 10]. Cubic
-convolution [Keys1981] with a = -1/2 interpolates at any time, with a continuous gradient.
+convolution [Keys1981], with the kernel's parameter a = -1/2, interpolates the table at any time.
+The interpolated position has a continuous time derivative.
 """
 
 import functools
@@ -26,7 +27,7 @@ LEAST_NODES = 5  # least number of nodes of a table
 
 @struct.dataclass
 class PathTable:
-    """States of a target at equal time steps. Node k is at time (k - 1) * resolution."""
+    """Positions and velocities of a target at N nodes; node k is at time (k - 1) * resolution."""
 
     rules: ClassVar[Table] = (Field("resolution", None, POSITIVE),)
 
@@ -35,7 +36,7 @@ class PathTable:
     resolution: Array  # () [s], > 0
 
     def at(self, time: Array) -> BallState:
-        """Interpolate position and velocity of the target at one time () [s]; see `target_at`."""
+        """Return position and velocity at one time () [s]; see `target_at`."""
         return target_at(self, time)
 
 
@@ -51,8 +52,8 @@ def predict_path(
         horizon: () [s], last time of the prediction.
         drag: () K_D [1/m].
         gravity: () [m/s^2], magnitude.
-        num_nodes: N >= 5. One node is before time 0 and one node after the horizon, because the
-            interpolation at a time uses two nodes before and two nodes after that time.
+        num_nodes: number of nodes, >= 5. One is before time 0 and one after the horizon, because
+            the interpolation at a time uses two nodes before and two nodes after that time.
 
     Raises:
         ValueError: an argument has a wrong shape or, unless it is a JAX array, is out of range.
@@ -70,7 +71,7 @@ def predict_path(
 
 @functools.cache
 def _node_function(num_nodes: int) -> Callable:
-    """Build the function that integrates positions and velocities (N, 3) at the nodes of a table.
+    """Build the function that integrates positions and velocities (N, 3) at the N nodes of a table.
 
     Derivatives use forward mode, also inside reverse mode, so that no states must be stored.
     """
@@ -127,9 +128,10 @@ def horizon_of(table: PathTable) -> Array:
 
 
 def convolution_weights(u: Array) -> Array:
-    """Return the weights (4,) of Keys' cubic convolution kernel [Yu2023bat, eqs 8 and 10b].
+    """Return the weights (4,) of cubic convolution [Keys1981; Yu2023bat, eqs 8 and 10b].
 
-    They multiply the four nodes around a point at the fraction `u` () between the middle two.
+    They multiply the values at four neighbouring nodes. The point of interpolation lies between the
+    second and third node, at the fraction `u` () of the interval.
     """
     far = lambda x: ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0  # noqa: E731
     near = lambda x: (1.5 * x - 2.5) * x * x + 1.0  # noqa: E731
@@ -137,10 +139,10 @@ def convolution_weights(u: Array) -> Array:
 
 
 def target_at(table: PathTable, time: Array) -> BallState:
-    """Return the state of the target at one time () [s], with a continuous gradient in time.
+    """Return position and velocity of the target at one time () [s], by cubic convolution.
 
-    In [0, horizon] position and velocity are cubic convolutions of the N nodes [Yu2023bat, eq. 9].
-    Outside this interval the target keeps its velocity at the nearer end.
+    The interpolation [Yu2023bat, eq. 9] has a continuous time derivative. Before time 0 and after
+    the last time of the table, the target keeps its velocity at that time.
     """
     require_kind("table", table, PathTable)
     require_scalar("time", time)

@@ -31,7 +31,8 @@ def table_kernel(
     Args:
         num_nodes: number N of nodes.
         moving: indices of arguments other than the position. If there are any, the kernel returns
-            derivatives by these arguments instead of states: of positions, then of velocities.
+            derivatives by these arguments instead of states: first the derivatives of positions,
+            then the derivatives of velocities.
         interpret: run the kernel in Pallas's interpreter, without a GPU, for tests.
     """
 
@@ -52,9 +53,9 @@ def table_kernel(
 class _Direction:
     """One scalar input by which the states at the nodes are differentiated."""
 
-    # Index of the result with derivatives of positions; results for velocities come later.
+    # Index of the kernel's result that holds the derivatives of positions by this input.
     result: int
-    index: tuple[int, ...]  # index in this result, after the indices of node and axis
+    index: tuple[int, ...]  # the input's index on the last axis of this result; () for a scalar
     vel: tuple[float, ...]  # (3,) tangent of the velocity at time 0
     numbers: tuple[float, ...]  # (3,) tangent of resolution, drag and gravity
 

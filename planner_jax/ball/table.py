@@ -34,15 +34,15 @@ def table_path(
 
     A cubic spline with continuous acceleration interpolates the positions, or a cubic Hermite
     spline if velocities are passed. With times at most d apart, the error of the position is
-    O(d^4), and of the velocity O(d^3). Noisy observations should be smoothed before.
+    O(d^4), and the error of the velocity O(d^3). Noisy observations should be smoothed before.
 
-    The result is a table of the spline with equal time steps, between which planner and referee
+    The result is a table of samples of the spline at equal time steps, between which planners
     interpolate by cubic convolution. By default the table has enough nodes to approximate the
-    spline's position to `error` [m], and its velocity to ten times `error` per second.
+    spline's position to `error` [m], and its velocity to 10 `error` [m/s].
 
     Args:
-        times: (K,) [s], rising, K >= 2, NumPy. Planning starts at time 0, which must be within the
-            times. After the last time the target keeps its velocity.
+        times: NumPy array of K >= 2 increasing times [s]. Planning starts at time 0, which must be
+            within the times. After the last time the target keeps its velocity.
         positions: (..., K, 3) [m]; leading axes are leading axes of the result, such as (N,) for
             the targets of one catch. The path is differentiable by positions.
         velocities: (..., K, 3) [m/s].
@@ -101,7 +101,7 @@ def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
 
 
 def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: int) -> PyTree:
-    """Evaluate a derivative (..., T, 3) of the spline at times `at` (T,), linear in `values`."""
+    """Evaluate a derivative (..., T, 3) of the spline through `values` at T times `at`."""
     units, none = np.eye(times.size), np.zeros((times.size, times.size))
     if len(values) == 1:
         splines = [CubicSpline(times, units)]
@@ -119,7 +119,7 @@ def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: in
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
-    """Return the least power of two, from 16, of nodes whose table has at most `error` [m]."""
+    """Return the least number of nodes, 16, 32, 64, ..., whose table has at most `error` [m]."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)

@@ -26,7 +26,7 @@ class TargetPath(Protocol):
 
 
 def state_at(path: TargetPath, time: Array) -> BallState:
-    """Return a target's position and velocity at a time () [s]; `at` may give only positions."""
+    """Return a target's state at a time () [s]; if `at` returns a position, differentiate it."""
     state = path.at(time)
     if isinstance(state, BallState):
         return state
@@ -36,7 +36,7 @@ def state_at(path: TargetPath, time: Array) -> BallState:
 
 @struct.dataclass
 class BallPath:
-    """Path of a ball with linear drag on each axis [Yu2023catch, eq. 9]."""
+    """Path of a ball with drag acceleration -K_i v_i on each axis i [Yu2023catch, eq. 9]."""
 
     rules: ClassVar[Table] = (
         Field("ball.pos", (3,)),
@@ -46,7 +46,7 @@ class BallPath:
     )
 
     ball: BallState  # at time 0
-    drag: Array  # (3,) K_i [1/s]
+    drag: Array  # (3,) K_i [1/s], drag coefficients of the axes
     gravity: Array  # () [m/s^2], magnitude
 
     def at(self, time: Array) -> BallState:

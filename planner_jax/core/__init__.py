@@ -1,1 +1,1 @@
-"""The contract of planners, cases and tasks: statuses, rules, checks, registry, plan files."""
+"""Base classes of planners, plans and cases, checks of arguments, and the registry of names."""

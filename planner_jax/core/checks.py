@@ -27,7 +27,7 @@ def format_shapes(tree: PyTree) -> str:
 
 
 def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
-    """Raise unless an argument is one finite number that keeps a rule; jax arrays () pass."""
+    """Raise unless an argument is one finite number that keeps a rule; jax scalars always pass."""
     number = require_scalar(name, value)
     if not isinstance(number, jax.Array) and not all(r.holds(number, None) for r in (FINITE, rule)):
         words = rule.words if rule is FINITE else f"{FINITE.words} and {rule.words}"
@@ -35,7 +35,7 @@ def require_number(name: str, value: object, rule: Rule = FINITE) -> None:
 
 
 def require_scalar(name: str, value: object) -> Numbers:
-    """Return a number, finite or not, as an array (); raise `ArgumentTypeError` otherwise."""
+    """Return a number, finite or not, as an array (); raise `ArgumentTypeError` for others."""
     number = numeric(value)
     if number is None or number.shape or number.dtype == np.bool_:
         raise ArgumentTypeError(name, "a number", value)
@@ -67,12 +67,12 @@ def require_path_name(name: str, value: object) -> None:
         raise ArgumentTypeError(name, "the path of a file", value)
 
 
-# Types that `isinstance` tests quickly; a value of such a type is no array of JAX.
+# Values of these types are not jax arrays. They are tested first, because the test is fast.
 _HOSTS = (np.ndarray, np.generic, float)
 
 
 def numeric(value: object) -> Numbers | None:
-    """Return real numbers as an array, a jax array unchanged, or None for any other value."""
+    """Return numbers or bools as an array, jax arrays unchanged; None if the value is neither."""
     try:
         if not isinstance(value, _HOSTS) and isinstance(value, Tracer | jax.Array):
             array: Numbers = value
@@ -113,7 +113,7 @@ def _require_numeric(name: str, value: object) -> Numbers:
 
 
 def floating(dtype: object) -> np.dtype:
-    """Return a floating-point dtype that JAX has enabled; raise `ArgumentTypeError` if not."""
+    """Return `dtype` if it is a floating-point type that JAX has enabled, or raise an error."""
     try:
         kind = np.dtype(dtype)  # type: ignore[call-overload]
     except TypeError:
@@ -126,7 +126,7 @@ def floating(dtype: object) -> np.dtype:
 
 
 def require_beginning(name: str, tree: PyTree, shape: tuple[int, ...], words: str) -> list[Numbers]:
-    """Return an argument's leaves; raise unless their shapes begin with `shape`."""
+    """Return a pytree's leaves; raise unless the shape of each begins with `shape` (`words`)."""
     leaves = jax.tree.leaves(tree)
     arrays = [array for leaf in leaves if (array := numeric(leaf)) is not None]
     if not arrays or len(arrays) < len(leaves):
@@ -176,7 +176,7 @@ def require_path(
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of the paths' positions; cached, since tracing `at` takes a millisecond."""
+    """Return the shape that the paths' method `at` returns; cached, since tracing takes 1 ms."""
 
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)

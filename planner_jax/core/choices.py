@@ -8,7 +8,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.host import machine
 
 EFFORTS = ("feasible", "good", "best")  # how long a planner searches; the first is the default
-RECOVERIES = ("brake", "home")  # to standstill anywhere, or at the initial position of the case
+RECOVERIES = ("brake", "home")  # come to standstill anywhere, or at the case's initial position
 NONE = "none"  # setting for plans that end at their last contact, without a recovery
 CHOICES = (NONE, *RECOVERIES)
 SCALES = (1e-3, 1e3)  # least and greatest plausible factor on the limits of a case
@@ -59,7 +59,6 @@ def require_disk(name: str, num: int, bytes_each: int, folder: str | os.PathLike
 
 
 def _require_space(name: str, num: int, bytes_each: int, free: int | None, what: str) -> None:
-    """Raise `ArgumentError` if `num` elements exceed the `free` bytes; None means unknown."""
     if free is not None and num * bytes_each > free:
         sizes = f"{machine.format_size(bytes_each)} each, {machine.format_size(free)} free"
         most = max(free // bytes_each, 1)

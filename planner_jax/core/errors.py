@@ -26,7 +26,7 @@ class ArgumentError(PlannerJaxError, ValueError):
         name: argument, or field of an argument, such as "limits.speed".
         rule: condition on the argument, such as "> 0".
         value: value of the argument.
-        index: first entry, or first case of a batch, that breaks the rule, if there are several.
+        index: index of the first entry of an array, or case of a batch, that breaks the rule.
         verb: word between "must" and the rule, such as "be" or "have".
         other: name of a second argument with which the rule compares this one.
         shown: text that is shown instead of `value`; "" shows nothing.
@@ -99,7 +99,7 @@ class MissingExtra(PlannerJaxError, ModuleNotFoundError):
 
 
 class NoRecovery(PlannerJaxError, ValueError):
-    """No trajectory to standstill after a plan keeps every limit; the text names the limit."""
+    """Every trajectory from the end of a plan to standstill exceeds a limit, named in the text."""
 
 
 def install_line(extra: str) -> str:

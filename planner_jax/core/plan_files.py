@@ -34,7 +34,7 @@ class PlanFileError(ArgumentError):
 
 
 def save_arrays(path: str | os.PathLike, tree: PyTree) -> None:
-    """Write a dataclass of arrays, or of such dataclasses, to a file: completely or not at all."""
+    """Write a (nested) dataclass of arrays to a .npz file, which is unchanged if writing fails."""
     require_path_name("path", path)
     header = json.dumps({"version": VERSION, "class": type(tree).__name__})
     arrays = {name: np.asarray(leaf) for name, leaf in leaves_by_name(tree).items()}
@@ -95,7 +95,7 @@ def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray
 
 
 def leaves_by_name(tree: PyTree, prefix: str = "") -> dict[str, PyTree]:
-    """Return the arrays of a dataclass by dotted names, without static fields and None."""
+    """Return a nested dataclass as a dict of arrays by dotted names, without static fields."""
     leaves = {}
     defaults = {field.name: field.default for field in dataclasses.fields(tree)}
     for name, value in nodes_of(tree).items():

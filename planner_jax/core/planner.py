@@ -61,10 +61,10 @@ class Drive(Protocol):
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after another try at some cases: the better of the old and new plan.
+        """Plan some of B cases again; return the better of the old and new plan of each case.
 
-        `plan_of` makes plans of a batch of the cases. NumPy leaves of `plans` are changed in place.
-        The cases where `left` (B,) is true are tried, unless the caller's time limit has passed.
+        `plan_of` makes plans of a batch of cases. The cases where `left` (B,) is true are planned,
+        unless the caller's time limit has passed. NumPy leaves of `plans` are changed in place.
         """
         ...
 
@@ -98,7 +98,7 @@ class Planner(Generic[CaseT, PlanT]):
         return (Attempt(),)
 
     def load_attempt(self, attempt: PyTree, cases: CaseT, /) -> PyTree:
-        """Return what `solve` takes as its attempt, as an argument of a compiled program.
+        """Convert an attempt to the pytree that the compiled `solve` takes as its second argument.
 
         By default each attempt is static, and compiles a program of its own. Attempts that are
         pytrees of the same structure share one program; see `run_time`. Only the class and the
@@ -147,10 +147,10 @@ class Planner(Generic[CaseT, PlanT]):
         return self
 
     def begin(self, *args: PyTree, **news: PyTree) -> Case:
-        """Return cases as they remain some time into their plans; see `pj.replan`.
+        """Return the cases that a re-planner solves while their plans are executed.
 
-        A re-planner takes the cases, the previous plans, the time since those started, and changed
-        quantities by name.
+        A re-planner takes the arguments of `pj.replan`: the cases, the previous plans, the time
+        since the plans started, and changed quantities by name.
 
         Raises:
             TypeError: the planner is not a re-planner.
@@ -163,7 +163,7 @@ class Planner(Generic[CaseT, PlanT]):
     def settle(
         self, cases: CaseT, plan_of: Callable[["Planner", PyTree], PyTree] | None = None
     ) -> "tuple[PyTree, PyTree]":
-        """Return an `OptimisedPlanner`, and the cases with all decisions that precede its search.
+        """Return an `OptimisedPlanner`, and the cases with decisions such as an order of targets.
 
         `plan_of` plans cases by a planner; the decisions are taken from these plans. By default the
         decisions are the first proposals. The function is then pure and makes no plan, and
@@ -178,10 +178,10 @@ class Planner(Generic[CaseT, PlanT]):
         )
 
     def with_effort(self, effort: str) -> Self:
-        """Return a copy of the planner whose first attempt, at all cases, searches for longer.
+        """Return a copy of the planner that continues to lower the cost when every limit holds.
 
-        "feasible" returns the planner itself, which leaves a case as soon as every limit holds,
-        mostly far from the least cost. See `OptimisedPlanner.with_effort` for the other efforts.
+        With the effort "feasible" it is the planner itself, which stops at a case as soon as every
+        limit holds. See `OptimisedPlanner.with_effort` for the efforts "good" and "best".
 
         Raises:
             ArgumentError: the effort is unknown, or the planner does not minimise a cost.

@@ -1,4 +1,4 @@
-"""The platform for which a program is being traced: on a GPU some functions have other methods."""
+"""The platform for which JAX traces a program, by which functions choose a method: CPU or GPU."""
 
 import contextlib
 import contextvars
@@ -11,7 +11,7 @@ _TRACED: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform",
 
 @contextlib.contextmanager
 def trace_for(platform: str) -> Iterator[None]:
-    """State within the context that a program is traced for one platform, such as "cpu"."""
+    """Declare that programs traced within the `with` block run only on one platform ("cpu")."""
     token = _TRACED.set(platform)
     try:
         yield

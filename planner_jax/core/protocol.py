@@ -42,7 +42,7 @@ class Status(enum.IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Status | None":
-        """Return the status that equals a jax array of one number, which is not hashable."""
+        """Return the status equal to a jax array (); the enum's own search needs a hash."""
         return next((status for status in cls if status == value), None)
 
 
@@ -68,12 +68,13 @@ def is_solved(status: Numbers | int) -> Array:
 
 
 def is_unsolved(status: Numbers | int) -> Array:
-    """Return which statuses another attempt may improve: a limit is exceeded, or out of reach."""
+    """Return where a status is INFEASIBLE, MAX_STEPS or OUT_OF_REACH: another attempt may help."""
     worth = (status == Status.INFEASIBLE) | (status == Status.MAX_STEPS)
     return worth | (status == Status.OUT_OF_REACH)  # type: ignore[return-value]
 
 
-# The referee accepts a relative excess of 1e-3. Half of it is reserved for peaks between samples.
+# Greatest relative excess over a limit that planners accept. The referee, an independent check of
+# plans, accepts 1e-3; the difference is reserved for peaks between the planner's samples.
 FEASIBILITY_TOLERANCE = 5e-4
 
 
@@ -191,7 +192,7 @@ PlanT = TypeVar("PlanT", bound=Plan)
 
 @runtime_checkable
 class Decision(Protocol):
-    """A rule that decides what a case leaves open, such as an order; a pytree, as planners are.
+    """A rule that decides what a case leaves open, such as the order of its targets; a pytree.
 
     Examples are the best of all orders, the output of a network, and a fixed order. A class may
     inherit the defaults of `check`, `rank` and `explain`.
@@ -201,7 +202,7 @@ class Decision(Protocol):
         """Raise `ArgumentError` for a batch that the rule cannot decide; called on the host."""
 
     def propose(self, case: PyTree, /) -> PyTree:
-        """Return F choices for `case.with_choice`, best first, with leaves (F, ...); pure."""
+        """Return F choices for a case, best first, in one pytree with leaves (F, ...); pure."""
         ...
 
     def rank(self, plans: PyTree, /) -> Array:
@@ -306,8 +307,8 @@ def select(later: PlanT, before: PlanT, where: Array | bool = True) -> PlanT:
 def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
     """Replace plans in place by later plans of the same cases that are better; NumPy leaves.
 
-    `lanes` are the indices of these cases in the batch. Later plans beyond their number are
-    padding.
+    `lanes` are the indices of these cases in the batch. If there are more later plans than
+    indices, the surplus plans are padding and are ignored.
     """
     later = jax.tree.map(lambda leaf: np.asarray(leaf)[: lanes.size], later)
     better = is_better(later, jax.tree.map(lambda leaf: leaf[lanes], plans))
@@ -320,7 +321,7 @@ def select_into(plans: PyTree, later: PyTree, lanes: np.ndarray) -> PyTree:
 
 
 def index_of_best(plans: PyTree, cost: PyTree = None) -> PyTree:
-    """Return the index along the first axis of the selected plan of each case, for plans (K, ...).
+    """Return the index of the best of K plans for each case; all leaves have the shape (K, ...).
 
     `cost` (K, ...) replaces the planner's own cost.
     """

@@ -54,7 +54,7 @@ def below(other: str) -> Rule:
 
 
 def _is_permutation(value: Numbers, part: PyTree) -> Numbers:
-    """Return which entries along the last axis are indices of it that occur only once."""
+    """Return which numbers are valid indices of the last axis and occur in it only once."""
     alike = (value[..., :, None] == value[..., None, :]).sum(axis=-1)
     return (alike == 1) & (value >= 0) & (value < value.shape[-1])
 
@@ -204,7 +204,7 @@ def require_shapes(cases: PyTree) -> None:
 
 
 def _usual_batch(part: PyTree) -> tuple[int, ...]:
-    """Return the batch shape of most arrays of a part: the axes in front of those of one case."""
+    """Return the batch shape that most arrays of a part have, in front of the shape of one case."""
     fronts: Counter[tuple[int, ...]] = Counter()
     for name, shape in {field.name: field.shape for field in type(part).rules}.items():
         if shape is not None and (value := part_at(part, name)) is not None:
@@ -236,7 +236,7 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
         (place + field.name, field, part) for place, part in parts for field in type(part).rules
     ]
     free = {name for name, field, _ in tables if field.rule.infinite}
-    whole: list[str] = []  # prefixes of parts whose numbers have been yielded
+    whole: list[str] = []  # dotted prefixes of parts whose numbers have been yielded
     for place, part in parts:
         if any(place.startswith(outer) for outer in whole):
             continue

@@ -56,15 +56,15 @@ def _is_run_time(value: object) -> bool:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Fixed:
-    """An attempt without run-time numbers: a compiled program of its own."""
+    """An attempt as a static argument: JAX compiles a separate program for every such attempt."""
 
     attempt: object
 
 
 def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings]:
-    """Decorate a function that returns settings: cache the result, with all numbers as jax arrays.
+    """Cache the settings that a function returns, with all their numbers as jax arrays.
 
-    The arguments must be hashable. Each precision of JAX has results of its own.
+    The function's arguments must be hashable. Results in float32 and float64 are cached separately.
     """
 
     def place(leaf: object) -> jax.Array:

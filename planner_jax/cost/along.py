@@ -21,10 +21,10 @@ from planner_jax.lanes import with_kernel
 from planner_jax.trajectory.polynomial import Motion
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, sample_motion
 
-BETWEEN_NODES = 0.004  # typical amount by which a peak between penalty nodes exceeds the nodes
+BETWEEN_NODES = 0.004  # typical difference of the excess at a peak and at the nearest sample
 
-# A function of a motion and of any pytree of numbers, and of no other array. It returns E arrays
-# with the shape of the motion's height, positive where a limit is exceeded.
+# A function of samples of a motion and of a pytree of numbers. It returns an array for each of E
+# limits, with the shape of the motion's height, positive where the limit is exceeded.
 Excess = Callable[[Motion, PyTree], tuple[Array, ...]]
 # A function of a motion and a pytree of numbers: it returns the cost per second at each sample.
 Rate = Callable[[Motion, PyTree], Array]
@@ -34,9 +34,10 @@ Rate = Callable[[Motion, PyTree], Array]
 class Along:
     """Constants of a planner that define its penalties: the integrand and the quadrature.
 
-    A segment's penalty is the integral, by the trapezoid rule, of the weighted smoothed hinges of
-    excess + margin, plus the integral of the rate if there is one. h is the mean duration of a
-    segment's pieces.
+    The penalty of a trajectory's segment is the integral, by the trapezoid rule, of the weighted
+    smoothed hinges of excess + margin, plus the integral of the rate if there is one. There are E
+    limits, K samples of a segment, and C columns (boundary rows and whitened waypoint offsets) that
+    define it. h is the mean duration of its pieces.
     """
 
     maps: ProportionalMinco
@@ -46,9 +47,9 @@ class Along:
     hinge_width: float
     # Cost per second of a case's extras, which need the whole position; kernels do not compute it.
     rate: Rate | None = None
-    # Number of derivatives, from the position on, that the excess needs: 4, or 5 with the snap.
+    # 4 if the excess depends on position, velocity, acceleration and jerk; 5 if also on the snap.
     orders: int = 4
-    # Groups of derivatives (order, axis) that occur together in limits, for `along_curvature`. The
+    # Groups of derivatives (order, axis) that occur together in a limit, for `along_curvature`. The
     # penalty is a sum of functions of one group each. By default all derivatives are one group.
     groups: tuple[tuple[tuple[int, int], ...], ...] = ()
     hinge_weights: tuple[float, ...] = ()  # (E,), weights of the hinges; 1 by default
@@ -69,17 +70,17 @@ class Along:
         return f"Along{(*shape, *code, *hinges, self.rate is None, self.orders)}"
 
     def matrices(self) -> np.ndarray:
-        """Return matrices (K, orders, C) from columns to samples, for 1 s mean piece duration."""
+        """Return matrices (K, orders, C) from C columns to K samples of a segment, for h = 1 s."""
         each = [self.maps.sample_matrix(self.nodes, d) for d in range(self.orders)]
         return np.stack(each, axis=1)
 
     def times(self) -> np.ndarray:
-        """Return the times (K,) of the samples, in units of h, the mean duration of a piece."""
+        """Return the times (K,) of a segment's K samples, in units of the mean piece duration."""
         steps = np.repeat(self.maps.proportions / self.nodes, self.nodes)
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def weights(self) -> np.ndarray:
-        """Return the samples' quadrature weights (K,), in units of h, a piece's mean duration."""
+        """Return the trapezoid weights (K,) of K samples, in units of the mean piece duration."""
         return join_trapezoid_weights(self.nodes, self.maps.proportions)
 
 
@@ -90,7 +91,8 @@ def integrate_along(
 
     Args:
         along: the excess functions and the quadrature.
-        columns: (N, C, 3) boundary rows (scaled end states) and whitened offsets of each segment.
+        columns: (N, C, 3), C columns of each segment: boundary rows (scaled states at its ends) and
+            whitened waypoint offsets.
         piece_durations: (N,) [s], mean duration h of the pieces of each segment.
         parameters: second argument of the excess functions, the same for all segments.
 
@@ -104,10 +106,10 @@ def integrate_along(
 def greatest_along(
     along: Along, columns: Array, piece_durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
-    """Return the greatest excess over each limit along N segments, E arrays (N,), differentiable.
+    """Return the greatest excess over each limit along N segments: one array (N,) for each limit.
 
-    The arguments are the same as for `integrate_along`. Peaks between the samples are estimated by
-    parabolas (`penalty.greatest_by_parabolas`).
+    The arguments are the same as for `integrate_along`. The result is differentiable. Peaks between
+    the samples are estimated by parabolas (`penalty.greatest_by_parabolas`).
     """
     return _greatest(along)(columns, piece_durations, parameters)
 
@@ -115,7 +117,7 @@ def greatest_along(
 def _with_kernel(
     function: Callable, along: Along, mode: str, jvp: Callable | None = None
 ) -> Callable:
-    """Bind a function to the constants `along`, and attach its kernel for a mode of `MODES`."""
+    """Bind a function to `along`, and attach its CUDA kernel, one of `along_kernel.MODES`."""
     path = "planner_jax.cost.along_kernel:along_kernel"
     return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
 
@@ -184,7 +186,7 @@ def _slopes(
 
 
 def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
-    """Return the results of `_slopes`, and derivatives by the parameters of each segment."""
+    """Return the results of `_slopes`, and the penalties' derivatives by the parameters."""
 
     def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
         value = functools.partial(_of_segment, along)
@@ -196,14 +198,13 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
-    """Return the derivative of `_slopes_by_all` along tangents; None keeps parameters fixed."""
+    """Return the derivative of `_slopes_by_all` along tangents; None stands for zero tangents."""
     moves = 2 if tangents[2] is None else 3
     slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]
 
 
 def _contract(slope: Array, tangent: Array) -> Array:
-    """Return the change (N,) of each segment's penalty along a tangent."""
     return jnp.sum(slope * tangent, axis=tuple(range(1, slope.ndim)))
 
 

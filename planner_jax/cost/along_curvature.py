@@ -1,4 +1,4 @@
-"""Penalties of `cost.along` with second derivatives, all or some of them, for Newton's method.
+"""Penalties of `cost.along` with first and second derivatives, for Newton's method.
 
 Samples are linear in a segment's columns (boundary rows and waypoint offsets), and a limit depends
 on few derivatives of the motion. So the Hessian is one product with a constant matrix for each pair
@@ -27,10 +27,11 @@ Slot = tuple[int, int]  # order of a derivative of the motion, and its axis
 
 @struct.dataclass
 class AlongCurvature:
-    """Penalties of one segment, with derivatives by its variable columns and theta = log h.
+    """Penalties of one segment, with derivatives by its C variable columns and theta = log h.
 
-    h is the mean duration of a piece. The first columns are fixed: they are rows of the initial
-    state, and the row of the d-th derivative is proportional to h^d.
+    Columns are boundary rows (scaled end states) and whitened waypoint offsets. h is the mean
+    duration of a piece. The first columns can be fixed: they are rows of the initial state, and the
+    row of the d-th derivative is proportional to h^d.
     """
 
     penalty: Array  # ()
@@ -39,8 +40,9 @@ class AlongCurvature:
     by_theta: Array  # ()
     columns_theta: Array  # (C, 3)
     theta_theta: Array  # ()
-    # Second derivatives at the K samples, the input of `columns_columns` and `block_and_diagonal`:
-    # an array (terms K, pairs) for all pairs of axes with the same terms (pairs of derivatives).
+    # Second derivatives at K samples, the input of `columns_columns` and `block_and_diagonal`. They
+    # are grouped by pairs of axes for which the same pairs of derivatives ("terms") occur together
+    # in limits: one array (terms * K, pairs of axes) for each group.
     at_samples: tuple[Array, ...]
 
 
@@ -109,7 +111,7 @@ def curvature_along(
 
 
 def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0) -> Array:
-    """Return a segment penalty's second derivatives by its variable columns, (C, 3, C, 3)."""
+    """Return second derivatives (C, 3, C, 3) of a segment's penalty by its C variable columns."""
     num = _constants(along, given).num_moving
     every = [(c, f) for c in range(num) for f in range(num)]
     return _square(_entries(along, given, every, at_samples), num)
@@ -118,9 +120,10 @@ def columns_columns(along: Along, at_samples: tuple[Array, ...], given: int = 0)
 def block_and_diagonal(
     along: Along, at_samples: tuple[Array, ...], num: int, given: int = 0
 ) -> tuple[Array, Array]:
-    """Return a penalty's second derivatives among the first E columns, and a diagonal.
+    """Return second derivatives of a segment's penalty by its C variable columns, but not all.
 
-    E is `num`, and the diagonal is of the others: shapes (E, 3, E, 3) and (C - E, 3).
+    They are the block (E, 3, E, 3) for the first E = `num` columns, and the diagonal (C - E, 3) for
+    the other columns.
     """
     among = [(c, f) for c in range(num) for f in range(num)]
     alone = [(c, c) for c in range(num, _constants(along, given).num_moving)]
@@ -133,7 +136,7 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Return penalties (K,), greatest excess, slopes (orders, K, 3), second derivatives (K,)."""
+    """Return penalties, greatest excess, and first and second derivatives at K samples."""
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)
@@ -171,7 +174,7 @@ def _at_samples(
 
 
 def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: Array) -> Array:
-    """Return the product of second derivatives at samples with a direction (orders, K, 3)."""
+    """Multiply the second derivatives at K samples by a direction (orders, K, 3)."""
     found = {}
     for group in groups:
         for one in group:
@@ -188,7 +191,7 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return a penalty's second derivatives by pairs of columns, for each pair of axes."""
+    """Return second derivatives of a penalty by the pairs of columns `places`, by pair of axes."""
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(
@@ -214,8 +217,9 @@ def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
 class _Constants:
     """Constant matrices of `curvature_along`; they are cached for each `Along`."""
 
-    # Three stacked maps from all columns to samples of all derivatives, (3 orders K, G + C). In the
-    # second map each fixed column is multiplied by d, its power of h; in the third map by d^2.
+    # Three stacked matrices from G fixed and C variable columns to K samples of all derivatives,
+    # (3 * orders * K, G + C). Fixed column d is proportional to h^d; it is multiplied by d in the
+    # second matrix and by d^2 in the third, for derivatives by log h.
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
@@ -257,7 +261,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return, for each group of pairs of axes, the matrix (places, terms K) that sums samples."""
+    """Return matrices (places, terms * K) that sum second derivatives at the K samples."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

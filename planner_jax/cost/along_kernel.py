@@ -1,8 +1,8 @@
-"""A CUDA kernel for `integrate_along` on many lanes, that is, problems of a batch.
+"""A CUDA kernel for `integrate_along`: penalties along the trajectories of many lanes (problems).
 
-One thread computes one lane: it reads a segment's columns, computes the samples one after another,
-and sums the penalties and their slopes (derivatives by the columns). If there are few lanes,
-several threads divide the samples of one lane among them.
+One thread computes one lane: it reads the columns (scaled end states and waypoint offsets) of a
+segment, computes its samples one after another, and sums the penalties and their derivatives. If
+there are few lanes, several threads divide the samples of one lane among them.
 """
 
 import dataclasses
@@ -27,7 +27,8 @@ from planner_jax.trajectory.polynomial import Motion
 
 _THREADS = 128  # threads of a block, one for each lane
 _ENOUGH = 512  # number of blocks that keeps a large GPU busy
-_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))  # axes of position (height only) to jerk
+# Axes that the kernel computes of position (height only), velocity, acceleration and jerk.
+_AXES = ((2,), (0, 1, 2), (0, 1, 2), (0, 1, 2))
 _WORST = 1  # index of the greatest excess among the results of a kernel
 
 # Results of a kernel: "values" are the sum of penalties and the greatest excess; "slopes" adds the
@@ -40,10 +41,10 @@ Vectors = list[list[Array]]  # columns, or derivatives of a motion, each with it
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """The division of a kernel's work into blocks, by trajectories and lanes (problems)."""
+    """The division of a kernel's work into blocks, by segments and lanes (problems of a batch)."""
 
     trajectories: int  # number of trajectories of each lane
-    num_columns: int  # C
+    num_columns: int  # number of columns (boundary rows and waypoint offsets) of a segment
     lanes: int
     threads: int  # number of threads of a block, one for each lane
 
@@ -67,8 +68,9 @@ def grid_of(
 ) -> tuple[Grid, tuple[int, ...]] | None:
     """Return the grid for a kernel's arguments, and the axes that `vmap` has put in front of them.
 
-    `leaves` are the leaves of all arguments. `points` has columns, durations and parameters of a
-    point and of a direction. The result is None if the kernel does not support the arguments.
+    `leaves` are the leaves of all arguments. `points` has the tuple (columns, durations,
+    parameters) of a point and, for the mode "curvature", of a direction. The result is None if the
+    kernel does not support the arguments.
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
@@ -95,10 +97,11 @@ def call_on_grid(
     name: str,
     interpret: bool,
 ) -> Callable[..., Sequence[Array]]:
-    """Make a function that runs a kernel; the first axis of its results is over parts of samples.
+    """Make a function that runs a kernel, whose threads each process a part of the samples.
 
-    `body` takes references to the leaves, to the `constants`, which every block reads, and to the
-    results. `shapes` are the results' shapes for one trajectory of one lane.
+    The results have a first axis over these parts. `body` takes references to the leaves, to the
+    `constants`, which every block reads, and to the results. `shapes` are the results' shapes for
+    one segment of one lane (problem of the batch).
     """
 
     def whole(shape: tuple[int, ...]) -> Block:
@@ -196,7 +199,7 @@ def _call(
 
 
 def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
-    """Return the shapes of a mode's results for one trajectory of one lane."""
+    """Return the shapes of a mode's results for one segment of one lane (problem)."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]
@@ -208,14 +211,14 @@ def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[
 
 
 def load_numbers(ref: Ref) -> PyTree:
-    """Load one number of each lane, or C columns of three numbers of each lane."""
+    """Load a number of each lane (problem), or each component of columns (C, 3) of each lane."""
     if len(ref.shape) != 3:
         return ref[...]
     return [[ref[c, axis] for axis in range(3)] for c in range(ref.shape[0])]
 
 
 def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
-    """Load a sample's row of the matrices: C factors for each of position to jerk."""
+    """Load a sample's row: C factors of the columns for each of position, ..., jerk."""
     return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
 
 
@@ -243,7 +246,7 @@ def unit_motion(row: Vectors, columns: Vectors) -> Vectors:
 class _Sample:
     """The constants of one sample: its row of the matrices, and its quadrature weight."""
 
-    row: Vectors  # C factors for each of position to jerk
+    row: Vectors  # factors of the C columns, for position, velocity, acceleration and jerk
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
@@ -268,7 +271,7 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Return a sample's greatest excess (None for "curvature"), and its summands of the results."""
+    """Return a sample's greatest excess, or None for "curvature", and its terms in the sums."""
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
     if mode == "values":
@@ -287,8 +290,8 @@ def _of_sample(
 def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, ...]:
     """Return the excess over each limit at one sample of a trajectory.
 
-    `unit`, of `unit_motion`, has height to jerk for a mean duration of 1 s. `given` has gravity and
-    limits.
+    `unit` is the result of `unit_motion`, and `duration` the mean duration [s] of a piece. `given`
+    holds gravity and limits.
     """
     rate = reciprocal(duration)
     rates = [rate, rate * rate, rate * rate * rate]
@@ -301,7 +304,7 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    """Return a sample's sum of hinges times the mean piece duration, and its greatest excess."""
+    """Return a sample's sum of smoothed hinges times `duration`, and its greatest excess."""
     excess = sample_excess(along, unit, duration, given)
     hinges = [
         factor * smooth_hinge(value + margin, along.hinge_width)
@@ -311,7 +314,7 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return the greatest excess, and the weighted penalty with its derivatives by `free`."""
+    """Return a sample's greatest excess, and its weighted penalty with derivatives by `free`."""
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 

@@ -57,7 +57,7 @@ def _size(vector: Numbers) -> Numbers:
 
 
 def _beside(vector: Numbers, pos: Numbers) -> Numbers:
-    """Return a vector (3,) with as many axes as positions (..., 3): (..., 3) with sizes 1."""
+    """Return a vector (3,) with leading axes of length 1, so that it broadcasts with `pos`."""
     return vector[(None,) * (pos.ndim - vector.ndim)]
 
 
@@ -85,7 +85,7 @@ class KeepOutBox:
     high: Numbers  # (3,) [m]
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
-        """Return the depth inside the box from its nearest face, over half of the shortest side."""
+        """Return the depth below the nearest face of the box, divided by half its shortest side."""
         low, high = _beside(self.low, pos), _beside(self.high, pos)
         half = 0.5 * (high - low)
         return (half - abs(pos - low - half)).min(-1) / half.min(-1)
@@ -159,7 +159,10 @@ class Dislike:
 
 
 def for_batch(extras: object, batch: tuple[int, ...], dtype: DTypeLike) -> tuple[Extra, ...]:
-    """Convert leaves of extras to a dtype with batch axes () or (B,), or raise `ArgumentError`."""
+    """Broadcast extras of one case to a batch, and convert their leaves to a dtype.
+
+    `batch` is () or (B,). Extras that have the batch axis already are only converted.
+    """
     if not isinstance(extras, Sequence) or isinstance(extras, str):
         raise ArgumentTypeError("extras", "a sequence of limits and costs", extras)
     for extra in extras:
@@ -202,7 +205,7 @@ def greatest_extras(
 ) -> tuple[Array, ...]:
     """Return the greatest excess () over each extra limit along a whole segment.
 
-    The maximum is not missed if the excess is concave between samples: see
+    It is never too small if the excess is concave between samples: see
     `penalty.greatest_by_tangents`. `maps`, `columns` and `duration` describe one segment, as for
     `cost.along`.
     """
@@ -226,7 +229,7 @@ def greatest_extras(
 
 
 def extra_rate(motion: Motion, given: tuple) -> PyTree:
-    """Return the cost per second (N,) of all extras, which are the last entry of `given`."""
+    """Return the cost per second (N,) at N samples of all extras, the last entry of `given`."""
     samples = motion.pos, motion.vel, motion.acc
     rates = (extra.cost(*samples) for extra in given[-1] if isinstance(extra, ExtraCost))
     return sum(rates, jnp.zeros_like(motion.height))

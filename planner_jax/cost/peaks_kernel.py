@@ -1,7 +1,7 @@
-"""A CUDA kernel for `greatest_along` on many lanes, that is, problems of a batch.
+"""A CUDA kernel for `greatest_along`: the greatest excess over each limit, for many lanes.
 
-One thread computes one lane, as in `along_kernel`. It computes the samples one after another and
-stores the excesses of the last two, to evaluate the parabola through each three neighbours.
+A lane is one problem of a batch. One thread computes one lane, as in `along_kernel`. It computes
+the samples one after another, and evaluates the parabola through each three neighbours.
 """
 
 import functools

@@ -10,9 +10,9 @@ from planner_jax.core.arithmetic import reciprocal
 
 
 def smooth_hinge(x: Array, width: float | Array | Array) -> Array:
-    """Return L_mu(x): 0 below 0, x - mu/2 above mu, a quartic between [Yu2023catch, eq. 27b].
+    """Return L_mu(x): 0 for x < 0, x - mu/2 for x > mu, a quartic between [Yu2023catch, eq. 27b].
 
-    It is twice continuously differentiable. mu is the `width`, > 0.
+    It is twice continuously differentiable. mu > 0 is the `width`.
     """
     # `where` is faster than `clip` and `maximum`, whose derivatives contain divisions.
     below = x < width
@@ -22,7 +22,7 @@ def smooth_hinge(x: Array, width: float | Array | Array) -> Array:
 
 
 def trapezoid_weights(num_intervals: int) -> np.ndarray:
-    """Return the weights (1/2, 1, ..., 1, 1/2) / n of the trapezoid rule on [0, 1], float64."""
+    """Return the trapezoid rule's weights (1/2, 1, ..., 1, 1/2) / n for n intervals of [0, 1]."""
     weights = np.ones(num_intervals + 1)
     weights[[0, -1]] = 0.5
     return weights / num_intervals
@@ -31,7 +31,7 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
 def join_trapezoid_weights(
     num_intervals: int, proportions: np.ndarray | Sequence[float]
 ) -> np.ndarray:
-    """Return trapezoid weights (M n + 1,) of M pieces of n intervals with common end nodes."""
+    """Return trapezoid weights (M n + 1,) of M pieces with n intervals; neighbours share a node."""
     weights = np.zeros(len(proportions) * num_intervals + 1)
     for i, share in enumerate(proportions):
         span = slice(i * num_intervals, (i + 1) * num_intervals + 1)
@@ -40,7 +40,7 @@ def join_trapezoid_weights(
 
 
 def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
-    """Return the maximum () of samples (K,) and of the parabolas through each three neighbours.
+    """Return the maximum () of K samples and of the parabolas through each three neighbours.
 
     For a smooth quantity the error is of third order in the step. `times` (K,) are in any unit.
     """
@@ -52,7 +52,7 @@ def greatest_by_parabolas(values: Array, times: np.ndarray) -> Array:
 def peak_above(
     left: Array, middle: Array, right: Array, before: Array | np.ndarray, after: Array | np.ndarray
 ) -> Array:
-    """Return the height >= 0 of a parabola's peak above the middle one of three samples on it.
+    """Return the height >= 0 above the middle sample of the peak of a parabola through three.
 
     It is 0 if the peak is not between the outer samples, and at most half of the samples' range.
     The left sample is a time `before` the middle sample, and the right sample a time `after` it.
@@ -66,7 +66,7 @@ def peak_above(
 
 
 def greatest_by_tangents(values: Array, slopes: Array, step: Array) -> Array:
-    """Return the maximum () of samples (K,) and of intersections of neighbouring tangents.
+    """Return the maximum () of K samples and of intersections of neighbouring tangents.
 
     `slopes` (K,) are time derivatives, and samples are a time `step` apart. The result is never
     below the true peak if the quantity is concave between samples.

@@ -25,7 +25,7 @@ from planner_jax.trajectory.proportional_minco import ProportionalMinco
 
 
 def _size_squared(vector: Components) -> Array:
-    """Return |v|^2 of vectors (..., 3), without a sum over an axis, for which XLA adds a loop."""
+    """Return |v|^2 of vectors (..., 3); for a sum over an axis XLA would compile one more loop."""
     x, y, z = components(vector)
     return x * x + y * y + z * z
 
@@ -45,13 +45,16 @@ def acceleration_excess(acc: Components, limits: QuadrotorLimits) -> Array:
 def body_rate_excess(
     acc: Components, jerk: Components, gravity: Array, limits: QuadrotorLimits
 ) -> Array:
-    """Return |omega|^2 / omega_max^2 - 1 for body rates omega by flatness [Yu2023bat, eq. 18a]."""
+    """Return |omega|^2 / omega_max^2 - 1 for the body rates omega [rad/s] [Yu2023bat, eq. 18a].
+
+    omega follows from acceleration and jerk, since the quadrotor is differentially flat.
+    """
     rate_squared = body_rate_squared(acc, jerk, gravity)
     return rate_squared * reciprocal(limits.body_rate) ** 2 - 1.0
 
 
 def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
-    """Return z_min - z [m] for heights z (...) [m], as [Yu2023catch, eq. 28] without the square."""
+    """Return z_min - z [m] for heights z [m] [Yu2023catch, eq. 28, without its square]."""
     return limits.min_height - height
 
 
@@ -71,7 +74,7 @@ def relative(squared_excess: Array) -> Array:
 def thrust_excess(
     acc: Components, gravity: Array, least: Array, most: Array
 ) -> tuple[Array, Array]:
-    """Return 1 - f^2 / least^2 and f^2 / most^2 - 1 of thrusts f [m/s^2] for `acc` (..., 3)."""
+    """Return 1 - f^2 / least^2 and f^2 / most^2 - 1 for the thrust f per mass [m/s^2]."""
     x, y, z = components(acc)
     squared = _size_squared((x, y, z + gravity))
     return 1.0 - squared * reciprocal(least) ** 2, squared * reciprocal(most) ** 2 - 1.0
@@ -130,7 +133,7 @@ class Measure(enum.Enum):
 
 
 def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return the rotors' thrusts above maximum, then below minimum, divided by the maximum."""
+    """Return each rotor's thrust above the maximum, then below the minimum, over the maximum."""
     rotors = limits.rotors
     assert rotors is not None
     thrusts = rotor_thrusts(motion.acc, motion.jerk, motion.snap, gravity, rotors)
@@ -141,7 +144,7 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """A group of limits that a quadrotor has either completely or not at all."""
+    """One or more limits that belong to one field of `QuadrotorLimits`; the field may be None."""
 
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
@@ -178,12 +181,11 @@ _KINDS = (
 
 
 def _kinds(limits: QuadrotorLimits) -> list[_Kind]:
-    """Return the groups of limits that a quadrotor has."""
     return [kind for kind in _KINDS if vars(limits)[kind.field] is not None]
 
 
 def flight_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return the excess (N,) over each existing limit, in the order of `flight_measures`."""
+    """Return the excess (N,) at N samples over each limit that is set, in a fixed order."""
     return tuple(
         excess for kind in _kinds(limits) for excess in kind.excess(motion, gravity, limits)
     )
@@ -195,7 +197,7 @@ def flight_measures(limits: QuadrotorLimits) -> tuple[Measure, ...]:
 
 
 def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
-    """Return, for each entry of `flight_excess`, the name of its field in `QuadrotorLimits`."""
+    """Return the name of the field of `QuadrotorLimits` for each entry of `flight_excess`."""
     return tuple(kind.field for kind in _kinds(limits) for _ in kind.measures)
 
 
@@ -233,7 +235,7 @@ def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
 def greatest_excess(
     maps: ProportionalMinco, nodes: int, columns: Array, durations: Array, case: QuadrotorCase
 ) -> list[Array]:
-    """Return the greatest relative excess over each limit in N segments of a plan, (N,) each.
+    """Return the greatest relative excess over each limit: an array (N,) for N segments of a plan.
 
     Peaks between samples are included, by parabolas for limits of flight and by tangents for
     extras. The other arguments are as for `greatest_along`.

@@ -39,7 +39,7 @@ def keep_compiled_programs() -> Path | None:
 
     chosen = jax.config.jax_compilation_cache_dir  # type: ignore[attr-defined]
     if os.environ.get(SWITCH) != "off" and jax.config.jax_enable_compilation_cache:  # type: ignore[attr-defined]
-        # An entry that cannot be read or written costs a compilation, not the run.
+        # If JAX cannot read or write a file of the cache, it compiles the program: not an error.
         warnings.filterwarnings("ignore", "Error (reading|writing) persistent compilation cache")
         if chosen is None:
             chosen = cache_folder()

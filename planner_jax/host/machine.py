@@ -59,7 +59,7 @@ def free_disk(folder: str | os.PathLike) -> int | None:
 
 
 def format_size(size: float) -> str:
-    """Format a number of bytes as text with a unit."""
+    """Format a number of bytes with three digits and a decimal unit, such as "1.54 GB"."""
     for unit in ("B", "kB", "MB", "GB"):
         if size < 1e3:
             return f"{size:.3g} {unit}"
@@ -100,7 +100,7 @@ def threads_of_a_computation() -> int:
 
 @functools.cache
 def processor() -> str:
-    """Return the processor's name and vector instructions, which affect results' last digits."""
+    """Return the processor's name and widest vector instructions, such as "... (avx2)"."""
     entries: dict[str, str] = {}
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")

@@ -48,7 +48,7 @@ def kernels() -> Kernels:
 
 
 def in_use() -> bool:
-    """Return whether a function that is being traced gets kernels; raises as `kernels` does."""
+    """Return whether functions traced by JAX use kernels: they are on, with Triton and a GPU."""
     return is_switched_on() and has_gpu() and _has_triton()
 
 
@@ -58,7 +58,7 @@ def has_gpu() -> bool:
 
 
 def is_switched_on() -> bool:
-    """Return whether the environment variable allows kernels; raises as `kernels` does."""
+    """Return whether PLANNER_JAX_KERNELS is "on" or not set; raise if it is not on or off."""
     value = os.environ.get(SWITCH, "on")
     if value not in ("on", "off"):
         raise ArgumentError(SWITCH, "one of on, off", value)

@@ -1,8 +1,9 @@
 """`over_lanes`: it works as `jax.vmap`, but keeps the batch axis last in every array.
 
-A lane is one problem of the batch. With the lanes last, neighbours in memory are the same number of
-different lanes. Then every read is one whole line of memory, a sum over samples needs no exchange
-between threads, and the product with a constant matrix is one large product.
+A lane is one problem of the batch. With the lanes last, a number is stored next to the same number
+of the next lane. Neighbouring GPU threads, one for each lane, then read neighbouring addresses, a
+sum over samples needs no exchange between threads, and multiplying by a constant matrix is one
+large product.
 """
 
 import functools
@@ -23,8 +24,8 @@ Results = TypeVar("Results")
 _CALLS = frozenset(
     "checkpoint closed_call core_call custom_jvp_call custom_vjp_call jit pjit remat2".split()
 )
-# Operations that return their operands unchanged. In a program for several devices `jnp.where` and
-# others use `reshard` to mark arrays as local to a device; within one lane all arrays are local.
+# Operations that return their operands unchanged. In a program for several devices `reshard` marks
+# arrays as local to a device. The arrays of one lane are local already.
 _UNCHANGED = frozenset("copy copy_p reshard stop_gradient".split())
 _ELEMENTWISE = frozenset(
     "abs acos add add_any and asin atan atan2 cbrt ceil clamp convert_element_type "
@@ -32,7 +33,7 @@ _ELEMENTWISE = frozenset(
     "lt max min mul ne neg not or pow reduce_precision rem round rsqrt select_n sign sin sinh "
     "sqrt square sub tan tanh xor".split()
 )
-# Operations whose parameters count axes from the front, so that a last axis changes nothing.
+# Operations whose parameters number axes from the front, and stay valid with one more last axis.
 _BY_AXIS = frozenset(
     "argmax argmin cumlogsumexp cummax cummin cumprod cumsum reduce_and reduce_max reduce_min "
     "reduce_or reduce_prod reduce_sum rev sort split squeeze unstack concatenate stack".split()
@@ -77,14 +78,14 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
 
 
 def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    """Return a value as an array (*shape, lanes); a value common to all lanes is repeated."""
+    """Return a value as an array (*shape, lanes); repeat a value that all lanes have in common."""
     if isinstance(value, _Lanes):
         return value.array
     return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    """Evaluate a function of one lane for all lanes; arguments and results have them last."""
+    """Evaluate a function of one lane for all lanes, the last axis of arguments and results."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]

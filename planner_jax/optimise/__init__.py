@@ -1,1 +1,1 @@
-"""Batched L-BFGS, Newton and least-squares solvers, scaling, and gradients of an optimum."""
+"""Solvers for batches (L-BFGS, Newton, least squares), base planners, gradients of optima."""

@@ -42,13 +42,13 @@ _ORDER = 4  # derivative whose square is minimised: snap
 
 @struct.dataclass
 class ChainEnds:
-    """Durations and states at the ends of N segments, computed from the end variables."""
+    """Durations and final states of N trajectory segments, computed from the end variables."""
 
     durations: Float[Array, " N"]  # [s], of the segments
     tail_states: Float[Array, "N 4 3"]  # position to jerk of the quadrotor at the segments' ends
     total_time: Float[Array, ""]  # [s], sum of the durations of the segments that the case uses
     excess: Float[Array, "..."]  # relative excess over the limits at the ends; feasible if <= 0
-    contact: PyTree = None  # data of the ends that the task stores in its plan
+    contact: PyTree = None  # data of the contacts (such as an impact) that the plan stores
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,11 +69,12 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     shipped_name: ClassVar[str] = "exact"  # first part of the scales' names in the package
     num_end_variables: ClassVar[int]  # K, for each segment
     guess_table: ClassVar[np.ndarray]  # one row for each starting point, best first
-    # Numbers of intervals of each piece at which finished plans are checked, with one segment and
-    # with several. Body rates peak sharply where the thrust is small, as happens between catches.
+    # Numbers of intervals of each piece at which finished plans are checked: with one segment, with
+    # several. Several need more, as body rates peak sharply where the thrust is small, between
+    # two catches.
     decode_nodes: ClassVar[tuple[int, int]] = (32, 48)
-    proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of the pieces
-    nodes: int = 8  # intervals of each piece at whose ends the penalties are evaluated
+    proportions: tuple[float, ...] = (1.0,) * 6  # relative durations of a segment's pieces
+    nodes: int = 8  # number of intervals of each piece, at whose ends penalties are evaluated
     time_weight: float = 0.005
     energy_weight: float = 3e-8
     margin: float = 0.03  # relative distance from a limit at which penalties start
@@ -91,11 +92,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def meet(self, natural: Float[Array, "N K"], context: PyTree) -> ChainEnds:
-        """Return the segments' durations and end states for end variables in SI units."""
+        """Return durations and final states of N segments from their K end variables (SI units)."""
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return guessed end variables of the first `num` starting points, in SI units."""
+        """Return guesses of N segments' K end variables (SI units) for `num` starting points."""
 
     @abc.abstractmethod
     def make_plan(
@@ -109,11 +110,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the penalties at the segments' ends, relative to the time integrals."""
+        """Factor [s] on the penalties at the segments' ends, which are added to time integrals."""
         return 0.0
 
     def active(self, context: PyTree) -> Bool[Array, " N"]:
-        """Return which of the N segments the case uses."""
+        """Return which of the N segments the case uses: one for each target of a catch."""
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
@@ -121,29 +122,29 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:
-        """Return the network that improves the first starting point of such cases, or None."""
+        """Return the network that improves the first starting point of a case, or None."""
         return None
 
     def start_features(self, context: PyTree) -> Float[Array, " F"]:
-        """Return the features of a case that are the inputs of the start network."""
+        """Return the F features of a case that are the inputs of the start network."""
         raise NotImplementedError
 
     def limit_learned(self, point: Float[Array, " n"]) -> Float[Array, " n"]:
-        """Limit a starting point of the network to values that a search can still change."""
+        """Clip the starting point that the network proposes; by default it is unchanged."""
         return point
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return the units of all variables; a subclass adds units that `scale` lacks."""
+        """Return the units of a segment's variables; a subclass may append to a short `scale`."""
         return scale
 
     @property
     def _usual_scale(self) -> tuple[float, ...]:
-        """Measured units of the variables of a segment with this number of pieces."""
+        """Measured units of a segment's variables, from the file `measured_scales.json`."""
         return load_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
 
     @property
     def num_pieces(self) -> int:
-        """M, the number of pieces of a segment."""
+        """Number of polynomial pieces of a segment."""
         return len(self.proportions)
 
     @property
@@ -157,7 +158,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return starting points (smoothest trajectories); a network may improve the first."""
+        """Return `num` starting points with zero offsets; a network may improve the first one."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
@@ -171,7 +172,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Split a point into whitened offsets (N, O, 3) and end variables (N, K) in SI units."""
+        """Split a point into N segments' offsets (N, O, 3) and end variables (N, K) in SI units."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
@@ -189,12 +190,12 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
     def evaluate_ends(
         self, natural: Float[Array, "N K"], context: PyTree
     ) -> tuple[Array, Array, Array, Array]:
-        """Compute the part of the objective that depends on the end variables alone.
+        """Compute the part of the objective that depends only on K end variables of N segments.
 
         Returns:
             Boundary rows (N, 8, 3), which are scaled states at both ends of the segments; mean
-            durations of a piece (N,) [s]; the cost () that depends on the end variables alone; and
-            the greatest excess at the ends ().
+            durations of a piece (N,) [s]; the part of the cost (); and the greatest excess over a
+            limit at the ends ().
         """
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces
@@ -212,7 +213,10 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:
-        """Return the cost, and the largest excess at the nodes: mostly q^2 / limit^2 - 1."""
+        """Return the cost and the violation: the largest excess over a limit at the samples.
+
+        For most quantities q the excess is q^2 / limit^2 - 1.
+        """
         case = context.case
         offsets, natural = self.split(point)
         rows, durations, core, at_ends = self.evaluate_ends(natural, context)
@@ -251,7 +255,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         )
 
     def decode(self, point: Float[Array, " n"], context: PyTree) -> PlanT:
-        """Return the plan at a point; its violation is found at and between `decode_nodes`."""
+        """Return the plan at a point; its violation includes peaks between the samples."""
         offsets, natural = self.split(point)
         ends = self.meet(natural, context)
         durations = ends.durations / self.num_pieces

@@ -20,8 +20,8 @@ from planner_jax.optimise.preconditioner import block_preconditioner
 from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
-# A function of the end variables (N, k). It returns boundary rows (N, 2s, 3), mean durations of a
-# piece (N,) [s], the cost of the ends (), and the greatest excess at the ends ().
+# A function of k end variables of each of N segments, (N, k). It returns boundary rows (N, 2s, 3),
+# mean durations of a piece (N,) [s], the cost of the ends (), and the greatest excess there ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 
@@ -45,12 +45,12 @@ def chain_curvature(
     preconditioner contains those among the end variables, and the diagonal for the offsets.
 
     Args:
-        maps: constants of a segment; M pieces, s = order.
+        maps: constants of a segment of M pieces that minimises its squared s-th derivative.
         along: penalties along the trajectory.
         ends: function of the end variables. The first variable of each segment is the logarithm of
             its duration and affects nothing else. The first segment's initial state is fixed.
         found: result of `ends` at `natural`.
-        natural: (N, k) end variables.
+        natural: (N, k), k end variables of each of N segments, in SI units.
         offsets: (N, M - 1, 3) whitened waypoint offsets.
         scale: (3 (M - 1) + k,) units of one segment's variables.
         parameters: gravity, limits and extras of the case, for the functions in `along`.
@@ -58,7 +58,7 @@ def chain_curvature(
         active: (N,) bool, the segments that exist.
 
     Returns:
-        The `violation` is the greatest excess, of the ends or of the nodes, plus `BETWEEN_NODES`.
+        The evaluation's `violation` is the greatest excess at ends or samples + `BETWEEN_NODES`.
     """
     rows, durations, core, excess = found
     num, order, power = natural.shape[0], maps.order, 2 * maps.order - 1
@@ -89,7 +89,8 @@ def chain_curvature(
     unit = jnp.asarray(np.eye(natural.size), natural.dtype)
     tangent = lambda unit: jax.jvp(slope, (natural.ravel(),), (unit,))  # noqa: E731
     (by_natural, _), (within, turned) = jax.vmap(tangent, out_axes=((None, None), 0))(unit)
-    # `within`: Hessian (N k, N k) of `pull_back`; `turned`: Jacobian of rows (N k, N, rows, 3).
+    # For N k end variables: `within` is the Hessian (N k, N k) of `pull_back`, and `turned` the
+    # Jacobian (N k, N, num_rows, 3) of the boundary rows of N segments.
     dot = functools.partial(jnp.tensordot, precision=lax.Precision.HIGHEST)
     einsum = functools.partial(jnp.einsum, precision=lax.Precision.HIGHEST)
     theta_theta = of.theta_theta + power**2 * energies

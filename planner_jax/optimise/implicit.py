@@ -1,8 +1,8 @@
 """Gradients of an optimal plan by the implicit function theorem, for `pj.optimal_plan`.
 
-At an optimum u*(theta) the gradient of the objective J vanishes, so
-du*/dtheta = -J_uu^-1 J_utheta. This takes one linear solve with the Hessian J_uu, for any number of
-iterations that found u*; the iterations are not differentiated.
+Let theta be the numbers of the case, and u* the variables that minimise the objective J(u, theta).
+There the gradient J_u vanishes, so du*/dtheta = -J_uu^-1 J_utheta. This takes one linear solve with
+the Hessian J_uu. The solver's iterations are not differentiated.
 """
 
 import functools
@@ -42,9 +42,9 @@ def newton_refine(
     """Move a nearly stationary point (n,) to the local optimum near it, by damped Newton steps.
 
     Negative eigenvalues of the Hessian are replaced by their absolute values. A step is accepted if
-    it lowers the cost, or if it lowers the gradient at a cost that is equal up to rounding.
-    Otherwise the damping grows. The refinement ends after `max_steps` Hessians, or when the norm of
-    the gradient () is at most `stationarity`. This norm is the second result.
+    it lowers the cost, or if it lowers the gradient's norm at a cost that is equal up to rounding.
+    Otherwise the damping grows. The refinement ends after `max_steps` steps, or when the norm of
+    the gradient is at most `stationarity`. This norm () is the second result.
     """
 
     def gradient(x: Array) -> tuple[Array, tuple[Array, Array]]:
@@ -126,7 +126,7 @@ def optimal_plan(
     solver = solver or LbfgsConfig(max_steps=200, tolerance=1e-7, patience=6)
     context = minimiser.prepare(case)
     start = lax.stop_gradient(minimiser.guesses(context, 1)[0])
-    # A gradient smaller than this number, relative to the cost, can be due to rounding alone.
+    # A gradient with a norm below this multiple of the cost can be due to rounding errors alone.
     stationarity = 1e2 * float(jnp.finfo(start.dtype).eps)
 
     def cost(point: Array) -> Array:

@@ -24,9 +24,9 @@ from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 
 @struct.dataclass
 class Memory:
-    """The newest m pairs of a step and the change of the gradient along the step, newest last."""
+    """The last m steps of a search in n variables, and the changes of the gradient along them."""
 
-    steps: Array  # (m, n), s_k of [Liu1989]
+    steps: Array  # (m, n), s_k of [Liu1989], newest last
     changes: Array  # (m, n), y_k
     inverse_curvature: Array  # (m,), 1 / s.y; 0 where no pair is stored
 
@@ -74,9 +74,9 @@ def init(point: Array, config: LbfgsConfig) -> LbfgsState:
 
 
 def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Array, Array]:
-    """Decide from s.y, y.y and s.s whether a new pair (step s, change of gradient y) is stored.
+    """Decide whether a new pair (step s, change of gradient y) is stored, given s.y, y.y and s.s.
 
-    Returns whether the curvature s.y is positive, so that the pair is stored; whether the step is
+    Returns whether the pair is stored, because the curvature s.y is positive; whether the step is
     longer than zero; and 1 / s.y if the pair is stored, otherwise 0.
     """
     keep = curvature > 1e-8 * change
@@ -84,14 +84,18 @@ def weigh_pair(curvature: Array, change: Array, step: Array) -> tuple[Array, Arr
 
 
 def start_scale(newest: Array, change: Array, grad: Array) -> Array:
-    """Return gamma = s.y / y.y of the newest pair, given 1 / s.y and y.y; without one, 1 / |g|."""
+    """Return the initial scale of the two-loop recursion: s.y / y.y of the newest stored pair.
+
+    `newest` is 1 / s.y, and `change` is y.y. Without a pair the scale is 1 / sqrt(`grad`), where
+    `grad` is the squared norm of the gradient.
+    """
     size = change * newest
     slope = jnp.sqrt(jnp.maximum(grad, 1e-30))
     return jnp.where(newest > 0.0, 1.0 / jnp.where(newest > 0.0, size, 1.0), 1.0 / slope)
 
 
 def shortening(squared_length: Array, step_cap: float) -> Array:
-    """Return the factor <= 1 that limits a direction of this squared length to `step_cap`."""
+    """Return the factor <= 1 that shortens a vector of this squared length to `step_cap`."""
     return jnp.minimum(1.0, step_cap / jnp.sqrt(jnp.maximum(squared_length, 1e-30)))
 
 
@@ -115,10 +119,10 @@ def remember(memory: Memory, step: Array, change: Array) -> Memory:
 
 
 def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
-    """Return the quasi-Newton direction -H g (n,), at most as long as the step cap.
+    """Return the quasi-Newton direction -H g (n,) for the gradient g, not longer than `step_cap`.
 
-    Without a stored pair the direction is steepest descent with length 1. This is a sensible
-    length for any size of the gradient, because the variables are scaled.
+    H approximates the inverse Hessian by the stored pairs. Without a stored pair the direction is
+    steepest descent with length 1, as the variables are in units of moderate steps.
     """
     q = grad
     alphas = []
@@ -148,10 +152,11 @@ def _turn(num_pairs: int, step_cap: float) -> Callable:
 
 
 def step(objective: Objective, state: LbfgsState, config: LbfgsConfig) -> LbfgsState:
-    """Return the state after one iteration: gradient, memory, direction, and the best trial step.
+    """Return the state after one iteration of L-BFGS.
 
-    The gradient is evaluated first, so that k iterations take exactly k gradients. A finished
-    problem of a batch keeps its point; only its memory and gradient change, without effect.
+    An iteration evaluates the gradient, updates the memory of pairs, computes a direction, and
+    takes the trial step along it with the least cost. A finished problem of a batch keeps its
+    point; its memory and gradient are updated, but not used.
     """
 
     def value(point: Array) -> tuple[Array, Array]:
@@ -201,7 +206,7 @@ class _Choice:
 def _choose(
     config: LbfgsConfig, numbers: LbfgsNumbers, here: Evaluation, lengths: Array, trials: Evaluation
 ) -> _Choice:
-    """Select the cheapest of the trial points (k,), if it costs less than the current point."""
+    """Select the trial point of least cost, if it costs less than the current point `here`."""
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     is_chosen = jnp.arange(costs.size) == jnp.argmin(costs)
 

@@ -20,7 +20,7 @@ _LANES, _THREADS = 32, 128  # problems and threads of a CUDA block
 
 
 def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> Callable:
-    """Make the CUDA kernel that does `lbfgs.remember` and then `lbfgs.search_direction`."""
+    """Make the CUDA kernel that computes `lbfgs.remember`, then `lbfgs.search_direction`."""
 
     def kernel(treedef: Treedef, leaves: Sequence[Array]) -> Sequence[Array] | None:
         grad = leaves[-1]
@@ -58,7 +58,7 @@ def _call(
         keep, moved, inverse = weigh_pair(dot(step, change), dot(change, change), dot(step, step))
         none = jnp.zeros_like(inverse)
 
-        # The newest pair comes first. If the new pair is stored, pair k + 1 moves to index k.
+        # The loop takes the newest pair first. A new pair moves pair k + 1 of the memory to k.
         alphas, kept, q, behind, later = [], [], grad, [step, change], inverse
         for k in reversed(range(num_pairs)):
             old, earlier = [read(steps, k), read(changes, k)], inverses[k]

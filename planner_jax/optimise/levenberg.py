@@ -1,9 +1,9 @@
 """Levenberg-Marquardt: least squares of few unknowns, one Cholesky factorisation a step.
 
-The method suits costs that are sums of squared residuals with known Jacobians J, such as hinges on
-limits. The curvature J'J is then accurate enough to finish in a dozen steps, where a quasi-Newton
-method takes many more. Each step tries one point. If it costs less, it is accepted, and the damping
-is reduced for the next step. Otherwise it is rejected, and the damping is increased.
+The method suits costs that are sums of squared residuals with known Jacobians J. The curvature J'J
+is then accurate enough to finish in a dozen steps, where a quasi-Newton method takes many more.
+Each step evaluates one new point. If its cost is lower, it is accepted, and the damping is reduced
+for the next step. Otherwise it is rejected, and the damping is increased.
 """
 
 import dataclasses
@@ -42,7 +42,8 @@ class LevenbergConfig:
     # less than the fraction `tolerance`.
     settled: int = 2
     tolerance: float = 1e-2
-    # k steps after step `trial`, a search is aborted if its cost exceeds hope * fade^k.
+    # The search is aborted if, k >= 0 steps after step number `trial`, its cost exceeds
+    # hope * fade^k. None for `hope`: it is never aborted.
     trial: int = 0
     hope: float | None = None
     fade: float = 1.0
@@ -72,8 +73,8 @@ def least_squares(
 
 def start_search(start: Array, config: LevenbergConfig) -> LevenbergState:
     """Return the initial state of a search from `start` (n,), before any evaluation."""
-    # The first step has length zero and evaluates the start. If the start were evaluated here, the
-    # model would be compiled twice.
+    # With a zero gradient the first step has length zero and evaluates the start. If the start were
+    # evaluated here, XLA would compile the function `evaluate` twice.
     zero = jnp.zeros((), start.dtype)
     nothing = Model(
         cost=zero + jnp.inf,
@@ -115,7 +116,7 @@ def _step(
     evaluate: Callable[[Array], Model], state: LevenbergState, config: LevenbergConfig
 ) -> LevenbergState:
     model = state.model
-    # All unknowns have the same damping > 0. An unknown without effect on the residuals then stays.
+    # All unknowns have the same damping > 0, so an unknown without effect on the cost is unchanged.
     scale = jnp.mean(jnp.diagonal(model.curvature)) * state.damping
     damped = model.curvature + scale * jnp.eye(state.point.size, dtype=state.point.dtype)
     change = -cho_solve(cho_factor(damped), model.gradient)

@@ -117,7 +117,7 @@ def minimise_lanes(
 
 
 def _has_steps(config: Solver, num: int) -> bool:
-    """Return whether the settings state this number of iterations, and not at run time."""
+    """Return whether the number of iterations is `num` and is known when JAX traces the search."""
     return isinstance(config.max_steps, int) and config.max_steps == num
 
 
@@ -138,7 +138,7 @@ def _step(objective: Objective, curved: Curved | None, state: PyTree, config: So
 
 
 def _with_stragglers(config: NewtonConfig) -> NewtonConfig:
-    """Return the settings with the total number of iterations that a slow problem may take."""
+    """Add the iterations of all groups of stragglers (slow problems) to `max_steps`."""
     if config.stragglers is None:
         return config
     _, steps, groups = config.stragglers
@@ -155,7 +155,6 @@ def _optimum_of(state: PyTree, config: Solver) -> Optimum:
 
 
 def _optimum_at(point: Array, evaluation: Evaluation, config: Solver) -> Optimum:
-    """Return the start itself as the optimum, for a search without iterations."""
     stationary = jnp.full((), config.patience == 0)
     return Optimum(point, evaluation, jnp.zeros((), jnp.int32), stationary)
 
@@ -233,7 +232,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches of a round in order; the last one is the round's own search."""
+    """Return the searches of a round in order: preliminary stages, then the round's own search."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 
@@ -245,14 +244,13 @@ def _of_each(function: Callable, starts: PyTree) -> PyTree:
 
 
 def _repeat(contexts: PyTree, num: int) -> PyTree:
-    """Repeat the context of each case `num` times, once for each start of the case."""
     if num == 1:
         return contexts
     return jax.tree.map(lambda x: jnp.repeat(x, num, axis=-1), contexts)
 
 
 def _cheapest(costs: Array, num: int) -> Array:
-    """Return the indices (num,) of the least of the costs (S,); non-finite costs come last."""
+    """Return the indices (num,) of the `num` least costs; costs that are not finite come last."""
     return jnp.argsort(jnp.where(jnp.isfinite(costs), costs, jnp.inf))[:num]
 
 
@@ -267,6 +265,5 @@ def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> 
 
 
 def _best(plans: PyTree) -> PyTree:
-    """Select the best plan of a case from the plans of its starts."""
     best = index_of_best(plans)
     return jax.tree.map(lambda leaf: leaf[best], plans)

@@ -9,15 +9,15 @@ feasible iterate. A lane is one problem of the batch.
 Few vectors are enough if the planner has a preconditioner, an inverse of the dominant part of the
 Hessian. There are two kinds of damping. First, each lane has its own damping, a multiple of the
 identity that is added to the Hessian. Far from the optimum it turns the step towards the negative
-gradient. Second, several multiples of the preconditioner's curvature are tried at once, for a few
-operations each. A search for the best multiple would, under `vmap`, continue until the slowest lane
-is done. The best multiple determines the lane's next damping. The damping fades towards the
-optimum, and the last steps are undamped Newton steps, also along flat valleys.
+gradient. Second, several multiples of the preconditioner's curvature are tried at once, which takes
+few operations. (A line search under `vmap` would continue until the slowest lane is done.) The best
+multiple determines the lane's next damping. The damping decreases towards the optimum, where the
+last steps are undamped Newton steps.
 
 Near an optimum the costs of two points differ by less than their rounding errors, while gradients
 still show where the optimum is. With a `slack` > 0 a step may raise the cost by a rounding error,
-as in the approximate Wolfe conditions [Hager2005]. Among such steps the least damped one is taken,
-until steps make no progress.
+as in the approximate Wolfe conditions [Hager2005]. Among the steps of equal cost up to this error,
+the least damped one is taken.
 """
 
 import functools
@@ -39,7 +39,7 @@ from planner_jax.optimise.settings import (
 )
 
 _HIGHEST = lax.Precision.HIGHEST
-_HALVINGS = 14  # bisections of the interval that contains the least eigenvalue
+_HALVINGS = 14  # number of bisections of the interval that contains the least eigenvalue
 _LEAST_DAMPING = 1e-10  # least damping of one problem of the batch
 _LEAST = 1e-7  # least pivot, relative to the greatest entry of its matrix
 
@@ -123,9 +123,10 @@ def most_to_gain(numbers: NewtonNumbers, config: NewtonConfig, num: int) -> Arra
 def step(
     objective: Objective, curved: Curved, state: NewtonState, config: NewtonConfig
 ) -> NewtonState:
-    """Return the state after one iteration: gradient, subspace, and the best of all damped steps.
+    """Return the state after one iteration of Newton's method.
 
-    A finished problem of a batch keeps its point.
+    An iteration computes derivatives, a subspace and one step for each trial damping, and takes
+    the step to the least cost. A finished problem of a batch keeps its point.
     """
     here = curved(state.point)
     steps, decrease = solve_damped(here, state.numbers.damping, config)
@@ -178,14 +179,15 @@ def _lanczos(
 ) -> tuple[Array, list[Array], list[Array]]:
     """Return directions (m, n) of the subspace, and the damped Hessian in it.
 
-    The directions are orthonormal with respect to the preconditioner's curvature M. The Hessian is
-    returned as its diagonal, m numbers, and its subdiagonal, m - 1 numbers. `turned` is
-    M^-1 gradient, and `size` is sqrt(gradient . turned). `image` returns the Hessian's product with
-    a direction, and M^-1 of this product.
+    The subspace has m dimensions, at most `num`. The directions are orthonormal with respect to the
+    matrix M whose inverse is the preconditioner. The Hessian is returned as its diagonal, m
+    numbers, and its subdiagonal, m - 1 numbers. `turned` is M^-1 gradient, and `size` is
+    sqrt(gradient . turned). `image` returns the Hessian's product with a direction, and M^-1 times
+    this product.
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # For each direction d, `directions` has the row d, and `images` has the row M d.
+    # Each row d of `directions` corresponds to the row M d of `images`.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []
@@ -209,7 +211,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return the pivots of the shifted tridiagonal matrix, each bounded away from zero."""
+    """Return the elimination pivots of (a tridiagonal matrix + shift * I), none close to zero."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -224,7 +226,8 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
 def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
     """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if none is negative.
 
-    The interval is bisected; the signs of the pivots count eigenvalues (Sturm).
+    An interval that contains it is bisected: if elimination of (matrix - x I) has a negative pivot,
+    an eigenvalue is below x (Sturm sequence).
     """
     around = [jnp.abs(each) for each in beside]
     zero = jnp.zeros_like(diagonal[0])
@@ -250,7 +253,7 @@ def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
 
 
 def _tridiagonal_solve(diagonal: list[Array], beside: list[Array], shift: Array) -> Array:
-    """Solve the shifted tridiagonal system with the first unit vector as right side, (m,)."""
+    """Solve (T + shift * I) x = (1, 0, ..., 0) for x (m,); T is a tridiagonal matrix."""
     pivots = _pivots(diagonal, beside, shift)
     right = [jnp.ones_like(pivots[0])]
     for k in range(1, len(pivots)):
@@ -268,9 +271,10 @@ def _choose(
     trials: Evaluation,
     decrease: Array,
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
-    """Choose the best trial step; return new scalars, weights of the trials, and two bools.
+    """Choose the trial step of least cost, if it lowers the cost.
 
-    The bools are whether the new point is the best so far, and whether the search was unfinished.
+    Returns the new scalars of the state; weights of the trial steps, 1 for the chosen step; whether
+    the new point is the best so far; and whether the search was unfinished before.
     """
     costs = jnp.where(jnp.isfinite(trials.cost), trials.cost, jnp.inf)
     slack = config.slack * jnp.finfo(costs.dtype).eps * jnp.abs(here.cost)

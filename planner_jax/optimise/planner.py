@@ -25,7 +25,7 @@ from planner_jax.optimise.settings import (
     load_round,
 )
 
-# Settings of Newton's method, which continues from the first search to the optimum.
+# Settings of Newton's method after the first round (attempt) of `with_polish`, to the optimum.
 _POLISH = NewtonConfig(
     max_steps=8,
     damping=1e-6,
@@ -37,7 +37,7 @@ _POLISH = NewtonConfig(
     stragglers=(0.125, 10, 10),
 )
 _LONG = LbfgsConfig(max_steps=300, tolerance=1e-7, patience=6)
-# Settings of Newton's method after the first round (attempt), for each effort.
+# By effort, the settings of Newton's method after the first round (attempt); see `with_effort`.
 _EFFORTS = {
     "good": NewtonConfig(max_steps=1, damping=1e-6, tolerance=2e-2, stragglers=(0.125, 2, 60)),
     "best": NewtonConfig(
@@ -47,7 +47,7 @@ _EFFORTS = {
 
 
 def pending(violation: Array) -> dict[str, PyTree]:
-    """Return the fields of a new `Plan`: its violation, and zeros that the solver replaces."""
+    """Return the fields of a new `Plan`: its violation, and zeros that the solver overwrites."""
     zero = jnp.zeros((), jnp.int32)
     return {
         "cost": jnp.zeros_like(violation),
@@ -69,7 +69,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     rounds: tuple[Round, ...]  # attempts, in order
     # Subspace vectors of Newton's method; 0 if the preconditioner is nearly the inverse Hessian.
     subspace: ClassVar[int] = 4
-    adjoint: ClassVar[str] = "products"  # the `curvature` of `pj.gradient` by default
+    adjoint: ClassVar[str] = "products"  # default of the argument `curvature` of `pj.gradient`
 
     @abc.abstractmethod
     def prepare(self, case: PyTree) -> PyTree:
@@ -77,7 +77,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @abc.abstractmethod
     def guesses(self, context: PyTree, num: int) -> Array:
-        """Return the first `num` starting points, (num, n), best first."""
+        """Return the first `num` starting points in n variables, (num, n), best first."""
 
     @abc.abstractmethod
     def objective(self, point: Array, context: PyTree) -> Evaluation:
@@ -120,7 +120,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return self.rounds
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
-        """Return a round with the settings of its searches by L-BFGS as run-time numbers."""
+        """Return a round whose numbers for L-BFGS are arguments of the compiled program."""
         return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
@@ -173,5 +173,5 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         )
 
     def _fit_subspace(self, solver: NewtonConfig) -> NewtonConfig:
-        """Return the settings with as many subspace vectors as the preconditioner needs."""
+        """Return the settings with the number of subspace vectors of this class of planners."""
         return dataclasses.replace(solver, subspace=self.subspace)

@@ -14,11 +14,11 @@ from planner_jax.optimise.settings import Preconditioner
 def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Preconditioner:
     """Return a preconditioner that inverts dense blocks, and a diagonal for other variables.
 
-    `blocks` are indices (K, k) of coupled variables, and `within` the second derivatives (K, k, k)
-    among them. `others` is the diagonal (n,) of the Hessian; its entries for the blocks are
-    ignored. The result takes a damping (), which is added to the diagonal, and returns the solver.
-    The solver's matrix is symmetric and positive: blocks that are not positive definite get
-    positive pivots.
+    `blocks` are indices (K, k) of K blocks of k coupled variables, and `within` the second
+    derivatives (K, k, k) among them. `others` is the diagonal (n,) of the Hessian of n variables;
+    its entries for the blocks are ignored. The result is a function of a damping (), which is added
+    to the diagonal. It returns the function that multiplies a vector by the inverse. For a block
+    that is not positive definite, the pivots of the inversion are made positive.
     """
     size, num = others.shape[0], blocks.shape[1]
     inside = np.zeros(size, bool)
@@ -46,10 +46,10 @@ def block_preconditioner(blocks: np.ndarray, within: Array, others: Array) -> Pr
 
 
 def _gauss_jordan(matrix: Array) -> Array:
-    """Return the inverse of a symmetric matrix (k, k), with its pivots made positive.
+    """Return the inverse of a symmetric matrix (k, k) by Gauss-Jordan elimination.
 
-    Gauss-Jordan elimination in k steps, in place, without pivoting. For a positive definite matrix
-    no pivot is changed, and the result is the exact inverse.
+    The rows are not exchanged. Pivots are replaced by their absolute values, or by a small positive
+    number. For a positive definite matrix no pivot changes, and the inverse is exact.
     """
     size = matrix.shape[0]
     least = 1e-6 * jnp.abs(jnp.diagonal(matrix)) + 1e-20

@@ -4,10 +4,11 @@ For a number q(u, theta) of a plan, where u minimises cost(u, theta) and theta i
 
     dq/dtheta = q_theta - lambda^T cost_utheta,   cost_uu lambda = q_u,
 
-the adjoint form of the implicit function theorem. Conjugate gradients [Hestenes1952] solve for
+where indices denote derivatives. This is the adjoint form of the implicit function theorem, and
+lambda is the adjoint vector. Conjugate gradients [Hestenes1952] solve for
 lambda in a few steps. They use the planner's products with the Hessian
-(`OptimisedPlanner.curvature_at`), or the whole Hessian. The product lambda^T cost_utheta is part of
-the derivative of the cost's gradient (by u and theta) along lambda.
+(`OptimisedPlanner.curvature_at`), or the whole Hessian. lambda^T cost_utheta is a part of the
+derivative of the cost's gradient (by u and theta) along lambda.
 """
 
 import dataclasses
@@ -44,10 +45,11 @@ class Gradient:
     """The value of one number of a plan, and its gradient by parts of the case."""
 
     value: Array  # ()
-    by: dict[str, PyTree]  # by name: part of the case, with leaves d value / d leaf
-    # () Relative residual of the equation for lambda, in the preconditioner's norm; 0 if lambda is
-    # exact. It does not measure the distance to the optimum. The residual and `by` are NaN if the
-    # Hessian is not positive along the first direction, because the point is then no minimum.
+    by: dict[str, PyTree]  # for each name a part of the case, whose leaves are d value / d leaf
+    # () Relative residual of the linear equation for the adjoint vector, in the preconditioner's
+    # norm; 0 if its solution is exact. It does not measure the distance to the optimum. The
+    # residual and `by` are NaN if the Hessian is not positive along the first direction of
+    # conjugate gradients, because the point is then no minimum.
     residual: Array
 
 
@@ -169,7 +171,8 @@ def gradient_at(
             "cost": its derivative at an optimum is the derivative at a fixed point (envelope
             theorem). None stands for the default of `curvature`.
         curvature: "products" uses products and preconditioner of the planner's `curvature_at`;
-            "whole" uses the inverse of the full Hessian as preconditioner: n more products.
+            "whole" uses the inverse of the full Hessian as preconditioner, which takes one product
+            for each of n variables.
 
     Raises:
         ValueError: a name does not exist, or is not of floating-point numbers.
@@ -205,7 +208,6 @@ def gradient_at(
     value, (along_point, by_context) = jax.value_and_grad(value_of, argnums=(0, 1))(point, smooth)
 
     def products(direction: Array) -> tuple[Array, list]:
-        """Return p^T cost_uu and p^T cost_uc (c: context): derivatives of gradients along p."""
         slopes = lambda x: jax.grad(cost, argnums=(0, 1))(x, smooth)  # noqa: E731
         return jax.jvp(slopes, (point,), (direction,))[1]
 
@@ -234,16 +236,17 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    """Return products with the Hessian's inverse, its pivots made positive, and the Hessian."""
+    """Return a function that multiplies by the Hessian's `positive_inverse`, and `product`."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
     return lambda right: jnp.sum(inverse * right[None], axis=1), product
 
 
 def _adjoint(solve: Product, product: Product, rhs: Array, steps: int) -> tuple[Array, Array]:
-    """Solve cost_uu lambda = rhs by conjugate gradients; return lambda and the relative residual.
+    """Solve H x = rhs by conjugate gradients; return x (n,) and the relative residual ().
 
-    The residual is NaN if the Hessian is not positive along the first direction.
+    `product` multiplies by the Hessian H, and `solve` is the preconditioner. The residual is NaN if
+    H is not positive along the first direction.
     """
 
     def going(state: tuple) -> Array:
@@ -302,7 +305,6 @@ def _find_part(tree: PyTree, name: str, argument: str) -> PyTree:
 
 
 def _members(tree: PyTree) -> dict[str, PyTree]:
-    """Return the entries of a tuple by index, or the fields of a dataclass by name."""
     if isinstance(tree, tuple):
         return {str(k): member for k, member in enumerate(tree)}
     return vars(tree) if dataclasses.is_dataclass(tree) else {}

@@ -15,7 +15,7 @@ from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 from planner_jax.core.run_time import Fixed, cached_by_precision, with_run_time_numbers
 
-# Up to this number of iterations a loop has a fixed length, which saves a test in every pass.
+# A search of at most this many iterations is a loop of fixed length: it never tests for its end.
 COUNTED = 16
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 
@@ -35,7 +35,7 @@ Preconditioner = Callable[[Array], Callable[[Array], Array]]
 
 
 class Curvature(NamedTuple):
-    """An objective's value and derivatives at a point (n,), for Newton's method."""
+    """An objective's value and derivatives at a point of n variables, for Newton's method."""
 
     evaluation: Evaluation
     gradient: Array  # (n,)
@@ -53,7 +53,7 @@ class LbfgsConfig:
     """Settings of the L-BFGS solver; hashable, so static under jit."""
 
     max_steps: int = 10  # greatest number of iterations; 0 returns the start itself
-    memory: int = 6  # number of stored pairs of a step and the change of the gradient
+    memory: int = 6  # number of stored pairs: a step, and the change of the gradient along it
     trial_steps: tuple[float, ...] = (1.0, 2.5, 0.3)  # lengths tried at once in each iteration
     step_cap: float = 2.0  # greatest Euclidean length of a step with trial length 1
     tolerance: float = 1e-4  # relative decrease of the cost below which progress stalls
@@ -87,13 +87,14 @@ class NewtonConfig:
     tighten: float = 1e3
     step_cap: float = 3.0  # largest Euclidean length of a step
     tolerance: float = 1e-4  # predicted relative decrease below which a problem is stationary
-    trusted: float = MOST_DAMPING  # greatest damping at which predicted decreases are reliable
+    trusted: float = MOST_DAMPING  # greatest damping at which a predicted decrease is reliable
     patience: int = 3  # iterations without progress after which a problem is stationary
     # Rounding error of a cost, in units of machine epsilon times the cost. A step may raise the
     # cost by this error; such a step counts as progress if the predicted decrease halves.
     slack: float = 0.0
-    # After `max_steps`, unfinished problems continue in groups, greatest predicted decrease first.
-    # The numbers: a group's fraction of the batch, its iterations, the greatest number of groups.
+    # After `max_steps`, unfinished problems continue in groups, those with the greatest predicted
+    # decrease first. The three numbers: size of a group as a fraction of the batch, iterations of a
+    # group, greatest number of groups.
     stragglers: tuple[float, int, int] | None = None
 
     def __post_init__(self) -> None:
@@ -157,11 +158,11 @@ class CountedLbfgs(LbfgsConfig):
 
 @cached_by_precision
 def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Return a round as an argument of a compiled program, static if it has a search of no steps.
+    """Convert a round to an argument of compiled programs; it is static if a search has no steps.
 
-    Rounds with the same starts, settings and kinds of searches share one program. If `is_counted`,
-    the program knows numbers of iterations up to `COUNTED`: a GPU then need not ask the host after
-    every iteration whether the loop has ended.
+    Rounds that differ only in L-BFGS's numbers of iterations and tolerances share one program. If
+    `is_counted`, numbers of iterations up to `COUNTED` are static: a GPU then need not ask the host
+    after every iteration whether the loop has ended.
     """
 
     def load(solver: Solver) -> Solver:

@@ -1,10 +1,11 @@
 """Measured units of variables, and trained networks for starting points, stored with each task.
 
-A quasi-Newton method depends on the units of its variables. Each planner therefore uses units that
-`python -m benchmarks.measure_scales` measured. The networks predict starting points. They are
-trained by `python -m benchmarks.learn_starts --train MINUTES` to lower the planner's own objective
-(amortised optimisation), without solved examples. A search starts at the network's point only if
-its cost is lower than the cost of the guess without it, so a poor output does no harm.
+A quasi-Newton method converges faster if all variables have second derivatives of similar size. So
+each planner uses units of variables that `python -m benchmarks.measure_scales` measured.
+
+The networks predict starting points. `python -m benchmarks.learn_starts --train MINUTES` trains
+them to lower the planner's own objective, without solved examples. A search starts at a network's
+point only if it costs less than the planner's own guess, so a poor prediction does no harm.
 """
 
 import functools
@@ -26,7 +27,7 @@ REACH = 4.0  # number of standard deviations at which features are clipped
 class StartNetwork:
     """A network that corrects a guessed starting point: weights, and statistics of the inputs."""
 
-    mean: Array | np.ndarray  # (F,), mean of each feature in the training data
+    mean: Array | np.ndarray  # (F,), mean of each of F features in the training data
     deviation: Array | np.ndarray  # (F,), standard deviation of each feature
     weights: tuple[Array | np.ndarray, ...]  # (inputs, outputs) of each layer
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)

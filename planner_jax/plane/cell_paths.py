@@ -19,7 +19,7 @@ _UNEVEN = 1.0  # cost of a change of speed by one level
 
 @struct.dataclass
 class CellPath:
-    """A path through a reach set: speed level, heading bin and cell at every time layer."""
+    """A path through a reach set: speed level, heading bin and grid cell at every time layer."""
 
     level: Array  # (layers,) int32, index of the speed up to the next layer
     bin: Array  # (layers,) int32, index of the heading, not wrapped to one revolution
@@ -28,7 +28,10 @@ class CellPath:
 
 @struct.dataclass
 class PathNoise:
-    """Gumbel noise for drawing D candidates of a path; many paths have one more leading axis."""
+    """Gumbel noise for drawing one path as the smoothest of D random candidates.
+
+    For the noise of several paths, every array has one more leading axis.
+    """
 
     layers: Array  # (layers + 1,), noise for the choice of the last layer
     ends: Array  # (D, levels, headings, 9), noise for the choice of the last cell
@@ -36,7 +39,11 @@ class PathNoise:
 
 
 def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNoise:
-    """Draw the noise for `num` paths from a seed; all cases of a batch use the same noise."""
+    """Draw Gumbel noise by which `draw_path` selects steps at random, for `num` paths.
+
+    Each path is the smoothest of `candidates` random paths. `lattice` has the numbers of time
+    layers, speed levels and headings. All cases of a batch use the same noise.
+    """
     rng = np.random.default_rng(seed)
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
     steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
@@ -45,7 +52,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return the velocities (..., 2) of speed levels and heading bins (...).
+    """Return the velocities (..., 2) for arrays of speed levels and heading bins.
 
     The unit is one level of speed, and the axes are along the heading of bin 0 and to its left.
     """
@@ -77,8 +84,8 @@ def draw_path(
         reach: set of cells that the car can reach.
         num: () int32, index of the layer at which the car meets the goal.
         cells: cells around the goal, from `goal_cells`.
-        is_reached: whether the car can be there, from `goal_cells`. If no entry is true, the
-            returned path is meaningless.
+        is_reached: whether the car can be in these cells, from `goal_cells`. If no entry is true,
+            the returned path is meaningless.
         noise: noise of one path.
         directness: weight of the squared difference, in levels of speed, between the velocity at a
             cell and the mean velocity from the start to this cell. With a greater weight, paths are

@@ -11,12 +11,12 @@ from planner_jax.plane.obstacles import Obstacles, distances
 class DistanceField:
     """Distances from the nearest wall at equally spaced nodes; negative inside a wall."""
 
-    values: Array  # (F, F) [m], the first index counts along y, the second along x
+    values: Array  # (F, F) [m], F nodes along each side; the first index is along y
     corner: Array  # (2,) [m], position of the entry (0, 0)
     spacing: Array  # () [m], distance between neighbouring nodes
 
     def near(self, x: Array, y: Array) -> tuple[Array, Array, Array]:
-        """Interpolate the distances [m] of points from walls, and their derivatives by x and y.
+        """Return the distances [m] of points (x, y) from the nearest wall, and derivatives by x, y.
 
         Interpolation is bilinear. Near a corner of a wall it overestimates the distance by up to
         spacing^2 / (4 distance). A point outside the grid gets the distance of the nearest point of

@@ -82,7 +82,6 @@ def obstacles(
 
 
 def _check_room(room: object) -> tuple[int, int] | None:
-    """Return the argument `room`; raise unless it is None or two positive whole numbers."""
     if room is None:
         return None
     if not isinstance(room, tuple | list) or len(room) != 2:
@@ -130,7 +129,7 @@ def distances(
 
     Returns:
         distance: (N, P) [m]. Inside a polygon it is minus the distance of the nearest edge's line.
-        away: x and y components, each (N, P), of the distance's gradient, a unit vector.
+        away: gradient of the distance, a unit vector: its x and y components, each (N, P).
     """
     before = jnp.roll(corners, 1, axis=1)
     edge = corners - before
@@ -170,10 +169,10 @@ def distances(
 def separation(
     corners: Array, present: Array, x: Array, y: Array, heading: Array, body: tuple
 ) -> Array:
-    """Return the gaps (N, P) [m] between a rectangle and polygons along their best separating axis.
+    """Return the gaps [m] between a rectangle at P poses and N polygons, (N, P).
 
-    A gap is positive if and only if rectangle and polygon do not touch (the separating axis
-    theorem). It is at most their distance.
+    A gap is the greatest separation along an axis normal to an edge. It is positive if and only if
+    rectangle and polygon do not touch (the separating axis theorem), and is at most their distance.
 
     Args:
         corners: (N, V, 2) [m], counter-clockwise; corners may be repeated.

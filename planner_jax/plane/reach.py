@@ -11,8 +11,8 @@ Path and timing are searched together, so that a car can wait for an obstacle to
 before it. One set covers all paths around the obstacles, all headings and all meeting times.
 `cell_paths` draws paths from the set.
 
-The bits of a row of cells (constant y) are packed in 32-bit words. The car's motion along y selects
-other rows, and its motion along x shifts the words.
+The bits of a row of cells (equal y) are packed in 32-bit words. A motion of the car along y moves
+whole rows, and a motion along x shifts the bits of the words.
 """
 
 import dataclasses
@@ -53,7 +53,7 @@ class Grid:
     upper: Array  # (2,) [m], opposite corner
     corner: Array  # (2,) [m], middle of the cell (0, 0)
     cell: Array  # () [m], side length of a cell
-    step: Array  # () [s], time between two layers; layer n is at (n + 1/2) steps
+    step: Array  # () [s], time between two layers; layer n is at the time (n + 1/2) * step
     num: Array  # () int32, index of the layer at the horizon
     start: Array  # (2,) int32, indices [x, y] of the cell at the start
     heading: Array  # () [rad], heading of bin 0, which is the heading at the start
@@ -61,10 +61,10 @@ class Grid:
 
 @struct.dataclass
 class Vehicle:
-    """Sizes and limits of a vehicle; two discs cover its body, and a reference point is tracked."""
+    """Sizes and limits of a vehicle, whose body is covered by two discs."""
 
     radius: Array  # () [m], radius of the discs
-    ahead: Array  # (2,) [m], distances of the discs' middles ahead of the reference point
+    ahead: Array  # (2,) [m], distances of the discs' middles ahead of the rear axle
     speed: Array  # () [m/s], greatest speed
     turn_rates: Array  # (levels,) [rad/s], greatest turn rate at each level of speed
 
@@ -73,8 +73,8 @@ class Vehicle:
 class ReachSet:
     """The reachable states of all time layers, and the moves and turns between layers."""
 
-    # (layers + 1, words, levels, headings, cells) uint32. The last axis counts cells along y, and
-    # the bits of the words count cells along x.
+    # (layers + 1, words, levels, headings, cells) uint32. The last axis is over cells along y. Each
+    # bit of the words along the second axis is a cell along x.
     bits: Array
     # (layers, levels, headings, 2, 2) int32, moved cells [x, y] in each half of a step.
     moves: Array
@@ -113,7 +113,7 @@ def grid_of(
 
 
 def _pack(cells: Array) -> Array:
-    """Pack flags (..., W * 32) bool into the bits of 32-bit words (W, ...) uint32."""
+    """Pack bools (..., W * 32) into the bits of W 32-bit words, an array (W, ...) uint32."""
     bits = cells.reshape(*cells.shape[:-1], -1, 32).astype(jnp.uint32)
     shifts = jnp.expand_dims(jnp.arange(32, dtype=jnp.uint32), tuple(range(cells.ndim)))
     words = jnp.sum(bits << shifts, axis=-1, dtype=jnp.uint32)
@@ -133,7 +133,7 @@ def _move_y(rows: Array, move: Array) -> Array:
 
 
 def _move_x(rows: Array, move: Array) -> Array:
-    """Move cells along x, the bits of words (words, ..., cells), by `move` (...) < 32 cells."""
+    """Shift the bits of (words, ..., cells), cells along x, by `move` (...) cells, less than 32."""
     none = jnp.zeros_like(rows[0])
     by = jnp.abs(move[..., None]).astype(jnp.uint32)
     carry = (32 - by) & 31
@@ -196,7 +196,7 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
 
 def _word_of(row: Array, at: Array) -> Array:
-    """Return the part of a 32-bit row that falls into a word if the row starts at its bit `at`."""
+    """Return the bits of a word into which a 32-bit row is written from the word's bit `at` on."""
     by = jnp.minimum(jnp.abs(at), 31).astype(jnp.uint32)
     moved = jnp.where(at >= 0, row << by, row >> by)
     return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))
@@ -229,7 +229,8 @@ def reach_set(
     direction = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
     pace = speed * grid.step / grid.cell * jnp.arange(levels, dtype=dtype) / (levels - 1)
     # A move is the difference of two rounded positions, so that the moves of n layers add up to the
-    # rounded position. If each move were rounded instead, a heading of 11 degrees would become 0.
+    # rounded position. If each move were rounded, a car with a heading of 11 degrees would never
+    # change its row.
     half_steps = jnp.arange(2 * lattice.layers + 2, dtype=dtype)[:, None, None, None]
     cells = jnp.round(0.5 * half_steps * pace[None, :, None, None] * direction[None, None]).astype(
         jnp.int32
@@ -238,8 +239,8 @@ def reach_set(
     halves = jnp.clip(halves, -_FARTHEST, _FARTHEST)
     moves = jnp.moveaxis(halves[1:].reshape(-1, 2, levels, headings, 2), 1, 3)
     most = vehicle.turn_rates * grid.step / width
-    # Turns are whole numbers of heading bins too. They are differences of a rounded angle, so that
-    # they add up to the angle that the turn rates allow.
+    # Turns are whole numbers of heading bins, too. The greatest turn at a layer is a difference of
+    # two rounded angles, so that these turns add up to the angle that the turn rate allows.
     before = jnp.arange(lattice.layers + 1, dtype=dtype)[:, None]
     whole = jnp.diff(jnp.floor(before * most[None] + 0.1), axis=0)  # (layers, levels)
     span = jnp.abs(jnp.arange(-SPAN, SPAN + 1, dtype=dtype))
@@ -311,7 +312,7 @@ def reach_set(
 
 
 def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
-    """Return the bits at time 0: the start cell, at the speed levels next to the initial speed."""
+    """Return the bits at time 0: the start cell and heading, and speed levels near the initial."""
     lattice, cell = grid.lattice, grid.start
     level = initial_speed / speed * (lattice.levels - 1)
     near = jnp.abs(jnp.arange(lattice.levels, dtype=level.dtype) - level) < 1.0
@@ -322,14 +323,14 @@ def _start_bits(grid: Grid, initial_speed: Array, speed: Array) -> Array:
 
 
 def _change_speed(bits: Array) -> Array:
-    """Mark every state as reached whose speed level is at most one from a reached state's level."""
+    """Mark every state whose speed level differs by at most one from a marked state's level."""
     none = jnp.zeros_like(bits[:, :1])
     slower = jnp.concatenate([bits[:, 1:], none], axis=1)
     return bits | slower | jnp.concatenate([none, bits[:, :-1]], axis=1)
 
 
 def _turn(bits: Array, turns: Array) -> Array:
-    """Mark every state as reached whose heading the car can turn to from a reached state."""
+    """Mark every state that the car reaches from a marked state by an allowed turn."""
     reached = jnp.zeros_like(bits)
     for k in range(2 * SPAN + 1):
         by = jnp.roll(bits, k - SPAN, axis=2)
@@ -352,11 +353,11 @@ def bit_at(bits: Array, level: Array, heading: Array, cell: Array) -> Array:
 def goal_cells(
     grid: Grid, layer: Array, goal: Array, ahead: Array, headings: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around a goal, and whether the car can reach them at one time layer.
+    """Return the cells around the position of a goal, and whether the car can be there.
 
     Args:
         grid: grid of the reach set.
-        layer: (words, levels, headings, cells) uint32, bits of one layer.
+        layer: (words, levels, headings, cells) uint32, bits of the time layer of the meeting.
         goal: (2,) [m], position to be met.
         ahead: () [m], distance from the rear axle forward to the point that meets the goal.
         headings: (headings,) bool, allowed headings.

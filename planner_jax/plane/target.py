@@ -78,16 +78,15 @@ class LaterPath:
 
 
 def arc(turn_rate: Array, time: Array) -> tuple[Array, Array]:
-    """Return the displacement of a target with unit speed and a constant turn rate.
+    """Return a target's displacements along its initial velocity and to its left, over its speed.
 
-    The displacements along the initial velocity and to its left are (...) [s], as the speed is 1.
+    The target has a constant speed and turn rate [rad/s]. The results (...) are in seconds.
     """
     angle = turn_rate * time
     return time * _sinc(angle), time * _cosc(angle)
 
 
 def _sinc(angle: Array) -> Array:
-    """Return sin(x) / x for an angle x [rad], also near zero."""
     small = jnp.abs(angle) < 1e-2
     safe = jnp.where(small, 1.0, angle)
     return jnp.where(small, 1.0 - angle**2 / 6.0, jnp.sin(safe) / safe)

@@ -116,7 +116,8 @@ class Watch:
         self._progress(Progress(place, max(len(rounds), place), int(tried), int(cases), seconds))
 
 
-# One compiled call: indices of its lanes, padded with the first index, and their unpadded number.
+# One compiled call: the indices of its cases in the batch, padded to a fixed length with copies of
+# the first index, and the number of cases without the padding.
 _Call = tuple[np.ndarray, int]
 
 
@@ -128,7 +129,7 @@ def plan_batch(
     devices: Sequence[jax.Device] | None,  # pyright: ignore[reportInvalidTypeForm]
     watch: Watch,
 ) -> tuple[PyTree, PyTree]:
-    """Return plans of a batch. Each attempt is made at the cases that are still unsolved.
+    """Return plans of a batch, by attempts that are each made at the cases still unsolved.
 
     Args:
         planner: planner that makes the attempts.
@@ -140,7 +141,7 @@ def plan_batch(
 
     Returns:
         The plans, with NumPy leaves, or with jax arrays if all leaves of the cases are jax arrays;
-        and an array of numbers that are all zero if every case is solved.
+        and the number of unsolved cases, or an array with one such number for each device.
     """
     planner, mesh = on_devices(planner, devices)
     batch = _Batch(planner, chunk, mesh, watch)
@@ -178,7 +179,7 @@ def _try_in_turn(
     watch: Watch,
     try_lanes: Callable[[Attempt, np.ndarray, PyTree], PyTree],
 ) -> tuple[PyTree, int]:
-    """Return plans (num, ...) after all attempts in order, and the number of unsolved plans.
+    """Return plans of `num` cases after all attempts in order, and the number of unsolved plans.
 
     `try_lanes` makes one attempt at the cases with given indices. It takes the plans so far (None
     before the first attempt), and returns them with improvements at those indices.
@@ -310,7 +311,7 @@ class _Batch:
         return plans, unsolved
 
     def _first_plans(self, attempt: Attempt, cases: PyTree) -> tuple[PyTree, Array]:
-        """Make the first attempt by chunks; return plans, and numbers unsolved by device."""
+        """Make the first attempt by chunks; return plans, and each device's number of unsolved."""
         mesh, sizes, share = self.mesh, self.sizes(attempt), count_lanes(cases) // self.mesh.size
         if share == sizes.next(share):
             return solve_on_devices(self.planner, attempt, mesh, cases)
@@ -334,13 +335,13 @@ class _Batch:
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return every leaf's entries with indices `lanes`; indices beyond the end give the last."""
+    """Return the entries `lanes` of every leaf; an index beyond the end selects the last entry."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 
 @functools.partial(jax.jit, static_argnames=("mesh", "size"))
 def _cut(mesh: Mesh, size: int, tree: PyTree, begin: PyTree) -> PyTree:
-    """Return `size` lanes (cases) from index `begin` of each device, padded with its last lane."""
+    """Return cases `begin` to `begin + size` of each device, padded with the device's last case."""
 
     def cut(tree: PyTree, begin: Array) -> PyTree:
         return _take(tree, begin + jnp.arange(size))
@@ -368,9 +369,9 @@ def _cut_unsolved(
 
 @functools.partial(jax.jit, static_argnames=("mesh", "within"))
 def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
-    """Return statuses for an attempt with the limit `within`, and the number due, (devices,).
+    """Mark plans with a violation above `within` as solved, so that the attempt skips them.
 
-    Plans with a violation above `within` are marked as solved, so that the attempt skips them.
+    Return the marked statuses, and the number of cases to be tried on each device, (devices,).
     """
 
     def due(plans: PyTree) -> tuple[Array, Array]:
@@ -383,7 +384,6 @@ def _mark_due(mesh: Mesh, within: float, plans: PyTree) -> tuple[Array, Array]:
 
 @functools.partial(jax.jit, static_argnames=("mesh", "share"))
 def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, Array]:
-    """Join the chunks of plans of each device, and count its unsolved plans."""
 
     def join(*parts: PyTree) -> tuple[PyTree, Array]:
         return with_unsolved(jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:share], *parts))

@@ -22,7 +22,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     `decision` proposes several choices for each case, and `planner` plans the case with every
     choice. The solved plan with the least `decision.rank` is selected, or the plan with the least
     violation if none is solved. The planner's last and longest attempt is made only for cases
-    without a solved choice. If its first attempt is long already, this holds for all later ones.
+    without a solved choice; if the first attempt is long, too, this holds for all later attempts.
     """
 
     decision: PyTree  # a `Decision`
@@ -96,7 +96,6 @@ def _propose(_: None, decision: Decision, case: PyTree) -> PyTree:
 
 
 def _split(choices: PyTree, axis: int) -> list[PyTree]:
-    """Split choices that are stacked along an axis into a list with one entry for each choice."""
     num = jax.tree.leaves(choices)[0].shape[axis]
     before = (slice(None),) * axis
     return [jax.tree.map(lambda leaf: leaf[*before, k], choices) for k in range(num)]  # noqa: B023
@@ -104,7 +103,7 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 @jax.jit
 def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return the proposed choices, best first; each entry is for one case or for a whole batch."""
+    """Return a list of proposals, best first; an entry has one choice for each of the cases."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
     return _split(jax.vmap(decision.propose)(cases), 1)
@@ -112,7 +111,7 @@ def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
 
 @jax.jit
 def _explain(decision: Decision, cases: PyTree, status: Array) -> Array:
-    """Return statuses in which the decision has replaced vague reasons by more exact ones."""
+    """Return statuses of plans, replaced where the decision knows why a case is unsolved."""
     explain = decision.explain if cases.batch_shape == () else jax.vmap(decision.explain)
     return explain(cases, status)
 

@@ -26,7 +26,7 @@ from planner_jax.planning.programs import solve_cases, solve_one
 
 @dataclasses.dataclass(frozen=True)
 class Driver:
-    """The implementation of `Drive`: with the caller's settings in `plan`, pure in `solve`."""
+    """The `Drive` of `pj.plan`, with its settings, and of `pj.solve`, as a pure function."""
 
     chunk: int | None = None
     devices: Sequence[jax.Device] | None = None  # pyright: ignore[reportInvalidTypeForm]
@@ -35,7 +35,7 @@ class Driver:
 
     @property
     def is_over(self) -> bool:
-        """True if the caller's time limit has passed."""
+        """True if the `time_limit` of `pj.plan` has passed."""
         return self.watch.is_over
 
     def __call__(
@@ -59,7 +59,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Return plans (B,) after another try at the cases where `left` is true; see `Drive`."""
+        """Plan the cases where `left` (B,) is true again; keep each case's better plan."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)
@@ -90,7 +90,7 @@ def _plan_one(planner: Planner, attempts: Sequence[Attempt], case: PyTree, watch
 
 
 def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -> PyTree:
-    """Return plans as jax arrays. An attempt is made at all cases if it is due for at least one."""
+    """Return plans as jax arrays; while any case is unsolved, attempts are made at all cases."""
     require_pure(planner)
     plans: PyTree = None
     pairs = [(attempt, planner.load_attempt(attempt, cases)) for attempt in attempts]

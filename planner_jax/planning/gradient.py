@@ -62,8 +62,8 @@ def gradient(
             `curvature`. 0 is exact for "cost", by the envelope theorem.
         curvature: "products", the default, solves with products of the Hessian, which are exact
             even where limits are active. "whole" uses the inverse Hessian as preconditioner, which
-            costs about n solver iterations; planners that search for a path first, such as
-            `pj.intercept.planner("spacetime")`, use it by default.
+            costs as much as n solver iterations for n decision variables; planners that search for
+            a path first, such as `pj.intercept.planner("spacetime")`, use it by default.
         solver: settings of one search that replaces the planner's rounds.
         polish: whether the first round continues to the optimum; ignored if there is a `solver`.
             Planners that search for a path first reach the optimum in any case.

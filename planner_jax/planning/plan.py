@@ -168,7 +168,6 @@ def _solve(planner: PyTree, cases: PyTree) -> PyTree:
 
 @_solve.defjvp
 def _raise(primals: tuple, tangents: tuple) -> tuple:
-    """Raise `TypeError` when `_solve` is differentiated."""
     raise TypeError(
         "plan and solve cannot be differentiated: for gradients of plans there are pj.gradient, "
         "and pj.optimal_plan inside a loss"

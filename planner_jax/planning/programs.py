@@ -26,12 +26,13 @@ from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
 from planner_jax.core.run_time import Fixed
 
-# Lanes (cases) of a device in one call. The sizes are few, because each needs its own program.
+# Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)
-_CPU_CHUNK, _GPU_CHUNK = 256, 65536  # starts in a call that fit a core's cache; that fill a GPU
+# Greatest number of starting points in one call: on a CPU they fit a core's cache, and fill a GPU.
+_CPU_CHUNK, _GPU_CHUNK = 256, 65536
 _GPU_BUSY = 8192  # least number of starts in one call that keeps a GPU busy
 _GPU_LEAST = 128  # least number of lanes of a call on a GPU; fewer lanes take the same time
-_SPARED = 8  # a smaller last call is compiled if it saves more than 1/8 of the lanes before it
+_SPARED = 8  # a smaller last call is used if it saves more than 1/8 of the lanes before that call
 LANES = PartitionSpec("lanes")
 
 
@@ -44,10 +45,10 @@ class Sizes:
     least: int = BUCKETS[0]  # least number of lanes of a call
 
     def next(self, num: int) -> int:
-        """Return the number of lanes of the next call, if `num` lanes are still to be solved.
+        """Return the size of the next call (its number of lanes) when `num` lanes are unsolved.
 
-        It is the least size that holds all of them, or the greatest size. If they fill at most half
-        of it, the next smaller size is returned, provided that it keeps a GPU busy.
+        It is the smallest size in `BUCKETS` that holds `num` lanes, or at most `most`. If the lanes
+        fill at most half of this size, the next smaller bucket is returned if it is >= `busy`.
         """
         needed = max(num, self.least)
         fits = next((bucket for bucket in BUCKETS if needed <= bucket <= self.most), self.most)
@@ -57,8 +58,8 @@ class Sizes:
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
         """Yield the first lane and the size of every call that is needed for `num` lanes.
 
-        The last call keeps the size of the calls before it, because a program of a smaller size
-        would have to be compiled. A smaller size is used only if it saves much work.
+        The last call has the size of the calls before it, because another size needs another
+        program. It is smaller only if this saves more than 1/8 of the work before it.
         """
         first = size = 0
         while first < num:
@@ -115,8 +116,8 @@ def replicated_sharding(mesh: Mesh) -> Sharding:
 def put_number(mesh: Mesh, value: int) -> Array:
     """Return an integer as an array on every device; cached, because each transfer takes time."""
     if mesh.size == 1:
-        # The number is not bound to its device. Lanes that are bound to none, as the arrays of most
-        # users are, then stay so, and every attempt runs the same program.
+        # JAX compiles anew for arrays that are committed to a device. The arrays of most users are
+        # not, and with an uncommitted number every attempt runs the same program.
         with jax.default_device(mesh.devices[0]):
             return jnp.asarray(value, jnp.int32)
     return jax.device_put(np.int32(value), replicated_sharding(mesh))
@@ -171,7 +172,7 @@ def solve_cases(planner: Planner, cases: PyTree, loaded: PyTree) -> PyTree:
 def solve_on_devices(
     planner: Planner, attempt: Attempt, mesh: Mesh, cases: PyTree
 ) -> tuple[PyTree, Array]:
-    """Return plans of each device's lanes (cases), and its number of unsolved ones, (devices,)."""
+    """Return plans of all cases, and the number of unsolved cases on each device, (devices,)."""
     return _solve_on_devices(planner, planner.load_attempt(attempt, cases), mesh, cases)
 
 
@@ -236,13 +237,12 @@ def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree)
 
 
 def _layout(leaves: Sequence[PyTree]) -> _Layout:
-    """Return the shape and dtype of each array."""
     return tuple([(leaf.shape, leaf.dtype) for leaf in leaves])
 
 
 @dataclasses.dataclass
 class _Result:
-    """Positions of a tree's leaves in the result vector; set when JAX traces the function."""
+    """Slices of a packed vector that hold a tree's leaves; set when JAX traces the function."""
 
     tree: PyTree = None
     fields: list[tuple[slice, tuple[int, ...]]] = dataclasses.field(default_factory=list)

@@ -50,7 +50,7 @@ def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
 
 
 def resolve_argument(name: str, given: PyTree, own: PyTree, elapsed: np.ndarray) -> np.ndarray:
-    """Return the value of an argument that the caller passed, or else the value in a plan.
+    """Return an argument's value: `given` by the caller or, if that is None, `own` of the plan.
 
     Both values are for one case, or for each case of a batch. The result has the batch shape and
     the type of `elapsed`.

@@ -19,7 +19,7 @@ from planner_jax.robot.quadrotor import QuadrotorPlan
 from planner_jax.trajectory.polynomial import sample_pieces, states_at
 
 _ARM_AT_REST = 0.01  # [rad/s] greatest joint rate of an arm that counts as standing still
-_NODES = 40  # intervals of each piece, whose ends are searched for the exceeded limit
+_NODES = 40  # number of intervals of each polynomial piece, at whose ends limits are evaluated
 
 
 def is_rested(found: Plan) -> bool:
@@ -59,7 +59,6 @@ def append_recovery(case: PyTree, found: Plan, to: str) -> Plan:
 
 
 def _end_flight(case: PyTree, found: QuadrotorPlan, to: str) -> QuadrotorPlan:
-    """Return the plan of a quadrotor with its recovery trajectory; see `append_recovery`."""
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (case, found))
     rest = plan(RecoveryPlanner(to=to), recovery_cases(cases, plans))
     if is_solved(rest.status[0]):

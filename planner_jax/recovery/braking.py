@@ -80,8 +80,8 @@ def _car_problem(
 ) -> str:
     """Describe the collision of a car that brakes from a pose (3,), or return "".
 
-    The plan of `case` lasts `since` [s], and braking `time` [s]; speed and curvature are at (n +
-    1,) knots.
+    Braking starts `since` [s] after the start of the plan and lasts `time` [s]. Speed and curvature
+    (n + 1,) are values at equally spaced knots.
     """
     times = np.linspace(0.0, time, _SAMPLES)
     poses = np.asarray(_poses(begin, time, jnp.asarray(speed), jnp.asarray(curvature), times))
@@ -136,7 +136,7 @@ def brake_arm(case: PyTree, plan: ArmPlan) -> ArmPlan:
 def _arm_candidates(
     angles: np.ndarray, rates: np.ndarray, most: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield coefficients (M, 3, 6) and durations (M,) of motions to standstill.
+    """Yield candidates of braking motions: coefficients (M, 3, 6), durations (M,) of M pieces.
 
     Angles [rad], rates [rad/s] and greatest accelerations [rad/s^2] are (6,).
     """
@@ -155,7 +155,7 @@ def _arm_candidates(
 
 
 def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
-    """Return why a motion, coefficients (M, 3, 6) and durations (M,), is not allowed, or ""."""
+    """Return why a motion of M pieces, given by coefficients (M, 3, 6), is not allowed, or ""."""
     tau = times[:, None, None] * np.linspace(0.0, 1.0, _SAMPLES // len(times))[:, None]
     first, second, third = np.moveaxis(pieces, 1, 0)[:, :, None]
     angles = (first + tau * (second + tau * third)).reshape(-1, 6)
@@ -170,6 +170,5 @@ def _arm_problem(case: PyTree, pieces: np.ndarray, times: np.ndarray) -> str:
 
 
 def _change(kind: type[PlanT], plan: PlanT, **fields: Any) -> PlanT:
-    """Return a plan of class `kind` with the fields of `plan`, of which some are replaced."""
     values = {field.name: vars(plan)[field.name] for field in dataclasses.fields(kind)}
     return kind(**{**values, **fields})

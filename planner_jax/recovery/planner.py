@@ -17,14 +17,15 @@ from planner_jax.recovery.case import RecoveryCase, RecoveryPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 _ABOVE_GROUND = 0.2  # [m] lowest guess of the position of standstill, above the least height
-# Starting points, best first. Column 1 is a base duration [s], to which the time for the distance
-# at half the greatest speed is added. Column 2 is the distance over the distance of braking.
+# Starting points of the search, best first. Column 1: a base duration T_0 [s], to which the time
+# for the displacement at half the greatest speed is added. Column 2: a factor c; the displacement
+# to standstill is c T_0 v / 2 for the initial velocity v.
 _GUESSES = np.array([(1.0, 1.0), (1.6, 1.0), (0.7, 0.7), (2.5, 1.5), (1.2, 0.3), (4.0, 1.0)])
 
 
 @struct.dataclass
 class RecoveryContext:
-    """The context of a recovery for `ChainPlanner`; it consists of the case alone."""
+    """The data of one case for the methods of `RecoveryPlanner`: the case alone."""
 
     case: RecoveryCase
 
@@ -34,8 +35,9 @@ class RecoveryContext:
 class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     """Plans minimum-snap trajectories to standstill, whose durations are free.
 
-    Decision variables, n = 3 (M - 1) + 4, in units of `scale`: whitened waypoint offsets, log
-    duration, and the position of standstill. With `to="home"` the position is the case's `home`.
+    A trajectory of M pieces has n = 3 (M - 1) + 4 decision variables, in units of `scale`: whitened
+    waypoint offsets (scaled deviations from the smoothest trajectory), log duration, and the
+    displacement to standstill. With `to="home"` it stands still at the case's `home` instead.
 
     Cost: energy_weight * integral |snap|^2 + time_weight * duration + integral of the smoothed
     hinges of the limits, and of the case's extras.
@@ -70,7 +72,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         return RecoveryContext(case)
 
     def guess_ends(self, context: RecoveryContext, num: int) -> Array:
-        """Return guesses of log duration and of the displacement to standstill, (num, 1, 4)."""
+        """Return `num` guesses (num, 1, 4): log duration, and displacement to standstill [m]."""
         case = context.case
         pos, vel = case.head_state[None, 0], case.head_state[None, 1]
         base, share = jnp.asarray(_GUESSES[:num], pos.dtype).T[..., None]
@@ -84,7 +86,7 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
         return jnp.concatenate([jnp.log(duration), end - pos], axis=1)[:, None]
 
     def meet(self, natural: Array, context: RecoveryContext) -> ChainEnds:
-        """Return duration and final state for the variables (1, 4); no limit applies at the end."""
+        """Return duration and final state for variables (1, 4): log duration and displacement."""
         case, duration = context.case, jnp.exp(natural[:, 0])
         at_rest = case.head_state[:1] + natural[:, 1:] if self.to == "brake" else case.home[None]
         return ChainEnds(

@@ -124,7 +124,7 @@ def _shortest(nearest: Callable, gap: Callable, bodies: tuple[Array, ...]) -> Ar
     """Return the distance () [m] between two bodies.
 
     `nearest` returns the parameters of the nearest points, such as fractions from 0 to 1 along
-    segments. `gap` returns the vector from the second body's nearest point to that of the first.
+    segments. `gap` returns the vector between these points, from the second body to the first.
     """
     return _length(gap(nearest(*bodies), *bodies))
 
@@ -140,11 +140,11 @@ def _shortest_jvp(nearest: Callable, gap: Callable, primals: Any, tangents: Any)
 def _nearest_of_segments(ends_a: Array, ends_b: Array) -> tuple[Array, Array]:
     """Return the fractions, from 0 to 1, along both segments at which they are nearest.
 
-    The first fraction is where the infinite lines are nearest, clipped to [0, 1]. Then the second
-    segment takes its point nearest to the first point, and the first segment its point nearest to
-    that. The result is exact (C. Ericson, Real-Time Collision Detection, 2005, 5.1.9). The first
-    fraction is computed from the normal u x v instead of dot products of u and v, so that it is
-    accurate in float32 for lines at any angle.
+    The first segment's fraction is taken where the infinite lines are nearest, clipped to [0, 1].
+    Then the point of the second segment nearest to this point is computed, and last the point of
+    the first segment nearest to the second point. This is exact (C. Ericson, Real-Time Collision
+    Detection, 2005, 5.1.9). The first step uses the cross product of the segments' directions
+    instead of dot products, so that it is accurate in float32 for lines at any angle.
     """
     (start_a, end_a), (start_b, end_b) = _rows(ends_a), _rows(ends_b)
     u, v, between = _minus(end_a, start_a), _minus(end_b, start_b), _minus(start_b, start_a)
@@ -182,8 +182,8 @@ def _nearest_of_rectangle(ends: Array, middle: Array, edges: Array) -> Any:
 
     They are the fraction along the segment (0 to 1), the multiples of both half-edges (-1 to 1),
     and whether the bodies are apart. The rectangle is treated as a box without thickness, whose
-    axes are the half-edges e and f, and e x f. Squared lengths are in units of |e|^2 |f|^2, which
-    saves divisions.
+    axes are the half-edges e and f and their cross product. Squared lengths are in units of
+    |e|^2 |f|^2, which saves divisions.
     """
     (start, end), (e, f) = _rows(ends), _rows(edges)
     step, away = _minus(end, start), _minus(start, tuple(middle))
@@ -228,8 +228,8 @@ class _Slab(NamedTuple):
 def _slab(to_low: Array, to_high: Array, speed: Array, weight: Array) -> _Slab:
     """Make a slab from the signed distances () of its two planes from a segment's start.
 
-    `speed` is the segment's signed length across the slab. `weight` is the square of this length,
-    in a unit that all slabs of one pair of bodies have in common.
+    `speed` is the segment's signed extent perpendicular to the slab. `weight` is the square of this
+    extent, in a unit that all slabs of one pair of bodies have in common.
     """
     moves = weight > _TINY
     step = jnp.where(moves, speed, 1.0)
@@ -316,8 +316,8 @@ def _nearest_of_projection(middle: Array, edges: Array, position: Array) -> Any:
             p, q = jnp.where(closer, along_e, p), jnp.where(closer, along_f, q)
     area = jnp.abs(_area(e, f))
     inside = (jnp.abs(_area(to, f)) < area) & (jnp.abs(_area(e, to)) < area)
-    # The projection of a vertical rectangle has no width. All its areas are 0 for points on its
-    # line, at any distance, so a test of the distance from the middle is added.
+    # The projection of a vertical rectangle is a line segment. All these areas are then 0 for every
+    # point of the segment's line, so the distance from the rectangle's middle is tested, too.
     inside = inside & (dot(to, to) <= squares[0] + squares[1] + 2.0 * jnp.abs(product))
     return p, q, ~inside
 
@@ -339,7 +339,6 @@ def _length(vector: Vector) -> Array:
 
 
 def _ratio(top: Array, square: Array) -> Array:
-    """Return top / square (), or 0 if the divisor `square` is at most `_TINY`."""
     is_positive = square > _TINY
     return jnp.where(is_positive, top / jnp.where(is_positive, square, 1.0), 0.0)
 
@@ -349,13 +348,11 @@ def _unit(share: Array) -> Array:
 
 
 def _point(ends: Array, share: Array) -> Vector:
-    """Return the point start + share * (end - start) of a segment with ends (2, 3)."""
     start, end = _rows(ends)
     return tuple(a + share * (b - a) for a, b in zip(start, end, strict=True))
 
 
 def _rows(pair: Array) -> tuple[Vector, Vector]:
-    """Split an array (2, 3) of two vectors into two tuples of components."""
     return tuple(pair[0]), tuple(pair[1])
 
 
@@ -380,7 +377,6 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def _area(a: Vector, b: Vector) -> Array:
-    """Return the signed area () of the parallelogram of two vectors in the plane."""
     return a[0] * b[1] - a[1] * b[0]
 
 

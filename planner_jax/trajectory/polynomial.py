@@ -14,7 +14,7 @@ from jaxtyping import PyTree
 class PiecewisePolynomial:
     """The trajectory p(t) = sum_k coeffs[i, k] (t - t_i)^k on piece i, which starts at t_i."""
 
-    coeffs: Array  # (M, D + 1, 3), ascending powers of the time [s] since t_i
+    coeffs: Array  # (M, D + 1, 3), M pieces of degree D; ascending powers of the time since t_i
     durations: Array  # (M,) [s], > 0
 
 
@@ -70,7 +70,7 @@ def total_duration(trajectory: PiecewisePolynomial) -> Array:
 
 
 def energy_form(degree: int, order: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the integral of the squared `order`-th derivative of a polynomial, a quadratic form.
+    """Return the quadratic form of the integral of a polynomial's squared `order`-th derivative.
 
     Returns:
         The matrix (degree + 1, degree + 1) of the form for duration 1, and for each entry the power
@@ -122,7 +122,7 @@ def join(first: PiecewisePolynomial, then: PiecewisePolynomial) -> PiecewisePoly
 
 
 def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
-    """Evaluate position to jerk on the host, for one trajectory or a batch with a time for each.
+    """Evaluate position, velocity, acceleration and jerk by NumPy, at one time per trajectory.
 
     Args:
         trajectory: one trajectory, or a batch with a leading axis B on every leaf.
@@ -146,14 +146,17 @@ def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def state_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors and powers (4, size) of t by which coefficients give position to jerk."""
+    """Return f and e, (4, size): sum_k f[d, k] t^e[d, k] c_k is derivative d of sum_k c_k t^k."""
     factors = np.stack([derivative_factors(size - 1, order) for order in range(4)])
     return factors, np.maximum(np.arange(size) - np.arange(4)[:, None], 0)
 
 
 @functools.cache
 def shift_basis(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return factors and powers (size, size) of t that shift a polynomial's origin by t."""
+    """Return f and e, (size, size), for coefficients c_j of a polynomial whose origin moves to t.
+
+    The i-th new coefficient is sum_j f[i, j] t^e[i, j] c_j.
+    """
     indices = np.arange(size)
     factors = np.array([[math.comb(j, i) for j in indices] for i in indices])
     return factors, np.maximum(indices - indices[:, None], 0)

@@ -1,20 +1,22 @@
 """MINCO splines with piece durations in fixed proportion, computed by constant matrices.
 
-MINCO is the piecewise polynomial of least integral |p^(s)|^2 through waypoints [Wang2022;
-Yu2023bat, eq. 19]. It has degree 2s - 1 on every piece and is 2s - 2 times differentiable.
+MINCO is the piecewise polynomial p(t) of least energy, the integral of |p^(s)|^2 with the s-th
+derivative p^(s), through waypoints [Wang2022; Yu2023bat, eq. 19]. It has degree 2s - 1 on every
+piece and is 2s - 2 times differentiable.
 
-Piece i of M lasts r_i h seconds. The proportions r_i are constant with mean one, so that h = T / M.
-With times in units of h, one constant matrix maps the boundary rows and the waypoints to the
-coefficients, and to samples of position, velocity, acceleration and jerk. The boundary rows are
-(p, v h, a h^2, j h^3) at both ends.
+Piece i of M lasts r_i h seconds. The proportions r_i are constant with mean one, so that h = T / M
+for the duration T. With times in units of h, one constant matrix maps the boundary rows b and the
+waypoints q to the coefficients, and to samples of position, velocity, acceleration and jerk. The
+boundary rows are (p, v h, a h^2, j h^3) at both ends: scaled position to jerk.
 
-The waypoints q are expressed by whitened offsets y from the waypoints that need the least energy
-for the boundary b: q = -E_qq^-1 E_qb b + W y with W = R^-T / |R^-T| and E_qq = R R^T. Hence y = 0
-is the smoothest guess for any boundary, and the energy is a boundary part plus a multiple of |y|^2.
+The energy is a quadratic form with blocks E_qq and E_qb. The waypoints are expressed by whitened
+offsets y from the waypoints of least energy for given b: q = -E_qq^-1 E_qb b + W y, with
+W = R^-T / |R^-T| and E_qq = R R^T. Hence y = 0 is the smoothest trajectory for any b, and the
+energy is a part that depends on b plus a multiple of |y|^2.
 
-The velocities at the waypoints may be variables as well: whitened offsets z from the velocities of
-least energy for boundary and waypoints. Their energy is the same multiple of |z|^2. A trajectory
-with z != 0 is 2s - 3 times differentiable.
+The velocities at the waypoints may be variables, too: whitened offsets z from the velocities of
+least energy for given b and q. Their energy is the same multiple of |z|^2. A trajectory with z != 0
+is 2s - 3 times differentiable.
 
 A `Chain` is N minimum-snap segments of M pieces each. Each segment starts with the state, position
 to jerk, at which the segment before it ends. Absent segments are computed and ignored, so that one
@@ -45,11 +47,15 @@ from planner_jax.trajectory.polynomial import (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ProportionalMinco:
-    """Constant float64 matrices of splines with M pieces that minimise the energy |p^(s)|^2."""
+    """Constant float64 matrices of splines of M pieces with least integral |p^(s)|^2.
 
-    order: int
+    The matrices multiply C = 2s + O columns [b; y]: 2s boundary rows b and O whitened waypoint
+    offsets y. h is the mean duration of a piece.
+    """
+
+    order: int  # s
     proportions: np.ndarray  # (M,) durations of the pieces divided by h; their mean is one
-    coefficients: np.ndarray  # (M, 2s, C), maps C = 2s + O columns [b; y] to pieces in t / h
+    coefficients: np.ndarray  # (M, 2s, C), maps [b; y] to coefficients of powers of t / h
     waypoints: np.ndarray  # (O, C), maps [b; y] to the waypoints, then their velocities times h
     offsets: np.ndarray  # (O, C), maps [b; waypoints] to y
     boundary_energy: np.ndarray  # (2s, 2s), quadratic form of the least energy for boundary rows
@@ -61,10 +67,10 @@ class ProportionalMinco:
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Return the matrix that samples a derivative at `nodes` + 1 points of every piece.
+        """Return the matrix (M nodes + 1, C) that samples a derivative, 0 for the position.
 
-        Its shape is (M nodes + 1, C): neighbouring pieces share a sample. The samples are the
-        matrix times [b; y] / h^derivative.
+        There are `nodes` + 1 samples on each of the M pieces, and neighbours share one. The samples
+        are the matrix times [b; y] / h^derivative.
         """
         degree = 2 * self.order - 1
         factors = derivative_factors(degree, derivative)
@@ -78,7 +84,7 @@ class ProportionalMinco:
 
 @functools.cache
 def _hermite_map(order: int) -> np.ndarray:
-    """Return the matrix (2s, 2s) from end derivatives to the coefficients of a unit-time piece."""
+    """Return the matrix from derivatives at both ends to coefficients of a piece of duration 1."""
     size = 2 * order
     ends = np.zeros((size, size))
     for d in range(order):
@@ -89,7 +95,7 @@ def _hermite_map(order: int) -> np.ndarray:
 
 @functools.cache
 def _hermite_energy(order: int) -> np.ndarray:
-    """Return the energy of a unit-time piece as a form (2s, 2s) in its end derivatives."""
+    """Return the energy of a piece of duration 1 as a quadratic form in its end derivatives."""
     hermite = _hermite_map(order)
     return hermite.T @ energy_form(2 * order - 1, order)[0] @ hermite
 
@@ -97,9 +103,9 @@ def _hermite_energy(order: int) -> np.ndarray:
 def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
     """Return the energy of M pieces as a quadratic form (C, C) in the C columns [b; y].
 
-    The form is a sum of squares. In the nodes' derivatives it would lose the small energy of smooth
-    motions far from the origin to rounding errors. `coefficients` (M, 2s, C) belong to powers of a
-    piece's unit time, and `shares` (M,) are the pieces' durations.
+    It is computed as a sum of squares, which keeps the small energy of smooth motions far from the
+    origin; other forms would lose it to rounding errors. `coefficients` (M, 2s, C) map the columns
+    to powers of the time since a piece's start over its duration, and `shares` (M,) are durations.
     """
     s = coefficients.shape[1] // 2
     root = np.linalg.cholesky(energy_form(2 * s - 1, s)[0][s:, s:]).T
@@ -151,8 +157,8 @@ def proportional_minco(
     b, q = np.s_[: 2 * s], np.s_[2 * s :]
     from_offsets, norm = np.eye(known.size), 1.0
     for k in range(len(kinds) if m > 1 else 0):
-        # Offsets of a kind (positions, or velocities) are deviations from values of least energy,
-        # for given columns before them and the best values of the columns after them.
+        # Offsets (of positions, then of velocities) are deviations from the values of least energy.
+        # The columns before them are fixed then, and the columns after them minimise the energy.
         begin, end = (2 * s + j * (m - 1) for j in (k, k + 1))
         before, own = np.s_[:begin], np.s_[begin:end]
         reduced = _least_energy(energy, end)
@@ -179,7 +185,7 @@ def proportional_minco(
 
 
 def boundary_rows(head_state: Array, tail_state: Array, piece_duration: Array) -> Array:
-    """Return the boundary rows (2s, 3) of two states (s, 3): d-th derivatives times duration^d."""
+    """Return the boundary rows (2s, 3) of two states (s, 3): derivative d times duration^d."""
     scale = jnp.stack([piece_duration**k for k in range(head_state.shape[0])])[:, None]
     return jnp.concatenate([head_state * scale, tail_state * scale])
 
@@ -273,7 +279,7 @@ def _boundary_form_jvp(
 
 
 def _by_rows(maps: ProportionalMinco, rows: Array) -> Array:
-    """Multiply the energy's matrix by the rows; a sum is faster here than a matrix product."""
+    """Multiply the energy's matrix by rows (2s, 3), as a sum, faster than a matrix product."""
     gram = jnp.asarray(maps.boundary_energy, rows.dtype)
     return jnp.sum(gram[..., None] * rows[None], axis=1)
 
