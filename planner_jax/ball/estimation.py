@@ -42,7 +42,7 @@ class EkfState:
 
 
 def _congruence(A: Array, P: Array) -> Array:
-    """Return A P A' in full precision (no TF32 on a GPU), made exactly symmetric."""
+    """Return A P A^T in full precision (a GPU may use TF32 otherwise), exactly symmetric."""
     full = jnp.einsum("ij,jk,lk->il", A, P, A, precision=lax.Precision.HIGHEST)
     return 0.5 * (full + full.T)
 

@@ -110,7 +110,7 @@ def install_line(extra: str) -> str:
 
 
 def format_value(value: object) -> str:
-    """Format a value as one short line for a message."""
+    """Format a value as at most one line of text for an error message."""
     if isinstance(value, numbers.Real) and not isinstance(value, numbers.Integral):
         return f"{float(value):g}"
     text = str(value) if isinstance(value, numbers.Number) else repr(value)

@@ -186,7 +186,7 @@ def _slopes(
 
 
 def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: PyTree) -> tuple:
-    """Return the results of `_slopes`, and the penalties' derivatives by the parameters."""
+    """Return penalties, greatest excesses, and derivatives by columns, durations, parameters."""
 
     def of_segment(columns: Array, duration: Array, parameters: PyTree) -> tuple:
         value = functools.partial(_of_segment, along)

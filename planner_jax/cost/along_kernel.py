@@ -74,7 +74,8 @@ def grid_of(
     """
     *_, num_columns, _, lanes = points[0][0].shape
     threads = block_width(lanes, _THREADS)
-    # Extras need vectors and the position, and rotors need the snap, which kernels do not compute.
+    # The kernel computes no horizontal position, which costs of the user need, and no snap, which
+    # limits of rotors need.
     if along.rate is not None or along.orders != 4 or threads is None:
         return None
     if any(leaf.dtype != jnp.float32 for leaf in leaves):
@@ -250,7 +251,7 @@ class _Sample:
     weight: Array
 
     def slope_by_columns(self, slope: Vectors) -> Vectors:
-        """Convert derivatives by the sample of `unit_motion` to derivatives by the columns."""
+        """Apply the chain rule: from derivatives by height to jerk, to derivatives by columns."""
         return [
             [
                 _total(

@@ -31,7 +31,11 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
 def join_trapezoid_weights(
     num_intervals: int, proportions: np.ndarray | Sequence[float]
 ) -> np.ndarray:
-    """Return trapezoid weights (M n + 1,) of M pieces with n intervals; neighbours share a node."""
+    """Return trapezoid weights of consecutive pieces, of which neighbours share a node.
+
+    The pieces have durations `proportions` (M,) and n = `num_intervals` intervals each; the result
+    has the shape (M n + 1,).
+    """
     weights = np.zeros(len(proportions) * num_intervals + 1)
     for i, share in enumerate(proportions):
         span = slice(i * num_intervals, (i + 1) * num_intervals + 1)

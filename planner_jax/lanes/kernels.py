@@ -122,7 +122,8 @@ def with_kernel(
         call.__name__ = call.__qualname__ = name
         return jax.jit(call)
 
-    # JAX's own derivative of the named function would keep the name, and wrongly get the kernel.
+    # If JAX differentiated the named function, its derivative would have the same name, and
+    # `over_lanes` would replace the derivative by the kernel.
     @jax.custom_jvp
     def call_named(*args: object) -> Results:
         leaves, treedef = jax.tree.flatten(args)
@@ -145,7 +146,8 @@ def kernel_of(eqn: JaxprEqn) -> Kernel | None:
     entry = _ENTRIES.get(eqn.params.get("name", ""))
     if entry is None:
         return None
-    # Reverse mode splits a function into two parts with the same name, but without all its shapes.
+    # Reverse-mode differentiation splits a function into two with the same name, but other
+    # arguments or results. For these there is no kernel.
     shapes = [shape_of(atom) for atom in (*eqn.invars, *eqn.outvars)]
     is_whole = len(shapes) == len(entry.shapes) and all(
         of_call[len(of_call) - len(of_lane) :] == of_lane

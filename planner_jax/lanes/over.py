@@ -149,7 +149,7 @@ def _by_kernel(
         results = kernel(leaves)
         if results is None:
             return by_operations(*leaves)
-        # A result that is constant along an axis of `vmap` lacks this axis.
+        # `vmap` within a lane adds a leading axis, but not to results that are constant along it.
         pairs = zip(results, shapes, strict=True)
         results = [result[(0,) * (result.ndim - len(shape))] for result, shape in pairs]
         as_called = all(r.shape == shape for r, shape in zip(results, shapes, strict=True))

@@ -21,7 +21,7 @@ _FEWEST = 16  # least number of lanes (problems of a batch) in a block of a kern
 
 
 def block_width(lanes: int, most: int) -> int | None:
-    """Return how many lanes (problems) a kernel's block has, up to `most`; None if too few."""
+    """Return the number of lanes (problems) in a block, a divisor of `most`, or None if < 16."""
     width = math.gcd(lanes, most)
     return width if width >= _FEWEST else None
 

@@ -21,7 +21,8 @@ from planner_jax.optimise.settings import Curvature, Evaluation
 from planner_jax.trajectory.proportional_minco import ProportionalMinco, offset_energy
 
 # A function of k end variables of each of N segments, (N, k). It returns boundary rows (N, 2s, 3),
-# mean durations of a piece (N,) [s], the cost of the ends (), and the greatest excess there ().
+# which are s scaled derivatives at each end; mean durations of a piece (N,) [s]; the cost of the
+# ends (); and the greatest excess over a limit at the ends ().
 Ends = Callable[[Array], tuple[Array, Array, Array, Array]]
 
 

@@ -84,10 +84,10 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         """Return the cost and the largest violation of a limit at a point (n,)."""
 
     def curvature_at(self, point: Array, context: PyTree) -> Curvature:
-        """Return the derivatives for Newton's method at a point (n,).
+        """Return gradient, products with the Hessian, and preconditioner at a point (n,).
 
-        By default each product with the Hessian is a derivative of the gradient, and there is no
-        preconditioner.
+        By default automatic differentiation of the gradient computes each product with the Hessian,
+        and there is no preconditioner.
         """
         from planner_jax.optimise.newton import by_products  # only planners that polish need it
 

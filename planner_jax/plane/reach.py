@@ -84,12 +84,14 @@ class ReachSet:
 def grid_of(
     lattice: Lattice, start: Array, time: Array, speed: Array, lower: Array, upper: Array
 ) -> Grid:
-    """Make the grid of a map, with a cell's middle at the start and the last layer at the horizon.
+    """Make the grid of cells and time layers for a map and a planning horizon.
+
+    The car starts in the middle of a cell, and the last time layer is at the horizon.
 
     Args:
-        lattice: sizes of the reach set.
+        lattice: numbers of cells, time layers, speed levels and headings.
         start: (3,) x, y [m] and heading [rad] of the car at time 0.
-        time: () [s], the horizon.
+        time: () [s], the horizon, the latest time of the plan.
         speed: () [m/s], greatest speed of the car.
         lower: (2,) [m], corner of the map.
         upper: (2,) [m], opposite corner.

@@ -393,7 +393,7 @@ def _join_locally(mesh: Mesh, parts: list[PyTree], share: int) -> tuple[PyTree, 
 
 @functools.partial(jax.jit, static_argnames="mesh")
 def _select_locally(mesh: Mesh, plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
-    """Replace plans by later plans that are better, on each device; count its unsolved plans."""
+    """Replace plans with indices `lanes` by better later plans; count unsolved plans by device."""
 
     def merge(plans: PyTree, later: PyTree, lanes: Array) -> tuple[PyTree, Array]:
         kept = select(later, _take(plans, lanes))

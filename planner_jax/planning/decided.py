@@ -30,9 +30,9 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
     def settle(
         self, cases: PyTree, plan_of: Callable[[Planner, PyTree], PyTree] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return the planner that minimises, and the cases with their choices filled in.
+        """Return the inner planner, which minimises a cost, and the cases with their choices.
 
-        The choices come from plans that `plan_of` makes. Without `plan_of` they are the first
+        The choices are taken from plans that `plan_of` makes. Without `plan_of` they are the first
         proposals of the decision, and nothing is planned.
         """
         if plan_of is None:

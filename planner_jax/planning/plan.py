@@ -83,7 +83,7 @@ def plan(
         if not resident:
             require_sound(cases)
     plans, _ = Driver(chunk, devices, watch)(planner, cases)
-    # A single case is checked only if its plan is marked as bad input, so good cases lose no time.
+    # A single case is checked only if its plan has the status BAD_INPUT, which is faster.
     if alone and not resident and int(plans.status) == Status.BAD_INPUT:
         require_sound(cases)
     if not alone and resident and not is_resident(plans):

@@ -252,7 +252,7 @@ class _Result:
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """A compiled function that takes the leaves of `own` and a vector, and returns a vector."""
+    """A compiled function of arrays on the device and a packed vector; it returns a vector."""
 
     run: Callable[[list[PyTree], np.ndarray], Array]
     dtype: np.dtype  # type of the input and output vectors

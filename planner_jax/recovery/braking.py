@@ -64,7 +64,7 @@ def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, n
     for share in _DECELERATIONS:
         num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)
         speed = first * np.linspace(1.0, 0.0, num + 1)
-        # The limit of lateral acceleration bounds the curvature, by the speed at the last knot.
+        # |curvature| <= lateral acceleration / speed^2, with the speed at the start of each step.
         before = np.maximum(speed[:-1] ** 2, 1e-9)
         most = np.maximum(_SPARE * float(limits.lateral_acceleration) / before, abs(bend))
         for target in targets:

@@ -114,7 +114,7 @@ def _energy(coefficients: np.ndarray, shares: np.ndarray) -> np.ndarray:
 
 
 def _least_energy(energy: np.ndarray, num: int) -> np.ndarray:
-    """Return a quadratic form in its first `num` unknowns, minimised over the other unknowns."""
+    """Return the quadratic form of the first `num` unknowns if all others minimise `energy`."""
     first, free = np.s_[:num], np.s_[num:]
     best = np.linalg.solve(energy[free, free], energy[free, first])
     return energy[first, first] - energy[first, free] @ best
@@ -232,7 +232,7 @@ def by_pieces(
 
 def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
     """Return the motion at N samples, computed by the matrices (orders, N, C)."""
-    # One product serves all orders, because on a CPU the call of an operation costs more than its
+    # One matrix product computes all derivatives, because on a CPU a call takes longer than its
     # arithmetic. The matrix is the left factor, so that a batch adds columns to the right factor.
     orders = matrices.shape[0]
     unit = jnp.matmul(
