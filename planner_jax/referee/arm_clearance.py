@@ -1,13 +1,13 @@
 """Clearance of a six-axis arm with a shield from obstacles and from itself, in float64 NumPy.
 
-Base frame of the arm, z up, SI units. Vectors at S samples of B motions are (3, B, S), with S = 1
-for solids that do not move. Links are modelled by capsules, and the shield by a square plate that
-is 0.01 m thick. The tested pairs of solids are:
+Base frame of the arm, z up, SI units. Vectors at S sampled times of B motions are (3, B, S), with
+S = 1 for solids that do not move. The solids are capsules around the links, and a square plate, the
+shield, 0.01 m thick. These distances are tested:
 
-- floor, pole and beams of the rig: with every moving link, and with the shield;
-- base: with links 2 to 6 and the shield, since link 1 is mounted on the base;
-- link 1: with links 3 to 6 and the shield;
-- shield: with links 1 to 4, since links 5 and 6 carry it. For link 4 see `_beside_shield`.
+- of every link and the shield from the floor, the pole and the beams of the rig around the arm;
+- of links 2 to 6 and the shield from the base, on which link 1 is mounted;
+- of links 3 to 6 from link 1, since neighbouring links always touch;
+- of links 1 to 4 from the shield, which link 6 carries. `_beside_shield` explains link 4.
 """
 
 import dataclasses
@@ -55,20 +55,18 @@ class _Capsule:
         return 0.5 * length(self.second[..., :1] - self.first[..., :1]) + self.radius
 
     def lowest(self) -> np.ndarray:
-        """Return the height (B, S) [m] of the capsule's lowest point."""
         return np.minimum(self.first[2], self.second[2]) - self.radius
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
-        """Return the distances (B, S) [m] to points (3, B, S)."""
         return from_segment(point, self.first, self.second) - self.radius
 
     def distance_to_capsule(self, other: "_Capsule") -> np.ndarray:
-        """Return the distances (P,) [m] to another capsule, for capsules selected by `at`."""
+        """Return the distances (P,) [m] between two capsules, each at the P samples of `at`."""
         apart = between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Capsule":
-        """Select P samples: return the capsule with ends (3, P) and radii (P,)."""
+        """Return the capsule at P samples, each the sample `sample[k]` of the motion `lane[k]`."""
         first, second = (_pick_samples(end, lane, sample) for end in (self.first, self.second))
         return _Capsule(self.name, self.link, first, second, self.radius[lane, 0])
 
@@ -88,47 +86,47 @@ class _Box:
         return length(self.half)
 
     def lowest(self) -> np.ndarray:
-        """Return the height (B, S) [m] of the box's lowest point."""
         return self.middle[2] - sum(np.abs(self.turn[2, k]) * self.half[k] for k in range(3))
 
     def distance_to_point(self, point: np.ndarray) -> np.ndarray:
-        """Return the distances (B, S) [m] to points (3, B, S)."""
         inside = rotate_back(self.turn, point - self.middle)
         return length(np.maximum(np.abs(inside) - self.half, 0.0))
 
     def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
-        """Return the distances (P,) [m] to a capsule, for solids selected by `at`."""
+        """Return the distances (P,) [m] of a box from a capsule, each at the P samples of `at`."""
         first, second = (
             rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
         return segment_to_box(first, second, self.half) - other.radius
 
     def distance_to_box(self, other: "_Box") -> np.ndarray:
-        """Return the distances (P,) [m] to another box, for boxes selected by `at`."""
+        """Return the distances (P,) [m] between two boxes, each at the P samples of `at`."""
         middle = rotate_back(self.turn, other.middle - self.middle)
         turn = np.stack([rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
         return between_boxes(middle, turn, other.half, self.half)
 
     def at(self, lane: np.ndarray, sample: np.ndarray) -> "_Box":
-        """Select P samples: return the box with middles (3, P) and rotations (3, 3, P)."""
+        """Return the box at P samples, each the sample `sample[k]` of the motion `lane[k]`."""
         middle, turn = (_pick_samples(each, lane, sample) for each in (self.middle, self.turn))
         return _Box(self.name, middle, turn, self.half[:, lane, 0])
 
 
 @dataclasses.dataclass(frozen=True)
 class _Pair:
-    """Two solids, or a solid and the floor, whose distance is tested."""
+    """Two solids, or a solid and the floor, whose distance is tested at S samples of B motions."""
 
     name: str  # name of the part of the arm, or of both parts
     bound: np.ndarray  # (B, S) [m], lower bound of the distance
-    # Function from indices of motions and samples, both (P,), to exact distances (P,) [m].
+    # Function that returns exact distances [m] at P samples: its arguments are the indices (P,) of
+    # their motions, and the indices (P,) of the samples within the motions.
     exact: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
     """Return links' rotations to the base frame, and joints' positions [m], for links 1 to 6.
 
-    Joint angles are (6, B, S) [rad], rotations (3, 3, B, S), and positions (3, B, S).
+    Joint `angles` are (6, B, S) [rad], at S samples of B motions. Each rotation is (3, 3, B, S),
+    each position (3, B, S).
     """
     turn, position = np.eye(3)[..., None, None], np.zeros((3, 1, 1))
     turns, positions = [], []
@@ -148,7 +146,10 @@ def links_of(case: dict, angles: np.ndarray) -> tuple[list, list]:
 
 
 def shield_middle(case: dict, turns: list, positions: list) -> np.ndarray:
-    """Return the middle (3, B, S) [m] of the shield's face, whose outward normal is link 6's x."""
+    """Return the middle (3, B, S) [m] of the shield's face at S samples of B motions.
+
+    The outward normal of the face is the x axis of link 6.
+    """
     return positions[5] + rotate(turns[5], case["arm.shield_centre"].T[..., None])
 
 
@@ -161,13 +162,14 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
     Args:
         case: arrays of B cases.
-        links: link of each capsule, 0 to 5 for links 1 to 6, -1 for the base.
-        angles: (6, B, S) [rad], joint angles.
+        links: link to which each capsule of the arm belongs, 0 to 5 for links 1 to 6, -1 for the
+            base.
+        angles: (6, B, S) [rad], joint angles at S samples of each motion.
         sampled: (B, S) bool, samples to evaluate, at least one in each motion.
 
     Returns:
-        By kind, the least distance (B,) [m], infinite without an obstacle; its sample (B,); and the
-        name (B,) of the part of the arm.
+        For each kind of obstacle: the least distance (B,) [m], infinite without an obstacle; the
+        index (B,) of its sample; and the name (B,) of the part of the arm.
     """
     capsules, shield = _arm(case, links, angles)
     moving = [each for each in capsules if each.link != _BASE]
@@ -191,7 +193,6 @@ def clearances(case: dict, links: Sequence, angles: np.ndarray, sampled: np.ndar
 
 
 def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule], _Box]:
-    """Compute the poses of the arm's capsules and its shield at joint angles (6, B, S) [rad]."""
     turns, positions = links_of(case, angles)
     capsules = []
     for k, link in enumerate(links):
@@ -210,8 +211,9 @@ def _arm(case: dict, links: Sequence, angles: np.ndarray) -> tuple[list[_Capsule
 def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> list[_Capsule]:
     """Return the capsules of links 2 to 4 for the test against the shield.
 
-    Link 4 is wider than thick, and the shield approaches only its narrow sides. The radius of its
-    capsule is therefore reduced until it only touches the shield when all joint angles are 0.
+    Link 4 is wider than thick, and the shield approaches only its narrow sides. A capsule that
+    contains the wide sides would overlap the shield. Its radius is therefore reduced so that it
+    just touches the shield if all joint angles are 0.
     """
     num_lanes = len(case["arm.shield_half"])
     straight, shield = _arm(case, links, np.zeros((6, num_lanes, 1)))
@@ -228,7 +230,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """Return the pole as a capsule; its radius is minus infinity in cases without a pole."""
+    """Return the pole as a long capsule; in cases without a pole its radius is minus infinity."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -259,7 +261,6 @@ def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
 
 
 def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
-    """Return the distances (P,) [m] between two solids at P samples."""
     if isinstance(one, _Capsule):
         return other.distance_to_capsule(one)
     return (
@@ -270,7 +271,10 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the least distance (B,) [m] over pairs and samples, its sample and its pair's name."""
+    """Find the least distance of each of B plans over all pairs of solids and sampled times.
+
+    Returns arrays (B,): the distance [m], the index of its sample, and the name of its pair.
+    """
     num_lanes, num_samples = sampled.shape
     if not pairs:
         return np.full(num_lanes, np.inf), np.zeros(num_lanes, int), np.full(num_lanes, "")
@@ -279,7 +283,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     distances = np.full_like(bounds, np.inf)
 
     def compute(selected: np.ndarray) -> None:
-        """Store the exact distances of the `selected` entries (B, pairs x samples)."""
+        """Store exact distances where `selected` (plans, pairs x samples) is true."""
         for k, pair in enumerate(pairs):
             here = slice(k * num_samples, (k + 1) * num_samples)
             lane, sample = np.nonzero(selected[:, here])
@@ -288,7 +292,8 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
     lanes = np.arange(num_lanes)
     first = np.zeros(bounds.shape, bool)
-    # Entries whose lower bound is above one exact distance need no exact distance.
+    # The exact distance of the entry with the lowest bound comes first. Entries whose lower bound
+    # is above this distance cannot be the least, and their exact distances are not computed.
     first[lanes, bounds.argmin(axis=1)] = True
     compute(first)
     upper = distances.min(axis=1, keepdims=True) + _SLACK
@@ -299,17 +304,17 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Select P entries (lane, sample) of values (..., B, S), where S = 1 for constant values."""
+    """Return values[..., lane, sample]; a last axis of length 1 holds values of all samples."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the matrix products `first` `second` of matrices (3, 3, ...)."""
+    """Return the matrix products of `first` and `second`, both (3, 3, ...)."""
     return np.stack([rotate(first, second[:, k]) for k in range(3)], axis=1)
 
 
 def _cross(axis: np.ndarray) -> np.ndarray:
-    """Return the matrices (3, 3, ...) of the cross product with axes (3, ...)."""
+    """Return the matrices (3, 3, ...) that map v to `axis` x v, for axes (3, ...)."""
     (x, y, z), none = axis, np.zeros_like(axis[0])
     return np.array([[none, -z, y], [z, none, -x], [-y, x, none]])
 

@@ -49,7 +49,7 @@ _SENTENCES = {
     "outer box before it gets into the inner one",
 }
 LIMITS = tuple(_SENTENCES)
-# Fields of a case that may be infinite, like the limits of the joints.
+# Fields of a case that may be infinite; the limits of joint velocities and accelerations may too.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {
@@ -64,13 +64,14 @@ _CASE_SHAPES: dict[str, tuple[int, ...]] = {
 _JOINTS = np.array([f"joint {k}" for k in range(1, 7)])
 
 LONGEST_STEP = 0.002  # [s], greatest time between two samples of the arm's motion
-# [rad] Greatest norm of the change of all joint angles between two samples.
+# [rad] Greatest change between two samples, as the norm of the six joint angles' changes.
 LARGEST_TURN = 0.017
-# [rad/s] Norm of all joint rates above which the time between samples is not reduced further.
+# [rad/s] The samples' distance in time is `LARGEST_TURN` / (norm of the joint rates). A norm above
+# this number counts as this number, which limits the number of samples.
 _FASTEST = 100.0
 LONGEST_PLAN = 60.0  # [s], latest contact that the referee accepts
 REST = 0.01  # [rad/s], greatest joint rate that counts as standstill
-_HALVINGS = 45  # number of bisections in the search for a root
+_HALVINGS = 45  # number of bisections in the search for the time of a joint's extreme angle or rate
 _SAMPLES = 16384  # number of poses whose clearances are computed together and fit the cache
 
 
@@ -78,7 +79,8 @@ _SAMPLES = 16384  # number of poses whose clearances are computed together and f
 class BlockVerdict(Verdict):
     """Verdict on B plans in which an arm blocks a ball with its shield.
 
-    Measurements are NaN where the inputs are not finite or the plan's times are wrong. A clearance
+    Measurements are NaN if a number of case or plan is not finite, or a time of the plan is wrong:
+    a negative duration, or a contact before the motion's end or after `LONGEST_PLAN`. A clearance
     is the least distance of solids over the samples: negative if they overlap, and infinite without
     an obstacle.
     """
@@ -86,11 +88,11 @@ class BlockVerdict(Verdict):
     SENTENCES = _SENTENCES
     UNBOUNDED = {"tunnel": "the ball never gets into the outer box"}
 
-    failed_part: np.ndarray  # (B,) str, the joint, link or shield that exceeds a limit, or ""
-    contact_time: np.ndarray  # (B,) [s], time of the contact that the plan reports
+    failed_part: np.ndarray  # (B,) str, name of the joint or part that exceeds a limit, or ""
+    contact_time: np.ndarray  # (B,) [s], time of the ball's contact, as the plan reports it
     execution_time: np.ndarray  # (B,) [s], duration of the arm's motion
-    velocity_share: np.ndarray  # (B,) greatest |rate| of a joint / its limit
-    acceleration_share: np.ndarray  # (B,) greatest |acceleration| of a joint / its limit
+    velocity_share: np.ndarray  # (B,) greatest ratio of a joint's |velocity| to its limit
+    acceleration_share: np.ndarray  # (B,) greatest ratio of a joint's |acceleration| to its limit
     floor_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the floor
     pole_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the pole
     rig_clearance: np.ndarray  # (B,) [m], least distance of arm and shield from the rig's beams
@@ -122,18 +124,19 @@ def referee_blocks(
     It must be at standstill there if the case requires it, or if the contact is later.
 
     Args:
-        cases: object with the fields of `BlockCase`, leaves with leading axis B; gravity > 0.
-        plans: object with the fields of `BlockPlan`, leaves with leading axis B; coefficients (B,
-            M, D + 1, 6), durations (B, M).
+        cases: object with the fields of `BlockCase`, for B cases; gravity > 0.
+        plans: object with the fields of `BlockPlan`, for B plans of M polynomial pieces of degree
+            D: coefficients (B, M, D + 1, 6), durations (B, M).
         tolerance: relative tolerance of velocities, accelerations, the case's offset and its tilt;
             absolute tolerance of the start and of jumps between pieces [rad], [rad/s], and of joint
             angles beyond their limits [rad].
-        contact_tolerance: [m], greatest distance of the ball from the square of the shield's face,
-            greatest depth of the arm in an obstacle, and distance by which the outer box of the
-            tunnel is enlarged and the inner box reduced.
+        contact_tolerance: [m], greatest distance of the ball from the shield's square face at the
+            contact, and greatest depth of the arm in an obstacle. The ball must be blocked between
+            two boxes: the outer box is enlarged and the inner box reduced by this length.
 
     Returns:
-        A `BlockVerdict`; see `referee_hits`. The offset and the tilt may be infinite too.
+        A `BlockVerdict` of float64 arrays. A plan with numbers that are not finite fails as "not
+        finite". Limits of a case, also of its `offset` and `tilt`, may be infinite.
 
     Raises:
         ValueError: a leaf has the wrong shape.
@@ -144,7 +147,7 @@ def referee_blocks(
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Read all arrays and check their shapes; return them, and the link of each capsule."""
+    """Read the arrays of cases and plans by name, and the index of each capsule's link."""
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
@@ -171,7 +174,7 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
-    """Judge one chunk of a batch of plans, and return the fields of `BlockVerdict` by name."""
+    """Judge some plans of a batch, and return the fields of `BlockVerdict` by name."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # Time [s] from the end of the arm's motion to the contact with the ball.
@@ -211,7 +214,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
 def _times(case: dict, stays: np.ndarray) -> tuple:
     """Test the contact time and the pieces' durations; return (failed, error [s], contact time).
 
-    `stays` (B,) [s] is the time from the end of the motion to the contact.
+    `stays` (B,) [s] is the time from the end of each of B motions to the contact with the ball.
     """
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
@@ -221,15 +224,19 @@ def _times(case: dict, stays: np.ndarray) -> tuple:
 
 @dataclasses.dataclass(frozen=True)
 class _Motion:
-    """Joint angles of B arms as polynomials in M pieces."""
+    """Joint angles of B arms as polynomials of degree D in M pieces."""
 
-    coeffs: np.ndarray  # (D + 1, 6, B, M), rising powers of the time [s] since the piece's start
+    # (D + 1, 6, B, M), coefficients of rising powers of the time [s] since the piece's start.
+    coeffs: np.ndarray
     durations: np.ndarray  # (B, M) [s]
     starts: np.ndarray  # (B, M) [s]
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return angles, rates and accelerations at their extrema and at ends of pieces, with times."""
+    """Return joint angles, rates and accelerations at their extrema and at the ends of pieces.
+
+    Each of the three is returned with its times [s] since the start of the piece.
+    """
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []
@@ -237,8 +244,9 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
         values = derivative(motion.coeffs, times, order)
         found.append((values, times))
         if order >= degree:
-            continue  # a constant derivative has no roots
-        # Between two extrema the derivative is monotonic, and has at most one root.
+            continue  # a constant derivative has no extrema
+        # Between two of its extrema the derivative is monotonic, and has at most one root. A root
+        # of a derivative is an extremum of the next lower derivative.
         low, high, is_below = times[:-1], times[1:], values[:-1] < 0.0
         for _ in range(_HALVINGS):
             middle = 0.5 * (low + high)
@@ -249,7 +257,10 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each plan's greatest of values (K, 6, B, M), its time (B,) [s] and its joint (B,)."""
+    """Find for each of B plans the greatest excess over a joint's limit, its time and its joint.
+
+    `excess` (K, 6, B, M) has K values for each of six joints and M pieces; the results are (B,).
+    """
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -258,7 +269,11 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test a motion's start, continuity and limits; return measurements, tests and worst joints."""
+    """Test the start, continuity and joint limits of motions.
+
+    Returns measurements, tests (failed, excess, time), and the joint with the greatest excess, each
+    by name. `extremes` is the result of `_extremes`.
+    """
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -288,7 +303,11 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test that the motion ends at standstill where it must; also return the fastest joint (B,)."""
+    """Test that a motion ends at standstill if the case requires it or the contact is later.
+
+    `stays` (B,) [s] is the time from the motion's end to the contact, for B plans. Returns the test
+    (failed, excess, time), and the name (B,) of the fastest joint.
+    """
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -303,7 +322,10 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return the least distance (B,) [m] to each kind of obstacle, its time and its part."""
+    """Return for each kind of obstacle the least distance (B,) [m], its time and the arm's part.
+
+    `turning` (B, M) [rad/s] bounds the norm of the joint rates in M pieces of each of B plans.
+    """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
@@ -331,7 +353,11 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (B, S) [s] and angles (6, B, S) [rad], `count` (B, M) samples a piece."""
+    """Sample the motions of B plans at S times: return times (B, S) [s], angles (6, B, S) [rad].
+
+    Piece m of plan b is divided into count[b, m] equal steps; `sample` has the indices (S,) of the
+    samples, and indices behind the last piece repeat its end.
+    """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
     rows, lanes = np.arange(len(lanes))[:, None], lanes[:, None]
@@ -343,7 +369,10 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Test ball, tilt and tunnel at the contact with joint angles (6, B), and measure them."""
+    """Test at the contact the ball's position on the shield, the shield's tilt, and the boxes.
+
+    `angles` (6, B) [rad] are the joint angles of B plans. Returns measurements and tests by name.
+    """
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
@@ -364,11 +393,14 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test that at the contact the ball is in the outer box and has not entered the inner box."""
+    """Test that at the contact the ball is in the outer box and has not entered the inner box.
+
+    `contact` [m] enlarges the outer box and shrinks the inner box.
+    """
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """Return the error (B,) [s] if the outer box grows and the inner box shrinks by `grown`."""
+        """Return the time [s] by which the contact is too early or too late, for changed boxes."""
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)
@@ -379,10 +411,11 @@ def _tunnel(case: dict, contact: float) -> tuple:
 
 
 def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times (2, B) [s] at which balls enter and leave a box, while rising and falling.
+    """Return the times at which the balls of B cases enter a box and at which they leave it.
 
-    The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. A ball that is
-    never inside enters at infinity and leaves at minus infinity.
+    Both results are (2, B) [s]: a ball may pass the box while it rises (row 0) and while it falls
+    (row 1). The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. A ball
+    that is never inside enters at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown

@@ -5,8 +5,9 @@ checks the flight, this module the plan's order of targets, its catch times and 
 positions. Only extra limits (`referee.extras`) are code that planners use too. World frame, z up,
 SI units.
 
-Equations of [Yu2023catch]: eq. 9 ball with linear drag, eq. 22 net centre p + l z_d, eq. 25 angle
-between z_d and minus the ball's velocity, with the unit vector z_d along the thrust.
+Equations of [Yu2023catch]: a ball with linear drag (eq. 9); the net's centre p + l z_d at the
+height l above the quadrotor's position p (eq. 22); and the angle between z_d and minus the ball's
+velocity (eq. 25). The unit vector z_d points along the thrust.
 """
 
 import dataclasses
@@ -56,7 +57,8 @@ _SENTENCES = {
 }
 LIMITS = tuple(_SENTENCES)
 
-# [m/s] A slower target counts as standing still: the direction of its velocity is rounding error.
+# [m/s] A slower target counts as standing still, and the angle between net and velocity is not
+# tested, because rounding determines the direction of so small a velocity.
 SLOWEST_TARGET = 1e-6
 
 
@@ -65,17 +67,19 @@ class CatchVerdict(FlightVerdict):
     """Verdict on B plans in which a quadrotor catches up to N targets each.
 
     Arrays (B, N) are in the order of the catches, like the plan's `order` and `times`. Their
-    entries are NaN after the last catch, and where the plan names a wrong target.
+    entries are NaN after the last catch, and where the plan names an absent or repeated target.
     """
 
     SENTENCES = _SENTENCES
     UNBOUNDED = MOTION_UNBOUNDED
 
     net_distance: np.ndarray  # (B, N) [m], from the net's centre to the target at the catch
-    net_offset: np.ndarray  # (B, N) [m], component along z_d: height above the hoop's plane
-    angle: np.ndarray  # (B, N) [rad], z_d to minus the target's velocity; NaN if it stands still
+    net_offset: np.ndarray  # (B, N) [m], height of the target above the hoop's plane at the catch
+    # (B, N) [rad], angle between the net's axis and minus the target's velocity; NaN for a target
+    # that stands still.
+    angle: np.ndarray
     catch_times: np.ndarray  # (B, N) [s], end of the pieces up to each catch
-    caught: np.ndarray  # (B, N) bool, the tests of order, catch time, net and angle pass
+    caught: np.ndarray  # (B, N) bool, whether the tests of order, catch time, net and angle pass
     num_caught: np.ndarray  # (B,) int, number of caught targets
 
     def success_message(self, k: int | tuple) -> str:
@@ -108,28 +112,29 @@ def referee_catches(
     `tolerance=0.05, net_test="ball"` reproduce the success criterion of [Yu2023catch].
 
     Args:
-        cases: object with the fields of `CatchCase`, leaves with leading axis B; leaves of
-            `targets` have (B, N). Unless `optional`, all present targets must be caught. The case's
-            own order and times are not read.
-        plans: object with the fields of `CatchPlan`, leaves with leading axis B; coefficients (B, N
-            * M, D + 1, 3), durations (B, N * M).
+        cases: object with the fields of `CatchCase`, for B cases of N targets. Unless `optional`,
+            all present targets must be caught. The case's own order and times are not read.
+        plans: object with the fields of `CatchPlan`, for B plans of polynomial pieces of degree D:
+            coefficients (B, N * M, D + 1, 3), durations (B, N * M).
         target_states: function `(targets, order, times) -> (pos, vel)` for targets of other
             classes, with order (B, N) int, times (B, N) [s], pos and vel (B, N, 3) [m], [m/s].
             Entry [b, i] is of target `order[b, i]` of case b at `times[b, i]`. Values for absent
             targets are ignored. If passed, the function is called for the known classes too.
-        net_test: "plane" requires the target in the hoop's plane, to `contact_tolerance`, and
-            within the net's radius there. "ball" requires it within the radius of the centre.
+        net_test: "plane" requires that the target is within `contact_tolerance` of the hoop's plane
+            and within the net's radius of the hoop's axis. "ball" requires only that the target is
+            within the net's radius of the hoop's centre.
         tolerance: relative tolerance of all limits of the case, also of the net's radius and angle.
         contact_tolerance: [m], greatest distance between target and hoop's plane at the catch.
-        continuity_tolerance: see `referee_hits`.
+        continuity_tolerance: greatest displacement at time 0 and between pieces, relative to the
+            largest coordinate at the ends of the pieces (at least 1 m).
 
     Returns:
-        A `CatchVerdict`; see `referee_hits`. The net's radius, its angle and a horizon may be
-        infinite too.
+        A `CatchVerdict` of float64 arrays. A plan with numbers that are not finite fails as "not
+        finite". Limits of a case, also the net's radius, its angle and a horizon, may be infinite.
 
     Raises:
-        ValueError: see `referee_hits`; or the class of the targets is not known, or `net_test` is
-            neither "plane" nor "ball".
+        ValueError: an array has the wrong shape, the class of the targets is not known, or
+            `net_test` is neither "plane" nor "ball".
     """
     if net_test not in ("plane", "ball"):
         raise ValueError(f'net_test must be "plane" or "ball", got {net_test!r}')
@@ -162,7 +167,7 @@ def referee_catches(
 
 
 def _read(cases, plans) -> dict[str, np.ndarray]:
-    """Read all arrays of cases and plans except the targets, and check their shapes."""
+    """Read the arrays of cases and plans by name, except the targets, and check their shapes."""
     coeffs, present = check_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
@@ -178,17 +183,20 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Return the catch times (B, N) [s] from the durations (B, N * M) of the pieces."""
+    """Return the catch times (B, N) [s]: the ends of N groups of pieces of equal number."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 
 
 def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of targets `order` (B, N) at `times` (B, N) [s]."""
+    """Return positions and velocities (B, N, 3) of targets at the times of their catches.
+
+    Entry [b, i] is of target order[b, i] of case b at times[b, i] [s].
+    """
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        """Return one array (B, N, ...) of the targets, sorted in the order of the catches."""
+        """Return an array of the targets, with its axis 1 sorted in the order of the catches."""
         value = check_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
@@ -227,11 +235,12 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
 
 
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of balls with linear drag K [1/s] on each axis.
+    """Return positions and velocities (B, N, 3) of N balls of B cases, with linear drag.
 
-    The position is s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K with x = K t [Yu2023catch, eq. 9].
-    It is computed as s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x. For
-    small x, the series h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
+    With the drag K [1/s], the start s_0, v_0, the gravity g and x = K t, the position is
+    s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K [Yu2023catch, eq. 9]. It is computed as
+    s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x, which allows K = 0.
+    For small x, the series h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
     """
     times = times[..., None]
     x = drag * times
@@ -248,10 +257,10 @@ def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarr
 
 
 def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
-    """Interpolate positions and velocities (B, N, 3) at `times` from tables with equal time steps.
+    """Interpolate positions and velocities of targets, which are stored at equal time steps.
 
-    Node k of a table is at time (k - 1) * resolution. The interpolation is cubic convolution with a
-    = -1/2 [Keys1981]. Outside the table the target keeps its first or last velocity.
+    Entry k of a table is at time (k - 1) * resolution. The interpolation is cubic convolution with
+    the parameter a = -1/2 [Keys1981]. Before and after the table's times the velocity is constant.
     """
     last = pos.shape[2] - 3
     inside = np.minimum(np.maximum(times, 0.0), last * resolution)
@@ -273,7 +282,7 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 def _judge(
     case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
 ) -> dict:
-    """Judge one chunk of a batch of plans, and return the fields of `CatchVerdict` by name."""
+    """Judge some plans of a batch, and return the fields of `CatchVerdict` by name."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)
@@ -290,8 +299,8 @@ def _judge(
     wrong = (~right).sum(axis=1).astype(np.float64)
     order_test = (wrong > 0.0, wrong, ends[lanes, right.argmin(axis=1)])
     held = due & right
-    # The arrays (B, N) are sorted in the order of the catches. Entries without a catch get neutral
-    # values, since the caller may have stored any numbers there.
+    # These arrays have one entry for each catch. Entries behind the last catch may hold any
+    # numbers, also NaN. They are replaced by values that pass all tests.
     case = case | {
         "coeffs": np.moveaxis(pieces.coeffs, 0, -1),
         "order": np.where(due, case["order"], 0.0),
@@ -323,10 +332,11 @@ def _judge(
 def _test_order(
     order: np.ndarray, present: np.ndarray, due: np.ndarray, optional: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Test the plan's order (B, N) of targets; return which entries are right, and their targets.
+    """Test the order in which B plans catch N targets; all arrays are (B, N).
 
-    Entries with `due` (B, N) are catches and must name present targets. Other entries must name
-    absent targets, or any targets if targets are optional. No target may be named twice.
+    Entries of `order` where `due` is true are catches and must name present targets. Other entries
+    must name absent targets, or any targets if targets are optional. No target may be named twice.
+    Returns whether each entry is right, and the target that it names.
     """
     num = due.shape[1]
     order = np.nan_to_num(order, nan=-1.0)
@@ -340,7 +350,10 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure distance and angle between net and target; return measurements and tests (B, N)."""
+    """Measure and test distance and angle between net and target at the N catches of B plans.
+
+    Returns measurements (B, N), and tests (failed, excess, time) of arrays (B, N), by name.
+    """
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
@@ -348,7 +361,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
     pos, acc = (np.moveaxis(derivative(tail, spans, order), 0, -1) for order in (0, 2))
     thrust = acc + case["gravity"][:, None, None] * [0.0, 0.0, 1.0]
     size = np.linalg.norm(thrust, axis=-1, keepdims=True)
-    # Without thrust z_d is zero, and the angle counts as pi.
+    # Without thrust the net's axis has no direction: it is set to 0, and the angle is set to pi.
     axis = thrust / np.maximum(size, np.finfo(float).tiny)
     centre = pos + case["net.height"][:, None, None] * axis
     miss, vel = case["target pos"] - centre, case["target vel"]
@@ -378,7 +391,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test that the catch times are positive, rise, agree with the pieces, and keep the horizon."""
+    """Test that catch times rise from 0, equal the ends of pieces, and keep the case's horizon."""
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)

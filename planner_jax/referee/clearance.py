@@ -2,23 +2,25 @@
 
 import numpy as np
 
-# Number of distances between a pose and a polygon that are computed together and fit the cache.
+# Greatest number of distances, each between a car's pose and a polygon, that are computed together.
+# The memory of so many fits the processor's cache.
 _PAIRS = 16384
-# [m] Greatest rounding error of a bound of a distance; a shorter edge counts as a point.
+# [m] Greatest rounding error of a bound of a distance. A polygon's edge that is shorter than this
+# length counts as a point.
 _SLACK = 1e-9
 
 
 def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarray) -> tuple:
-    """Return the least distance (B,) [m] of each moving rectangle from N moving polygons.
+    """Return the least distance (B,) [m] of each of B moving rectangles from N moving polygons.
 
-    Also returns the time (B,) [s] of the least distance and the index (B,) of the polygon. Lower
-    bounds of the distance exclude most pairs of a sample and a polygon.
+    Also returns the time (B,) [s] of the least distance and the index (B,) of the polygon. Exact
+    distances are computed only for polygons and times whose lower bound is small enough.
 
     Args:
         group: the polygons, as arrays "centre" [m] and "velocity" [m/s] (B, N, 2), "corners" (B, N,
-            V, 2) [m] relative to the centre, and "present" (B, N).
+            V, 2) [m] of V corners relative to the centre, and "present" (B, N).
         half: (B, 2) [m], half sides of the rectangles.
-        times: (B, S) [s], of the samples.
+        times: (B, S) [s], S times at which the distance is sampled.
         poses: (B, S, 3), pose of the rectangle's middle: x [m], y [m], heading [rad].
     """
     num_lanes, num_samples, num = *times.shape, group["present"].shape[1]
@@ -36,7 +38,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
     apart = np.sqrt(apart) - reach[:, None]  # infinite for absent polygons
 
     def exact(lane: np.ndarray, sample: np.ndarray, which: np.ndarray) -> np.ndarray:
-        """Return the exact distances (P,) [m] of P pairs of a sample and a polygon."""
+        """Return the exact distance [m] of plan lane[k] from polygon which[k] at time sample[k]."""
         parts = [np.zeros(0)]
         for part in (slice(k, k + _PAIRS) for k in range(0, len(lane), _PAIRS)):
             b, s, n = lane[part], sample[part], which[part]
@@ -46,13 +48,14 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
         return np.concatenate(parts)
 
     def closest(bound: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return the index of each plan's least `bound` (P,); `of` (P,) has rising plan indices."""
+        """Return for each plan the index of its least `bound`; of[k] is the plan of bound[k]."""
         lowest = np.full(num_lanes, np.inf)
         np.minimum.at(lowest, of, bound)
         hits = np.flatnonzero(bound == lowest[of])
         return hits[np.unique(of[hits], return_index=True)[1]]
 
-    # Any exact distance is an upper bound of the least distance; a second pair may lower it.
+    # Each exact distance is an upper bound of the least distance. Pairs of a time and a polygon
+    # whose lower bound is above it are excluded, first by circles, then by the polygon's edges.
     lanes = np.arange(num_lanes)
     sample, which = np.divmod(apart.reshape(num_lanes, num_samples * num).argmin(axis=1), num)
     upper = exact(lanes, sample, which) + _SLACK
@@ -77,7 +80,7 @@ def clearances(group: dict, half: np.ndarray, times: np.ndarray, poses: np.ndarr
 
 
 def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return outward unit normals (..., V, 2) and offsets (..., V) [m] of the edges of polygons."""
+    """Return the outward unit normals n and the offsets d [m] of polygons' edges: n . x = d."""
     edge = np.roll(corners, -1, axis=-2) - corners
     area = (corners[..., 0] * edge[..., 1] - corners[..., 1] * edge[..., 0]).sum(axis=-1)
     length = np.linalg.norm(edge, axis=-1)
@@ -88,16 +91,15 @@ def _edges(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _separation(corners, normals, pose, half) -> np.ndarray:
-    """Return distances (P,) [m] of rectangles from polygons; minus the depth where they overlap.
+    """Return distances [m] of rectangles from polygons; minus the depth where they overlap.
 
-    If the greatest gap along the normals of all edges is negative, it is minus the depth. Otherwise
-    the distance is between a corner and an edge. `half` (P, 2) [m] are half sides of the
-    rectangles.
+    The gap along the normal of each edge is computed. If the greatest gap is negative, it is minus
+    the depth of the overlap. Otherwise the distance is between a corner of one shape and an edge of
+    the other. `half` has the half sides [m] of each rectangle.
     """
     cos, sin = np.cos(pose[:, 2, None]), np.sin(pose[:, 2, None])
 
     def rotate(vectors: np.ndarray) -> np.ndarray:
-        """Rotate vectors (P, V, 2) into the rectangle's frame."""
         x, y = vectors[..., 0], vectors[..., 1]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=2)
 

@@ -15,28 +15,30 @@ from planner_jax.referee.quadrotor import Pieces
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """An extra of a case that is a limit. Extras without `excess` are terms of the cost."""
+    """A limit that a user adds to a case; other objects in `extras` are terms of the cost."""
 
     def excess(self, pos: np.ndarray, vel: np.ndarray, acc: np.ndarray) -> np.ndarray:
-        """Return the relative excess (...) over the limit, positive where the limit fails.
+        """Return the relative excess over the limit, positive where the limit is exceeded.
 
-        Position [m], velocity [m/s] and acceleration [m/s^2] are (..., 3).
+        Position [m], velocity [m/s] and acceleration [m/s^2] are (..., 3), the result is (...).
         """
         ...
 
 
-# Number of refined intervals, and of refinements, each to a quarter of the interval's length.
+# Number of intervals between samples that are searched more finely, and number of their
+# refinements. Each refinement reduces an interval to a quarter of its length.
 _REFINED, _REFINEMENTS = 6, 4
-# Assumed change of the excess between two samples where a neighbouring sample is missing.
+# Assumed change of the excess beyond the first and the last sample of a piece. It is so large that
+# the bound of the excess in an interval follows from the samples on the other side alone.
 _STEEP = 1e9
 
 
 def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray) -> tuple:
-    """Find each plan's greatest relative excess (B,) over extra limits, its time and its limit.
+    """Find each plan's greatest relative excess over limits in `extras`, its time and its limit.
 
-    The excess is sampled at fractions u of every piece. Between samples the search refines the
-    likeliest intervals. The limit is returned as its index in `extras`; without an extra limit the
-    index and the excess are -1.
+    The excess is sampled at fractions u of every piece. The intervals between samples that most
+    likely contain a greater excess are sampled more finely. All results are (B,); the limit is an
+    index in `extras`. Without an extra limit the index and the excess are -1.
 
     Args:
         pieces: trajectories of B plans.
@@ -56,7 +58,6 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
 
 
 def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[float, float]:
-    """Return the greatest relative excess of one plan over one extra limit, and its time [s]."""
 
     def excess(coeffs: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Evaluate the excess at times (...) [s] since the start of polynomial pieces."""
@@ -92,7 +93,7 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
 
 
 def _of_lane(extra, lane: int) -> ExtraLimit:
-    """Return a copy of the extra that holds the numbers of case `lane` alone, in float64."""
+    """Return the extra limit of case `lane` alone: a copy with this case's numbers in float64."""
     numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
     own = {name: np.asarray(vars(extra)[name], float)[lane] for name in numbers}
     return dataclasses.replace(extra, **own)

@@ -5,7 +5,9 @@ flight. This module integrates the ball up to the impact, which is at the end of
 on to its landing. Only extra limits (`referee.extras`) are code that planners use too. World frame,
 z up, ground at z = 0, SI units.
 
-Equations of [Yu2023bat]: eq. 2 drag, eq. 3 impact (with 1 + beta), eq. 18 limits.
+Equations of [Yu2023bat]: eq. 2 is the drag, eq. 18 the limits, and eq. 3 the impact with the
+coefficient of restitution beta. Eq. 3 prints 1 - beta; this module has 1 + beta, which follows from
+the paper's definition of beta.
 """
 
 import dataclasses
@@ -94,14 +96,12 @@ def referee_hits(
     """Decide for every plan of a batch of hits whether it succeeds.
 
     The impact is at the end of the trajectory. Errors of the state at time 0 and jumps between
-    pieces count as displacement (`referee.quadrotor.joint_errors`). In eight pieces of least snap,
-    computed in float32 with coordinates up to 4.5 m, rounding causes at most 1.3e-4 m, less than a
-    third of the default tolerance.
+    pieces count as displacement (`referee.quadrotor.joint_errors`).
 
     Args:
-        cases: object with the fields of `HitCase`, leaves with leading axis B.
-        plans: object with the fields of `HitPlan`, leaves with leading axis B; coefficients (B, M,
-            D + 1, 3), durations (B, M).
+        cases: object with the fields of `HitCase`, for B cases.
+        plans: object with the fields of `HitPlan`, for B plans of M polynomial pieces of degree D:
+            coefficients (B, M, D + 1, 3), durations (B, M).
         drag_after_impact: whether the ball has drag after the impact too.
         tolerance: relative tolerance of every limit of the case.
         landing_tolerance: [m], greatest horizontal distance between landing point and target.
@@ -139,7 +139,7 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    """Judge one chunk of a batch of plans, and return the fields of `HitVerdict` by name."""
+    """Judge some plans of a batch, and return the fields of `HitVerdict` by name."""
     pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
@@ -149,14 +149,14 @@ def _judge(
 
 
 def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return the acceleration (3, B) of a ball of velocity (3, B): v' = g - K_D |v| v."""
+    """Return the accelerations g - K_D |v| v of balls with velocities v and drag K_D [1/m]."""
     acc = -drag * np.sqrt((vel * vel).sum(axis=0)) * vel
     acc[2] -= gravity
     return acc
 
 
 def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    """Advance position and velocity (6, B) by one Runge-Kutta step (B,) [s] of order 4."""
+    """Advance `state` (6, B), the positions and velocities of B balls, by a Runge-Kutta step."""
     half, sixth, vel = 0.5 * step, step / 6.0, state[3:]
     acc_1 = _ball_acc(vel, drag, gravity)
     acc_2 = _ball_acc(vel + half * acc_1, drag, gravity)
@@ -171,10 +171,11 @@ def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
 
 
 def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, np.ndarray]:
-    """Find the time (B,) [s] within a step at which one entry of the ball's state falls to `level`.
+    """Find the time (B,) [s] within a step at which height or vertical speed falls to `level`.
 
-    The entry is the height (2) or the vertical speed (5). Returns the time and the state (6, B)
-    then. Newton's method starts at the end of the step and converges to the last crossing.
+    `entry` is 2 for the height and 5 for the vertical speed in the states (6, B) of B balls. Also
+    returns the states then. Newton's method starts at the end of the step, so that it converges to
+    the last crossing.
     """
     step = np.full(state.shape[1], _OUTGOING_STEP)
     for _ in range(6):
@@ -185,9 +186,10 @@ def _step_down_to(state, entry: int, level, drag, gravity) -> tuple[np.ndarray, 
 
 
 def _return_in_air(state, height, drag, gravity) -> tuple:
-    """Integrate a ball's flight with quadratic drag until it falls to `height` (B,) [m].
+    """Integrate the flights of B balls with quadratic drag until they fall to `height` (B,) [m].
 
-    Returns apex (B,) [m], its time, landing point (3, B) and its time since the start `state`.
+    Returns the greatest heights (B,) [m] and their times, and the points (3, B) at which the balls
+    fall to `height` and their times. Times [s] count from `state`, the start of the flights.
     """
     before_top, before_end, state = state.copy(), state.copy(), state.copy()
     top_time, end_time = np.zeros_like(height), np.zeros_like(height)
@@ -229,7 +231,7 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """Compute impact and landing; return measurements and tests. Vectors are (3, B)."""
+    """Compute the impact and the ball's landing; return measurements, and tests by limit."""
     durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
     end = durations.sum(axis=1)
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])
@@ -238,7 +240,8 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
     tail = case["coeffs"][:, -1].transpose(1, 2, 0)
     pos, vel, normal = (derivative(tail, durations[:, -1], order) for order in range(3))
     normal[2] += gravity
-    # Without thrust the normal is zero, so the test "wrong face" fails.
+    # Without thrust the racket's normal is zero. The ball's speed along it is then 0, so that the
+    # test "wrong face", which requires a negative speed, fails.
     normal /= np.maximum(np.linalg.norm(normal, axis=0), np.finfo(float).tiny)
     racket = pos + case["racket_height"] * normal
     approach = ((state[3:] - vel) * normal).sum(axis=0)
@@ -286,7 +289,7 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 
 
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
-    """Test that the impact time is positive, ends the trajectory, and is before the landing."""
+    """Test that the impact is at the trajectory's end, and before the ball reaches the ground."""
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)
     height = np.minimum(case["ball.pos"][:, 2], ball[2])

@@ -48,7 +48,8 @@ _UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
 
 LONGEST_STEP = 0.02  # [s], greatest time between two samples of the motion
 LONGEST_PLAN = 3600.0  # [s], greatest time of a plan that the referee accepts
-# Gauss-Legendre nodes and weights on (0, 1) for the position, exact for degree 5.
+# Nodes and weights of the Gauss-Legendre quadrature by which velocities are integrated to
+# positions; it is exact for polynomials up to degree 5.
 _NODES = np.polynomial.legendre.leggauss(3)
 _NODE, _WEIGHT = 0.5 * (_NODES[0] + 1.0), 0.5 * _NODES[1]
 
@@ -68,12 +69,12 @@ class InterceptVerdict(Verdict):
     max_acceleration: np.ndarray  # (B,) [m/s^2], |dv/dt|
     rms_acceleration: np.ndarray  # (B,) [m/s^2], sqrt(1/T int (dv/dt)^2 dt)
     max_curvature: np.ndarray  # (B,) [1/m], magnitude
-    max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of atan(wheelbase * curvature)
+    max_steering_rate: np.ndarray  # (B,) [rad/s], magnitude, of the angle atan(wheelbase curvature)
     max_lateral_acceleration: np.ndarray  # (B,) [m/s^2], magnitude, of the rear axle
     wall_clearance: np.ndarray  # (B,) [m], least distance of the body from a wall
     mover_clearance: np.ndarray  # (B,) [m], least distance from a moving obstacle
     nearest_wall: np.ndarray  # (B,) int, index of the nearest wall, or -1
-    nearest_mover: np.ndarray  # (B,) int, index of the nearest mover, or -1
+    nearest_mover: np.ndarray  # (B,) int, index of the nearest moving obstacle, or -1
     miss: np.ndarray  # (B,) [m], from the body's middle to the target when the plan ends
     meeting_time: np.ndarray  # (B,) [s], when the plan ends
 
@@ -94,14 +95,14 @@ def referee_intercepts(
 ) -> InterceptVerdict:
     """Decide for every plan of a batch of interceptions whether it succeeds.
 
-    Speed and curvature are linear between knots, so the heading is a cubic polynomial of time.
-    Gauss-Legendre quadrature integrates the position between samples, exact to rounding. Speed,
-    acceleration, curvature, steering rate and lateral acceleration are compared with their limits
-    at their extrema, not at samples.
+    Speed and curvature are linear between the plan's K + 1 knots in time, so the heading is a cubic
+    polynomial of time. Gauss-Legendre quadrature integrates the position between samples, exact to
+    rounding. Speed, acceleration, curvature, steering rate and lateral acceleration are compared
+    with their limits at their extrema, not at samples.
 
-    Map, walls and movers are tested at the knots and at samples between them, at most
-    `LONGEST_STEP` apart: a car at 1.5 m/s drives 3 cm in this time. At a sample the distance
-    between rectangle and convex polygon is exact.
+    The distances of the car's body from the map's border, from walls and from moving obstacles
+    (movers) are tested at the knots and at samples between them, at most `LONGEST_STEP` apart: a
+    car at 1.5 m/s drives 3 cm in this time. At a sample the distance from a polygon is exact.
 
     Target positions are computed in float64 for paths with the fields of `TurningPath` (recognised
     by `turn_rate`), `PolynomialPath` (`coeffs`), or a `LaterPath` (`path` and `begin`) of either.
@@ -109,13 +110,11 @@ def referee_intercepts(
     calls too.
 
     Args:
-        cases: object with the fields of `InterceptCase`, leaves with leading axis B. Polygons
-            are convex, in either orientation, and may repeat corners. Values of absent obstacles
-            are ignored.
-        plans: object with the fields of `InterceptPlan`, leaves with leading axis B; speed and
-            curvature (B, K + 1).
-        truth: true path of the target, with leading axis B; it replaces `cases.target`, which may
-            be a prediction.
+        cases: object with the fields of `InterceptCase`, for B cases. Polygons are convex, in
+            either orientation, and may repeat corners. Values of absent obstacles are ignored.
+        plans: object with the fields of `InterceptPlan`, for B plans; speed and curvature are (B,
+            K + 1).
+        truth: true paths of the B targets; they replace `cases.target`, which may be a prediction.
         target_positions: function `(target, times (B,) [s]) -> positions (B, 2) [m]` for targets
             of other classes. If passed, it is called for the known classes too.
         tolerance: relative tolerance of every limit of the car, of the case's tolerance and its
@@ -125,7 +124,8 @@ def referee_intercepts(
             its middle outside the map.
 
     Returns:
-        An `InterceptVerdict`; see `referee_hits`. Tolerances and the map's bounds may be infinite.
+        An `InterceptVerdict` of float64 arrays. A plan with numbers that are not finite fails as
+        "not finite". Limits, tolerances and the map's bounds may be infinite.
 
     Raises:
         ValueError: a leaf has the wrong shape, or the class of the target is not known.
@@ -151,7 +151,7 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Read all arrays of cases and plans except the target, and check their shapes."""
+    """Read the arrays of cases and plans by name, except the target, and check their shapes."""
     speed = np.asarray(plans.speed)
     if speed.ndim != 2 or speed.shape[1] < 2:
         raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
@@ -164,7 +164,7 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
-    """Return the arrays of walls or movers by name; the numbers of absent obstacles are zero."""
+    """Return the arrays of walls or moving obstacles by name; for absent obstacles all are zero."""
     corners = np.asarray(group.corners)
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
@@ -181,7 +181,7 @@ def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
 
 
 def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
-    """Return the positions (B, 2) [m] of targets of the library's classes at times (B,) [s]."""
+    """Return the positions (B, 2) [m] of B targets of the library's classes at `times` (B,) [s]."""
     fields, batch = getattr(target, "__dict__", {}), times.shape
 
     def leaf(name: str, *trailing: int) -> np.ndarray:
@@ -208,7 +208,7 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
 
 
 def _judge(case: dict, relative: float, contact: float) -> dict:
-    """Judge one chunk of a batch of plans, and return the fields of `InterceptVerdict` by name."""
+    """Judge some plans of a batch, and return the fields of `InterceptVerdict` by name."""
     end = case["plan.time"]
     finite = finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
@@ -241,7 +241,7 @@ def _judge(case: dict, relative: float, contact: float) -> dict:
 
 
 def final_poses(plans, body) -> np.ndarray:
-    """Return the rear axles' poses (B, 3) at the end of car plans: x [m], y [m], heading [rad]."""
+    """Return the rear axles' poses (x [m], y [m], heading [rad]) at the end of B plans, (B, 3)."""
     case = {
         "plan.start": plans.start,
         "plan.speed": plans.speed,
@@ -263,12 +263,11 @@ def final_poses(plans, body) -> np.ndarray:
 
 
 def _wrap(angle: np.ndarray) -> np.ndarray:
-    """Wrap angles [rad] to (-pi, pi]."""
     return np.arctan2(np.sin(angle), np.cos(angle))
 
 
 def _start(case: dict, allowed: float) -> tuple:
-    """Test pose, speed and curvature at time 0 against the case; return (failed, error, time)."""
+    """Test that plans start with the case's pose, speed and curvature, to the error `allowed`."""
     away = case["plan.start"] - case["start"]
     errors = [
         np.linalg.norm(away[:, :2], axis=1),
@@ -281,25 +280,26 @@ def _start(case: dict, allowed: float) -> tuple:
 
 
 def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest of M values for each of B plans, and its time (B,) [s]."""
+    """Return the greatest value (B,) of each of B plans, and its time (B,) [s]."""
     lanes, top = np.arange(len(values)), values.argmax(axis=1)
     return values[lanes, top], np.broadcast_to(times, values.shape)[lanes, top]
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure and test the limits of motions whose pieces last `span` (B,) [s]."""
+    """Measure and test speed, curvature and other limits of B motions with pieces of `span` [s]."""
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
     rise, bend = np.diff(v) / h, np.diff(k) / h
-    # The steering angle atan(L k), of wheelbase L and curvature k, changes fastest where |k| is
-    # least, since k is linear in time.
+    # The steering angle atan(L k), of wheelbase L and curvature k, has the rate L k' / (1 + L^2
+    # k^2). In a piece k' is constant, so the rate is greatest where |k| is least.
     zero = np.clip(np.where(bend == 0.0, 0.0, -k0 / bend), 0.0, h)
     zero = np.where(k0 * k1 < 0.0, zero, np.where(np.abs(k0) <= np.abs(k1), 0.0, h))
     least = np.where(k0 * k1 < 0.0, 0.0, np.minimum(np.abs(k0), np.abs(k1)))
     wheelbase = case["body.wheelbase"][:, None]
     steering = np.abs(wheelbase * bend) / (1.0 + (wheelbase * least) ** 2)
-    # The lateral acceleration v^2 k has its extrema where v = 0, and where 2 v' k + v k' = 0.
+    # The lateral acceleration v^2 k, of speed v and curvature k, has its extrema where v = 0, and
+    # where 2 v' k + v k' = 0.
     slope = 3.0 * rise * bend
     inside = np.where(slope == 0.0, 0.0, -(2.0 * rise * k0 + bend * v0) / slope)
     inside = np.clip(inside, 0.0, h)
@@ -328,14 +328,14 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
 
 
 def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Integrate the motion; return times (B, S) [s] and poses (B, S, 3) of the body's middle."""
+    """Integrate B motions to poses (B, S, 3) of the body's middle at S times (B, S) [s] each."""
     v, k = case["plan.speed"][..., None], case["plan.curvature"][..., None]
     num, h = v.shape[1] - 1, span[:, None, None]
     v0, k0 = v[:, :-1], k[:, :-1]
     rise, bend = (np.where(h > 0.0, np.diff(each, axis=1) / h, 0.0) for each in (v, k))
 
     def heading_change(tau: np.ndarray) -> np.ndarray:
-        """Return the heading's change [rad], the integral of v k from each piece's start to tau."""
+        """Integrate speed v times curvature k from each piece's start to its time tau [s]."""
         return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
 
     count = np.maximum(np.ceil(span / LONGEST_STEP - 1e-9), 1.0)
@@ -364,7 +364,10 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Test map, walls and movers at poses (B, S, 3) of the body's middle; measure clearances."""
+    """Test that the car's body stays in the map and off obstacles; also measure the distances.
+
+    `poses` (B, S, 3) are of the body's middle at S `times` of each of B plans.
+    """
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

@@ -24,7 +24,7 @@ from planner_jax.referee.judging import check_leaf
 class GroupVerdict(InterceptVerdict):
     """Verdict on B plans in which a car meets several targets in turn.
 
-    The drive to one target is a leg. Measurements are those of the first leg that fails, or of the
+    The drive to one target is a leg. The measurements describe the first leg that fails, or the
     last leg if all succeed. Times count from the start of the first leg.
     """
 
@@ -52,8 +52,8 @@ def referee_groups(
     case's time.
 
     Args:
-        cases: object with the fields of `InterceptGroup`, leaves with leading axis B.
-        plans: object with the fields of `GroupPlan`, leaves with leading axis B.
+        cases: object with the fields of `InterceptGroup`, for B cases.
+        plans: object with the fields of `GroupPlan`, for B plans.
         target_positions: see `referee_intercepts`.
         **settings: other arguments of `referee_intercepts`, which also lists the errors.
     """
@@ -95,7 +95,10 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """Return cases that start at `begin` (B,) [s] with pose, speed and curvature in `car`."""
+    """Return cases of one target that start at the times `begin` [s] in the state `car`.
+
+    `car` has the pose, the speed and the curvature at the end of the preceding leg.
+    """
     movers, (start, speed, curvature) = shared.movers, car
     centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}
@@ -105,7 +108,7 @@ def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNames
 
 
 def _delay(where: Callable, begin: np.ndarray) -> Callable:
-    """Shift the time origin of `where(target, times)`: times of the result count from `begin`."""
+    """Return the function (target, times) -> where(target, times + begin)."""
     return lambda target, times: where(target, begin + times)
 
 

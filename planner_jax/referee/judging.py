@@ -1,4 +1,7 @@
-"""Parts that the referees of all tasks share: verdicts, checks of shapes, threads and processes."""
+"""Parts that the referees of all tasks share: verdicts, checks of shapes, threads and processes.
+
+A referee is an independent check of plans in float64.
+"""
 
 import dataclasses
 import functools
@@ -13,28 +16,29 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-# Sentence that describes the violation of an upper limit, for most limits of a verdict.
+# Text for the violation of an upper limit: `{excess}` is the relative excess, `{time}` its time.
 ABOVE_LIMIT = "{excess:.2%} above its limit at {time:.3f} s"
 
 
 @dataclasses.dataclass(frozen=True)
 class Verdict:
-    """The referee's decision on B plans, with measurements; for a single plan without batch axis.
+    """The referee's decision on B plans, with measurements.
 
-    Measurements are NaN where the plan or its case is not finite.
+    Arrays (B,) are () in the verdict on a single plan. Measurements are NaN where a number of the
+    plan or of its case is not finite.
     """
 
-    # By limit: the sentence that describes its violation. A sentence may contain `{time}`,
-    # `{excess}` and any field of the verdict. The order of the limits is the order of the tests,
-    # and `failed_limit` is the first limit whose test fails.
+    # For each limit by name, the sentence that describes its violation. A sentence may contain
+    # `{time}`, `{excess}` and any field of the verdict. The limits are tested in this order, and
+    # `failed_limit` is the first limit whose test fails.
     SENTENCES: ClassVar[dict[str, str]]
-    # By limit: the sentence that replaces the one of `SENTENCES` if the excess is infinite.
+    # For some limits by name, the sentence that replaces the sentence above for an infinite excess.
     UNBOUNDED: ClassVar[dict[str, str]] = {}
 
-    success: np.ndarray  # (B,) bool, every limit holds
+    success: np.ndarray  # (B,) bool, whether the plan keeps every limit
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
     failed_time: np.ndarray  # (B,) [s], when that limit is exceeded most; NaN for a success
-    # (B,) greatest excess over the failed limit, in the unit of the limit's sentence. The
+    # (B,) greatest excess over the failed limit, in the unit of the sentence in `SENTENCES`. The
     # tolerance is not subtracted. NaN for a success.
     failed_excess: np.ndarray
 
@@ -61,24 +65,26 @@ class FlightVerdict(Verdict):
 
     max_speed: np.ndarray  # (B,) [m/s]
     max_acceleration: np.ndarray  # (B,) [m/s^2]
-    max_body_rate: np.ndarray  # (B,) [rad/s], infinite where the attitude is undefined
+    max_body_rate: np.ndarray  # (B,) [rad/s], infinite if the attitude is undefined at some time
     min_height: np.ndarray  # (B,) [m]
     min_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     max_thrust: np.ndarray  # (B,) [m/s^2], per unit mass
     min_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
     max_rotor_thrust: np.ndarray  # (B,) [N], of one rotor; NaN if the case does not limit rotors
-    continuity_error: np.ndarray  # (B,) [m], greatest jump between pieces, as displacement
-    head_error: np.ndarray  # (B,) [m], error of the state at time 0, as displacement
+    # Greatest jump of the state between two pieces, and error of the state at time 0; an error of
+    # velocity, acceleration or jerk counts as the displacement that it causes in a piece.
+    continuity_error: np.ndarray  # (B,) [m]
+    head_error: np.ndarray  # (B,) [m]
     worst_extra: np.ndarray  # (B,) int, index of the extra limit with the greatest excess, or -1
 
 
-# [s] Greatest allowed difference between the contact time that a plan reports and the time at
-# which its trajectory makes the contact.
+# [s] Greatest allowed difference between the time of a contact with the ball or target that a plan
+# reports, and the time at the end of the trajectory's last piece before the contact.
 CONTACT_TIME_TOLERANCE = 1e-4
 # A relative excess is divided by the limit, or by this number if the limit is smaller.
 SMALLEST_LIMIT = 1e-3
-_FEWEST_LANES = 256  # least number of plans for one thread: fewer do not repay its start
-# Processes instead of threads judge batches of at least so many plans on at least so many cores.
+_FEWEST_LANES = 256  # least number of plans of a thread; starting a thread for fewer takes longer
+# Least number of plans, and of cores, for which processes judge a batch instead of threads.
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 
@@ -95,8 +101,9 @@ def read_leaves(
 ) -> dict[str, np.ndarray]:
     """Read arrays of cases or plans, by the dotted paths of their fields, and check their shapes.
 
-    `shapes` lack the batch axis B. Names in the result and in errors start with `prefix`. Fields of
-    `tree` that are None are left out.
+    `shapes` are the shapes of the arrays of a single case, without the batch axis of length
+    `num_lanes`. Names in the result and in errors start with `prefix`. Fields of `tree` that are
+    None are left out.
 
     Raises:
         ValueError: an array does not have the shape (B, ...) that `shapes` requires.
@@ -110,7 +117,7 @@ def read_leaves(
 
 
 def flat(values: np.ndarray) -> np.ndarray:
-    """Flatten all axes behind the first: reshape (B, ...) to (B, N), also if B is zero."""
+    """Flatten all axes behind the first: reshape (B, ...) to two axes, also if B is zero."""
     return values.reshape(len(values), math.prod(values.shape[1:]))
 
 
@@ -124,8 +131,9 @@ def judge_in_chunks(
 ) -> dict[str, np.ndarray]:
     """Judge B plans in chunks, and return the fields of their verdict as arrays (B, ...).
 
-    At most `chunk` plans are judged together, to bound the memory. One thread per core judges
-    chunks, or one process per core in batches above `_MANY_LANES` if `judge` can be pickled.
+    At most `chunk` plans are judged together, to bound the memory. The chunks are divided among
+    threads, one for each core. Large batches are divided among processes instead, if `judge` can be
+    pickled.
     """
     num_lanes, num_cores = len(next(iter(leaves.values()))), cores()
     size = min(chunk, max(math.ceil(num_lanes / num_cores), _FEWEST_LANES))
@@ -158,7 +166,7 @@ def _can_be_sent(judge: Callable) -> bool:
 
 
 def cores() -> int:
-    """Return the number of cores to use: the variable `NPROC`, as XLA does, or all available."""
+    """Return the number of cores to use: the environment variable `NPROC`, or all that exist."""
     setting = os.environ.get("NPROC", "")
     if setting.isdecimal():
         return max(int(setting), 1)
@@ -169,7 +177,7 @@ def cores() -> int:
 
 
 def finite_lanes(case: dict, unbounded: tuple[str, ...] = ()) -> np.ndarray:
-    """Test whether all numbers of B plans are finite; limits and `unbounded` may be infinite."""
+    """Test which plans have finite numbers only; limits and fields `unbounded` may be infinite."""
     finite = np.ones(len(next(iter(case.values()))), bool)
     for name, leaf in case.items():
         limit = "limits." in name or name in unbounded
@@ -182,10 +190,10 @@ def first_failures(tests: dict, limits: tuple[str, ...], finite: np.ndarray) -> 
     """Find the first failed limit of each plan, and return the fields of `Verdict`.
 
     Args:
-        tests: by name of a limit, the arrays (failed, excess, time), each (B,).
+        tests: by name of a limit, the arrays (failed, excess, time), each (B,) for B plans.
         limits: "not finite", then the names of limits in the order of the tests. A limit without
             an entry in `tests` is skipped.
-        finite: (B,) bool, all numbers of the plan and its case are finite.
+        finite: (B,) bool, whether all numbers of the plan and its case are finite.
     """
     limits = (limits[0], *(name for name in limits[1:] if name in tests))
     failed, excess, time = (
@@ -213,7 +221,10 @@ def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarr
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate derivatives of polynomials with coefficients (D + 1, 3, ...) at times (...) [s]."""
+    """Evaluate the derivative of an order of polynomials at `times` (...) [s].
+
+    `coeffs` (D + 1, ...) are coefficients of rising powers, up to the degree D.
+    """
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

@@ -24,16 +24,16 @@ from planner_jax.referee.judging import (
 
 @dataclasses.dataclass(frozen=True)
 class Pieces:
-    """Polynomial pieces of B trajectories in float64.
+    """Polynomial pieces of B trajectories in float64: M pieces of degree D each.
 
-    A piece that the plan does not fly is a copy of the last flown piece before it, so that the
-    extreme values of the trajectory do not change.
+    Some pieces of a plan may be unused, such as pieces for absent targets. In their place there is
+    a copy of the last used piece before them, which does not change the trajectory's extrema.
     """
 
     coeffs: np.ndarray  # (3, B, M, D + 1)
     durations: np.ndarray  # (B, M) [s]
     starts: np.ndarray  # (B, M) [s]
-    flown: np.ndarray  # (B, M) bool
+    flown: np.ndarray  # (B, M) bool, whether a piece is used
 
     def of(self, lanes: slice) -> "Pieces":
         """Return the pieces of the trajectories in the slice `lanes` of the batch."""
@@ -42,9 +42,10 @@ class Pieces:
 
 
 def pieces_of(coeffs: np.ndarray, durations: np.ndarray, flown: np.ndarray | None = None) -> Pieces:
-    """Build `Pieces` from coefficients (B, M, D + 1, 3) and durations (B, M) [s].
+    """Build the `Pieces` of B trajectories of M polynomials of degree D.
 
-    `flown` (B, M) bool marks the flown pieces, by default all; others must have zero duration.
+    Coefficients are (B, M, D + 1, 3), durations (B, M) [s]. `flown` (B, M) bool marks the pieces
+    that are used, by default all; the others must have zero duration.
     """
     coeffs = np.moveaxis(coeffs, -1, 0)
     starts = np.cumsum(durations, axis=1) - durations
@@ -97,22 +98,26 @@ MOTION_SENTENCES = {
 MOTION_UNBOUNDED = {"body rate": "no thrust or upside down, so without attitude, at {time:.3f} s"}
 _ROTOR_SHAPES = {"mass": (), "inertia": (3,), "mixer": (4, 4), "min_thrust": (), "max_thrust": ()}
 
-# [s] Least h with which an error e of the n-th derivative counts as |e| h^n / n! of displacement.
+# [s] An error e of the n-th derivative of the position counts as the displacement |e| h^n / n!,
+# where h is the mean duration of a piece, but at least this number.
 SHORTEST_PIECE = 0.1
-_INTERVALS = 400  # least number of sample intervals between two contacts
-_FEWEST_INTERVALS = 16  # least number of sample intervals of one polynomial piece
+_INTERVALS = 400  # least number of intervals between samples, from contact to contact
+_FEWEST_INTERVALS = 16  # least number of intervals between samples in one polynomial piece
 # Greatest number of multiplications in one matrix product, and of plans whose maxima are searched
-# together. Both keep the data in the cache, and OpenBLAS from starting its own threads.
+# together. So few numbers fit the processor's cache, and OpenBLAS starts no threads for them.
 _PRODUCT, _SEARCHED = 250_000, 1024
 
 
 def intervals_of(num_pieces: int) -> int:
-    """Return the number of sample intervals per piece, for `num_pieces` between two contacts."""
+    """Return into how many intervals a piece is divided, for `num_pieces` between two contacts."""
     return max(math.ceil(_INTERVALS / num_pieces), _FEWEST_INTERVALS)
 
 
 def check_coeffs(value: ArrayLike) -> np.ndarray:
-    """Convert coefficients to an array; raise a ValueError unless it is (B, M, D + 1, 3)."""
+    """Convert coefficients to an array; raise a ValueError unless its shape is (B, M, D + 1, 3).
+
+    B trajectories have M polynomial pieces of degree D each.
+    """
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
@@ -139,7 +144,10 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Evaluate position to jerk, each (3, B, M, S), at fractions u (S,) of all pieces."""
+    """Evaluate position, velocity, acceleration and jerk at fractions u (S,) of all pieces.
+
+    Each is (3, B, M, S), for B plans of M pieces.
+    """
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
@@ -154,12 +162,11 @@ def _motion(pieces: Pieces, u: np.ndarray) -> list:
 
 
 def _norm_squared(vector: np.ndarray) -> np.ndarray:
-    """Return the squared norm of vectors (3, ...)."""
     return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """Return the squared thrust per unit mass, |a + g e_3|^2, for accelerations a (3, ...)."""
+    """Return the squared thrust per unit mass, |a + g e_z|^2, for accelerations a (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
@@ -182,7 +189,9 @@ def _body_rate_squared(gravity, acc: np.ndarray, jerk: np.ndarray) -> np.ndarray
 
 
 # Quantities whose maximum along the trajectory is searched. Each entry has the orders of the
-# derivatives of the position that the quantity needs, and the function that computes it.
+# position's derivatives from which the quantity is computed, and the function that computes it.
+# "depth" is minus the height, and "weakness" minus the squared thrust: their maxima are minima of
+# height and thrust.
 _MEASURES = {
     "speed": ((1,), lambda gravity, vel: _norm_squared(vel)),
     "acceleration": ((2,), lambda gravity, acc: _norm_squared(acc)),
@@ -194,11 +203,11 @@ _MEASURES = {
 
 
 def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the greatest of samples (N, M, S) of M pieces, and where the true maximum likely is.
+    """Find the greatest of S samples in each of M pieces, and where the true maximum likely is.
 
-    Returns arrays (N,): the index of the greatest of the M S samples, its value, and the index of
-    the sample next to the highest vertex of all parabolas through three neighbours. Overwrites
-    `values`.
+    `values` (N, M, S) are samples of N trajectories, and are overwritten. Returns arrays (N,): the
+    index of the greatest of the M * S samples, its value, and the index of the sample next to the
+    highest vertex of all parabolas through three neighbours.
     """
     line, rows = values.ravel(), flat(values)
     top = rows.argmax(axis=1)
@@ -213,10 +222,11 @@ def _tops(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tuple]:
-    """Find the maximum (B,) of every quantity of `_MEASURES` along the trajectory, and its time.
+    """Find the maxima of speed, acceleration, thrust and others along trajectories, by name.
 
-    Every piece is sampled at both ends and inside. The search then starts at the highest vertex of
-    a parabola through three samples, and evaluates the polynomial itself at ever closer times.
+    Each result has two arrays: the maximum of each plan, and its time. Every piece is sampled at
+    both ends and inside. The search then starts at the highest vertex of a parabola through three
+    samples, and evaluates the polynomial itself at ever closer times.
     """
     u = np.linspace(0.0, 1.0, intervals + 1)
     parts = [_peaks(pieces.of(lanes), gravity[lanes], u) for lanes in cut(len(gravity), _SEARCHED)]
@@ -248,7 +258,10 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """Sample the six `_MEASURES`; return `_tops` of each, (6, B), and `_fastest_turn`, (B,)."""
+    """Sample the six quantities `_MEASURES` of B plans at fractions `u` of each piece.
+
+    Returns the three results (6, B) of `_tops`, and the two results (B,) of `_fastest_turn`.
+    """
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
@@ -260,14 +273,17 @@ def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the time (B,) [s] of sample `index` (B,) among the samples of all pieces of a plan."""
+    """Return the time [s] of sample index[b] among the samples of all pieces of each plan b."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Refine the maximum (B,) of a quantity near the sample `likeliest`; also return its time."""
+    """Refine each plan's maximum of the quantity `name`, and its time, near one sample.
+
+    `likeliest` has the index of this sample among the samples of all pieces, for each plan.
+    """
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
@@ -283,15 +299,14 @@ def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tup
 
 
 def _greater(first: tuple, second: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greater of two (value, time) pairs for each plan; all arrays are (B,)."""
     better = second[0] > first[0]
     return np.where(better, second[0], first[0]), np.where(better, second[1], first[1])
 
 
 def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Find the fastest rotation of the thrust between two neighbouring samples.
+    """Find the fastest rotation of each plan's thrust between two neighbouring samples.
 
-    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] of the step.
+    Returns the index of the first sample, and the squared mean rate [rad^2/s^2] between the two.
     """
     tau = acc.copy()
     tau[2] += gravity
@@ -310,13 +325,13 @@ def _fastest_turn(acc, gravity, pieces: Pieces, u: np.ndarray) -> tuple[np.ndarr
 
 
 def joint_errors(pieces: Pieces, head_state: np.ndarray) -> tuple:
-    """Return how far a trajectory is off its state at time 0, and its jumps between pieces.
+    """Measure how far B trajectories are off their states at time 0, and jumps between pieces.
 
     Returns arrays (B,): error at time 0 [m], greatest jump [m], time of this jump [s], and a scale
     [m]. An error e_n of the n-th derivative (n = 0..3) counts as the displacement |e_n| h^n / n!
     over the mean duration h of a piece, at least `SHORTEST_PIECE`. The scale is the largest
-    coordinate at the ends of the pieces, at least 1 m. The head state (B, 4, 3) is position,
-    velocity, acceleration and jerk at time 0.
+    coordinate at the ends of the pieces, at least 1 m. `head_state` (B, 4, 3) is the required
+    position, velocity, acceleration and jerk at time 0.
     """
     durations, flown = pieces.durations, pieces.flown
     coeffs = np.moveaxis(pieces.coeffs, -1, 0)
@@ -372,8 +387,8 @@ def judge_motion(
         "continuity": (jump > allowed, jump, jump_time),
         "extra": (beyond > relative, beyond, at),
     }
-    # By test: the quantity in `found`, the measurement, the limit's field in the case, and the sign
-    # (1 for an upper limit, -1 for a lower limit).
+    # For each test by name: the quantity in `found`, the name of the measurement, the field of the
+    # case that holds the limit, and 1 for an upper limit or -1 for a lower limit.
     bounds = {
         "speed": ("speed", "max_speed", "speed", 1.0),
         "acceleration": ("acceleration", "max_acceleration", "acceleration", 1.0),

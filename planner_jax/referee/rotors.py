@@ -1,7 +1,8 @@
 """Thrusts of a quadrotor's four rotors along a trajectory, for the referee, in float64 NumPy.
 
 Attitude and body rate follow from thrust and jerk (Hopf fibration at zero heading). The angular
-acceleration is a central difference of body rates; the planners compute it from the snap.
+acceleration is a central difference of body rates, so that the referee is independent of the
+planners, which compute it from the snap.
 """
 
 import numpy as np
@@ -14,7 +15,10 @@ _NUMBERS = 250_000  # greatest number of samples computed at once, so that they 
 
 
 def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure the least and the greatest thrust (B,) [N] of any rotor, and test both limits."""
+    """Measure and test the least and the greatest thrust [N] of any rotor, for each plan.
+
+    Each piece is sampled at its fractions `u`; `relative` is the tolerance relative to the limit.
+    """
     parts = [
         _rotor_range(pieces.of(lanes), {name: leaf[lanes] for name, leaf in case.items()}, u)
         for lanes in cut(len(pieces.durations), max(_NUMBERS // (pieces.flown[0].size * u.size), 1))
@@ -33,7 +37,7 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
 
 
 def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return the least thrust (B,) [N] of any rotor, its time, the greatest, and its time."""
+    """Return for each plan the least thrust [N] of any rotor, its time, the greatest, its time."""
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
@@ -54,12 +58,13 @@ def rotor_thrusts(
     inertia: np.ndarray,
     mixer: np.ndarray,
 ) -> np.ndarray:
-    """Return the thrusts (B, M, S, 4) [N] of the four rotors at S samples of M pieces.
+    """Return the thrusts (B, M, S, 4) [N] of four rotors at S times in M pieces of B trajectories.
 
     The thrusts are not finite where the attitude is undefined: without thrust and upside down.
 
     Args:
-        coeffs: (3, B, M, D + 1), of rising powers of the time since each piece's start.
+        coeffs: (3, B, M, D + 1), coefficients of position polynomials of degree D, of rising powers
+            of the time since each piece's start.
         times: (B, M, S) [s], since each piece's start.
         gravity: (B,) [m/s^2], magnitude.
         mass: (B,) [kg].
@@ -70,7 +75,8 @@ def rotor_thrusts(
     before, after = (
         _pull_and_rate(coeffs, times + step, gravity)[1] for step in (-_MOMENT, _MOMENT)
     )
-    # Omega has the same derivative in world and body frame: they differ by omega x omega = 0.
+    # The derivatives of the angular velocity omega in the world frame and in the body frame are
+    # equal, because they differ by omega x omega = 0.
     change = (after - before) / (2.0 * _MOMENT)
     axes = _body_axes(pull)
     own = np.einsum("...ij,...i->...j", axes, rate)
@@ -85,13 +91,17 @@ def rotor_thrusts(
 def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return thrust per mass [m/s^2] and angular velocity [rad/s], (B, M, S, 3), world frame."""
+    """Return the thrusts per unit mass [m/s^2] and angular velocities [rad/s] in the world frame.
+
+    Both are (B, M, S, 3), at S times in each of M pieces of B trajectories.
+    """
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]
     size = np.linalg.norm(pull, axis=-1)
     across = np.cross(pull, jerk)
-    # omega = tau x jerk / |tau|^2 + r tau / |tau|; the rate r about the thrust tau keeps heading 0.
+    # The angular velocity is tau x jerk / |tau|^2 + r tau / |tau|, with the thrust per unit mass
+    # tau. Of all rates r about the thrust, the Hopf fibration at zero heading has this one.
     about = -across[..., 2] / (size * (size + pull[..., 2]))
     return pull, (across / size[..., None] + about[..., None] * pull) / size[..., None]
 

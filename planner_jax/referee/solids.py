@@ -7,7 +7,7 @@ import itertools
 
 import numpy as np
 
-# Two edges count as parallel if the cross product of their unit directions is shorter than this.
+# Two edges count as parallel if the norm of their unit vectors' cross product is below this number.
 _PARALLEL = 1e-9
 
 
@@ -22,17 +22,20 @@ def length(vector: np.ndarray | list) -> np.ndarray:
 
 
 def rotate(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return the products (3, ...) of rotation matrices (3, 3, ...) and vectors (3, ...)."""
+    """Return the products R v of rotation matrices R (3, 3, ...) and vectors v (3, ...)."""
     return np.stack([dot(rotation[k], vector) for k in range(3)])
 
 
 def rotate_back(rotation: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return the products of transposed rotation matrices (3, 3, ...) and vectors (3, ...)."""
+    """Return the products R' v of transposed matrices R (3, 3, ...) and vectors v (3, ...)."""
     return np.stack([dot(rotation[:, k], vector) for k in range(3)])
 
 
 def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return distances (...) [m] of points from segments; `first` may equal `second`."""
+    """Return the distances [m] of points from line segments from `first` to `second`, all (3, ...).
+
+    `first` may equal `second`.
+    """
     span, away = second - first, point - first
     square = dot(span, span)
     share = np.clip(_ratio(dot(away, span), square), 0.0, 1.0)
@@ -42,9 +45,9 @@ def from_segment(point: np.ndarray, first: np.ndarray, second: np.ndarray) -> np
 def between_segments(
     first: np.ndarray, second: np.ndarray, third: np.ndarray, fourth: np.ndarray
 ) -> np.ndarray:
-    """Return distances (...) [m] between segments `first` to `second` and `third` to `fourth`.
+    """Return the distances [m] between segments `first` to `second` and `third` to `fourth`.
 
-    The method is Ericson's (Real-Time Collision Detection, Section 5.1.9).
+    The arrays are (3, ...). The method is Ericson's (Real-Time Collision Detection, Section 5.1.9).
     """
     span, other, away = second - first, fourth - third, first - third
     a, b, c = dot(span, span), dot(span, other), dot(other, other)
@@ -58,9 +61,9 @@ def between_segments(
 def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> np.ndarray:
     """Return the distances (...) [m] of line segments from axis-aligned boxes around the origin.
 
-    The squared distance is convex along a segment, and its derivative is piecewise linear with
-    breaks at the planes of the box's sides. The segment's ends and the half edges `half` are (3,
-    ...) [m].
+    `first` and `second` (3, ...) [m] are the ends of the segments, `half` (3, ...) [m] the half
+    edges of the boxes. The squared distance is convex along a segment, and its derivative is linear
+    between the planes of the box's sides. The minimum is where the derivative is zero.
     """
     span = second - first
 
@@ -86,8 +89,9 @@ def between_boxes(
 ) -> np.ndarray:
     """Return the distances (P,) [m] between P pairs of boxes.
 
-    The distance is minus the penetration depth where two boxes overlap, by the separating axis
-    theorem. Otherwise one of the two nearest points lies on an edge of its box.
+    Where two boxes overlap, the distance is minus the penetration depth, the least overlap along
+    any of the 15 axes of the separating axis theorem. Otherwise it is the least distance of an edge
+    of one box from the other box.
 
     Args:
         middle: (3, P) [m], centre of the first box in the frame of the second box.
@@ -115,8 +119,8 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return the least distance (P,) [m] of the first boxes' edges from the second boxes."""
-    edges = rotation * half  # (3, 3, P), the half edges as vectors
+    """Return for P pairs of boxes the least distance of the first's edges from the second."""
+    edges = rotation * half  # (3, 3, P), three vectors along the edges, half as long as an edge
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
         for k, first, second in itertools.product(range(3), (-1.0, 1.0), (-1.0, 1.0))
@@ -126,6 +130,5 @@ def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
 
 
 def _ratio(value: np.ndarray, by: np.ndarray) -> np.ndarray:
-    """Return value / by, or zero where the divisor `by` is zero."""
     none = by == 0.0
     return np.where(none, 0.0, value / np.where(none, 1.0, by))

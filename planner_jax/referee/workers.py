@@ -1,7 +1,7 @@
-"""Worker processes of the referee, for batches above 16,000 plans, which slow threads down.
+"""Worker processes that judge batches of more than 16,000 plans faster than threads.
 
-A worker runs this module with `python -m` and does not import the calling program, which therefore
-needs no `if __name__ == "__main__"`.
+A worker runs this module with `python -m`. It does not import the calling program, so that the
+program needs no `if __name__ == "__main__"`.
 """
 
 import atexit
@@ -26,7 +26,10 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def map_in_processes(
     function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
 ) -> list[ResultT]:
-    """Return `function` of each argument, computed in worker processes; both must be picklable."""
+    """Return function(argument) for each argument, computed in worker processes.
+
+    The function and the arguments must be picklable.
+    """
     threads, idle = _start_workers()
 
     def call(argument: ArgumentT) -> ResultT:
@@ -58,7 +61,7 @@ def _call(
 
 @functools.cache
 def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
-    """Start a worker process per core, and threads that wait for them, until the program ends."""
+    """Start a worker process and a waiting thread for each core; they stop with the program."""
     num, idle = cores(), SimpleQueue()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **_ONE_THREAD}
     pipe, command = subprocess.PIPE, [sys.executable, "-m", __name__]
@@ -72,7 +75,7 @@ def _start_workers() -> tuple[ThreadPoolExecutor, SimpleQueue]:
 def _stop_workers(threads: ThreadPoolExecutor, idle: SimpleQueue) -> None:
     threads.shutdown()
     while not idle.empty():
-        idle.get().communicate()  # closes the pipe that the process reads, which ends it
+        idle.get().communicate()  # closes the pipe from which the worker reads, so that it ends
 
 
 def _serve() -> None:
@@ -85,7 +88,7 @@ def _serve() -> None:
             return
         try:
             answer = False, function(argument)
-        except Exception as error:  # the caller raises it
+        except Exception as error:  # sent to the calling process, which raises it
             answer = True, error
         pickle.dump(answer, answers, pickle.HIGHEST_PROTOCOL)
         answers.flush()

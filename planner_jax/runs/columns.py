@@ -1,4 +1,4 @@
-"""Columns of the rows of a run, in SI units; a row describes one case, its plan and its verdict."""
+"""Columns of the rows that a run stores: one row for each case, its plan and the verdict on it."""
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
@@ -14,7 +14,7 @@ from planner_jax.runs.source import Chunk
 
 @dataclasses.dataclass(frozen=True)
 class RefereedBatch:
-    """B cases, their plans and the referee's verdicts; leaves are NumPy or JAX arrays (B, ...)."""
+    """B cases, their plans and the referee's verdicts, whose leaves are arrays (B, ...)."""
 
     chunk: Chunk
     plans: PyTree
@@ -22,7 +22,7 @@ class RefereedBatch:
 
     @property
     def cases(self) -> PyTree:
-        """The cases of the chunk, with leaves (B, ...)."""
+        """The B cases, with leaves (B, ...)."""
         return self.chunk.cases
 
 
@@ -30,22 +30,26 @@ Values: TypeAlias = ArrayLike | pa.Array | None
 
 
 class Column(NamedTuple):
-    """One column of a task's rows: its description, and a function that computes its values."""
+    """One column of the rows of a run: its description, and a function that computes its values."""
 
     name: str
     unit: str  # SI unit; "" for names and counts, "1" for ratios
     meaning: str  # text for the metadata of the Parquet file
     type: pa.DataType
-    # Function that returns the values, (B,) or (B, ...), or None if all values are missing.
+    # Function that returns one value or list for each of B rows, (B,) or (B, ...), or None if all
+    # values are missing.
     values: Callable[[RefereedBatch], Values]
 
 
 BOOL, TEXT, COUNT, NUMBER = pa.bool_(), pa.string(), pa.int32(), pa.float32()
-_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # code of a NumPy dtype's kind -> type of a column
+_KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # Arrow types of columns by the `kind` of NumPy dtypes
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
-    """Return the Arrow type of a list column, whose entries Parquet names "element"."""
+    """Return the Arrow type of a column whose values are lists of `kind`.
+
+    Parquet names the entries of a list "element"; the lists have any length if `length` is -1.
+    """
     return pa.list_(pa.field("element", kind), length)
 
 
@@ -61,7 +65,7 @@ def leaves_of(part: str, *rows: tuple, optional: bool = False) -> list[Column]:
         part: dotted path of the subtree, such as "plans" or "cases.targets".
         *rows: one tuple a column: name, unit and meaning, then optionally the type, by default
             NUMBER, and the dotted path of the leaf within the subtree, by default the name.
-        optional: whether the values are null if a batch has no such leaf; if not, that is an error.
+        optional: whether a missing leaf gives missing values; if false, it raises an error.
     """
 
     def column(
@@ -121,7 +125,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
         fields = [
             (f.name, vars(tree)[f.name], f.metadata)
             for f in dataclasses.fields(tree)
-            if f.metadata.get("pytree_node", True)  # static fields have no value for each row
+            if f.metadata.get("pytree_node", True)  # a static field has one value for all rows
         ]
         return [
             column
@@ -141,7 +145,10 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """Return the table of a batch, one row a case; `frame` is a text for the table's metadata."""
+    """Return the table of a batch with one row for each case.
+
+    `frame` describes the coordinate frame, and is stored in the table's metadata.
+    """
     num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns
@@ -151,7 +158,7 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
 
 
 def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
-    """Convert values (num,) or (num, ...) to an Arrow array of `num` numbers or lists."""
+    """Convert `num` numbers (num,) or arrays (num, ...) to an Arrow array of numbers or lists."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):

@@ -1,7 +1,8 @@
 """The rows of a run: a Parquet dataset, which `pyarrow.dataset`, pandas and DuckDB read.
 
 A part is one file of rows, such as `part-000007-1a2b3c4d.parquet`, whose name holds its number and
-its CRC-32 checksum. Its metadata hold a record, a JSON object on how the rows were made.
+its CRC-32 checksum. Its metadata hold a record: a JSON object with the number of rows, the times of
+planning, and a digest of the settings and the code that made them.
 """
 
 import io
@@ -18,7 +19,8 @@ from pyarrow import dataset
 from planner_jax.host.files import open_plain, replacing
 from planner_jax.runs.manifest import Entries, Row
 
-ROW_GROUP = 2048  # Rows in a row group of about 3 MB. Reading one row reads a whole group.
+# Number of rows in one row group of a Parquet file, the smallest unit that can be read, about 3 MB.
+ROW_GROUP = 2048
 _RECORD = b"part"  # key of a part's record in the metadata of its file
 _NAME = re.compile(r"part-([0-9]{6,12})-([0-9a-f]{8})\.parquet")
 
@@ -28,7 +30,7 @@ class DamagedPart(ValueError):
 
 
 def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
-    """Return the bytes of a Parquet file with some rows, and with a record in its metadata."""
+    """Return the bytes of a Parquet file of `rows`, with `record` on their making as metadata."""
     metadata = {**(rows.schema.metadata or {}), _RECORD: json.dumps(record).encode()}
     text = [field.name for field in rows.schema if pa.types.is_string(field.type)]
     others = [field.name for field in rows.schema if not pa.types.is_list(field.type)]
@@ -45,14 +47,14 @@ def encode(rows: pa.Table, record: Mapping[str, object]) -> bytes:
 
 
 def number_of(path: Path) -> int:
-    """Return the number in the name of a row file; raise `DamagedPart` for any other name."""
+    """Return the number in the name of a file of rows; raise `DamagedPart` for other names."""
     if (name := _NAME.fullmatch(path.name)) is None:
         raise DamagedPart("is not a part of a run")
     return int(name[1])
 
 
 def check_part(path: Path) -> Entries:
-    """Return the record in a row file's metadata; raise `DamagedPart` if the file is damaged."""
+    """Return the JSON object in a row file's metadata; raise `DamagedPart` if it is damaged."""
     number_of(path)
     with open_plain(path) as file:
         content = file.read()
@@ -92,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return the reasons why files are damaged, or do not hold `num` rows, by path."""
+        """Return for each damaged file the reason, by path; also if all files lack `num` rows."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
@@ -119,7 +121,7 @@ class Dataset:
             yield fragment.to_table(columns=known)
 
     def pick(self, rows: Sequence[int], columns: Sequence[str] | None = None) -> list[Row]:
-        """Return the rows with some indices, sorted by index; read only their row groups."""
+        """Return the rows with the indices `rows`, sorted by index; read only their row groups."""
         wanted, first, picked = sorted(set(rows)), 0, []
         for fragment in self._open().get_fragments():
             size = fragment.metadata.num_rows

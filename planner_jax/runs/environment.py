@@ -12,7 +12,8 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.host.machine import processor, threads_of_a_computation, usable_cores
 from planner_jax.runs.manifest import Entries
 
-_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")  # their versions affect the rows
+# Packages whose versions affect the numbers in the rows of a run.
+_PACKAGES = ("planner-jax", "jax", "jaxlib", "numpy", "scipy")
 _PACKAGE = Path(__file__).resolve().parents[1]
 
 
@@ -26,7 +27,7 @@ def find_version(name: str) -> str | None:
 
 @functools.cache
 def code_digest() -> str:
-    """Return the SHA-256 of the names and contents of the package's files, without benchmarks."""
+    """Return the SHA-256 of the names and contents of this library's files except benchmarks."""
     digest = hashlib.sha256()
     for place, folders, files in os.walk(_PACKAGE, followlinks=True):
         folders[:] = sorted(set(folders) - {"__pycache__", "benchmarks"})

@@ -25,7 +25,8 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_write
 
 LOCK = ".lock"
-FAILURES_SHOWN, _CASES_SHOWN = 12, 60  # numbers of failed and of all rows that figures show
+# Greatest number of failures, and number of all cases, that the figures of a run show.
+FAILURES_SHOWN, _CASES_SHOWN = 12, 60
 _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] pause between attempts
 
 

@@ -26,18 +26,21 @@ class WorkersFailed(PlannerJaxError, RuntimeError):
 
 
 def option(default: object, metavar: str, text: str) -> Any:
-    """Return a dataclass field for a command-line option; "" as `metavar` makes a switch."""
+    """Return a dataclass field for a command-line option with the help `text`.
+
+    `metavar` stands for the option's value in the help; "" makes a switch, which has no value.
+    """
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": text})
 
 
 def recovery_option(usual: str = NONE) -> str:
-    """Return the field `recovery` of settings: what the quadrotor does after its last contact."""
+    """Return the field `recovery` of settings: how the quadrotor stops after its last contact."""
     words = f"trajectory after the last contact, within all limits: {', '.join(CHOICES)}"
     return option(usual, "NAME", words)
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return a planner's keyword arguments for the setting `recovery`; raise if it is unknown."""
+    """Return a planner's keyword arguments for a value of the setting `recovery`, or raise."""
     require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
@@ -65,7 +68,7 @@ class SweepSettings:
     )
     seed: int = option(0, "K", "seed of the drawn cases")
 
-    # The task's subclass of `Sweep` as "module:Class"; "" stands for `Sweep` itself.
+    # Subclass of `Sweep` that runs the sweep, as "module:Class"; "" stands for `Sweep` itself.
     RUN: ClassVar[str] = ""
     DEFAULT_NUM: ClassVar[int] = 1000  # number of cases if the settings specify none
     CASE_BYTES: ClassVar[int] = 20_000  # [bytes] estimated memory of one case of a batch
@@ -124,7 +127,10 @@ class SweepSettings:
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the settings of a resumed run; raise if one in `given` differs from the stored one."""
+    """Return the stored settings of a run that is resumed.
+
+    Raises an error if the caller repeats a setting in `given` with another value.
+    """
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:

@@ -14,7 +14,7 @@ from planner_jax.core.registry import Task
 from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import SweepSettings
 
-_MOST_PARTS = 10**6  # greatest number of files of rows in the folder of a run, one for each chunk
+_MOST_PARTS = 10**6  # greatest number of chunks (blocks of cases) in a run; each gets its own file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Chunk:
 
     index: np.ndarray  # (B,) int, indices of the cases in the sweep
     cases: PyTree  # cases of the task's class, NumPy leaves (B, ...)
-    origin: object = None  # data from which some tasks make their cases, such as serves
+    origin: object = None  # data from which the cases were made, such as the serves of hits
 
     def __len__(self) -> int:
         return len(self.index)
@@ -33,7 +33,7 @@ class Chunk:
 class Source(abc.ABC):
     """A source of the cases of a sweep; subclasses draw the cases or read them from files."""
 
-    settings: SweepSettings  # settings of the sweep, with `num` and `batch` filled in
+    settings: SweepSettings  # settings of the sweep, in which `num` and `batch` are not None
     num: int  # number of all cases
     batch: int  # number of cases of a chunk
 
@@ -43,7 +43,7 @@ class Source(abc.ABC):
         return -(-self.num // self.batch)
 
     def chunk(self, number: int) -> Chunk:
-        """Return the cases of chunk `number`; raise `ArgumentError` if one breaks a rule."""
+        """Return the cases of block `number`; raise `ArgumentError` if a case breaks a rule."""
         return self.cases(number * self.batch, min((number + 1) * self.batch, self.num))
 
     def check(self) -> PyTree:
@@ -52,7 +52,7 @@ class Source(abc.ABC):
 
     @abc.abstractmethod
     def cases(self, first: int, last: int) -> Chunk:
-        """Return the cases `first` to `last - 1`; raise `ArgumentError` if one breaks a rule."""
+        """Return cases `first` to `last - 1`; raise `ArgumentError` if a case breaks a rule."""
 
     @abc.abstractmethod
     def description(self) -> Entries:
@@ -82,7 +82,7 @@ class DrawnSource(Source):
 
 
 def fill_in(settings: SweepSettings, num: int, batch: int) -> Entries:
-    """Return the fields of a `Source`; `num` and `batch` replace settings that are None."""
+    """Return the fields of a `Source`; `num` and `batch` are used where the settings are None."""
     num, batch = settings.num or num, settings.batch or batch
     if num > _MOST_PARTS * batch:
         rule = f"at most {_MOST_PARTS * batch:,} with a batch of {batch}, as each batch is a file"

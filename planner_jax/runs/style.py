@@ -1,4 +1,4 @@
-"""One style for all figures, in Okabe and Ito's colours, made for colour-blind readers."""
+"""Style of all figures: fonts, lines, and Okabe and Ito's colours for colour-blind readers."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -19,14 +19,14 @@ def wilson_interval(successes: int, num: int) -> tuple[float, float]:
 
 
 def percent(successes: int, num: int) -> str:
-    """Return a rate in percent; a rate near 0 or 1 is never rounded to "0.00" or "100.00"."""
+    """Return successes / num in percent as text; only exact 0 and 1 give "0.00" and "100.00"."""
     rate = 100.0 * successes / num
     if 0 < successes < num:
         rate = min(max(rate, 0.01), 99.99)
     return f"{rate:.2f}"
 
 
-# Columns of the rows that every subclass of `Tally` reads.
+# Columns of the rows from which every sweep is counted.
 COUNTED = ("index", "success", "status", "failed_limit")
 
 
@@ -61,11 +61,11 @@ class Tally:
                 self._example_rank, self.example = rank, int(index[there][0])
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
+        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first."""
         return [success, np.ones_like(success)]
 
     def summary(self) -> Entries:
-        """Return success rate, counts, and means over successes (None if no plan is a success)."""
+        """Return the success rate, counts, and means over the plans that the referee accepted."""
         num = self.successes
         means = {f"mean_{name}": total / num if num else None for name, total in self._sums.items()}
         return {

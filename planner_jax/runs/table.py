@@ -36,7 +36,7 @@ def align(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def headline(manifest: Entries, findings: Sequence[str] = ()) -> list[str]:
-    """Return the sentences at the head of a report: success, `findings`, speed and failures."""
+    """Return the first sentences of a report: success rate, `findings`, speed, failed limits."""
     summary, times = manifest["summary"], manifest["times"]
     settings, device = manifest["parameters"], manifest["device"]
     low, high = summary["wilson_95"]

@@ -12,10 +12,11 @@ from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import take
 from planner_jax.planning.plan import CaseT, PlanT, plan
 
-# Prefix of JAX's events of tracing, lowering, compiling and reading the compile cache. Their time
-# spans overlap, since functions are traced within functions, so their union is measured.
+# Prefix of the names of JAX's events of tracing, lowering, compiling and reading the compile cache.
+# Events overlap in time, since functions are traced within functions. The compile time is the
+# length of the union of their time spans.
 _COMPILING = "/jax/core/compile/"
-_WARM_CALLS = 3  # greatest number of calls by which `measure_warm` tries to avoid compilation
+_WARM_CALLS = 3  # greatest number of calls until one in which JAX compiles nothing
 
 ResultT = TypeVar("ResultT")
 
@@ -48,7 +49,7 @@ class CompileClock:
         return total
 
     def lap(self) -> float:
-        """Return the time [s] spent on compilation since the last call of `lap`, or in total."""
+        """Return the compile time [s] since the last call of `lap`, or since the block's start."""
         last, self._last = self._last, self.seconds
         return self._last - last
 
@@ -71,7 +72,7 @@ class Stopwatch:
 
 
 def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
-    """Return a call's result, its duration [s], and True if JAX compiled nothing meanwhile."""
+    """Return a call's result, its duration [s], and whether JAX compiled nothing in the call."""
     watch = Stopwatch()
     with CompileClock() as clock:
         found = call()
@@ -79,7 +80,7 @@ def measure(call: Callable[[], ResultT]) -> tuple[ResultT, float, bool]:
 
 
 def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
-    """Return a call's result and its duration [s] without compilation, by at most three calls."""
+    """Repeat a call, up to three times, until JAX compiles nothing; return result and time [s]."""
     for _ in range(_WARM_CALLS - 1):
         found, seconds, warm = measure(call)
         if warm:
@@ -88,7 +89,10 @@ def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
 
 
 def measure_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
-    """Plan B cases one after another; return plans and durations (B,) [s] without compilation."""
+    """Plan B cases one after another; return the plans, and the planning times (B,) [s].
+
+    The times exclude compilation.
+    """
     num = jax.tree.leaves(cases)[0].shape[0]
     timed_each = [measure_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)

@@ -1,4 +1,4 @@
-"""Draw, plan and judge the cases of a sweep in chunks; each chunk becomes one file of rows."""
+"""Draw, plan and judge the cases of a sweep in chunks (blocks), each stored in a file of rows."""
 
 import contextlib
 import functools
@@ -29,7 +29,7 @@ from planner_jax.runs.summary import percent
 from planner_jax.runs.timing import CompileClock, Stopwatch, measure, measure_warm
 from planner_jax.sweep.sweep import Sweep
 
-_PENDING = 2  # Greatest number of chunks that are judged or written while the next one is planned.
+_PENDING = 2  # greatest number of chunks that are judged or written while the next chunk is planned
 _MEASURED = {
     "compile_seconds": "JAX tracing, lowering, compiling or reading its cache, while chunks were "
     "made; overlapping spans counted once",
@@ -46,30 +46,31 @@ _MEASURED = {
 class Record(TypedDict):
     """Description of one file of rows (a part), stored in the metadata of the Parquet file."""
 
-    run: str  # digest `Maker.run` of everything that affects the rows
+    run: str  # SHA-256 of everything that affects the rows, such as the settings and the code
     number: int  # number of the chunk whose cases are in the file
     num: int  # number of rows
     successes: int  # number of plans that the referee accepted
     warm: bool  # True if JAX compiled nothing while the chunk was planned
-    plan_seconds: float  # time of planning, including compilation
-    compile_seconds: float  # time in which JAX traced or compiled
-    referee_seconds: float  # time of judging
+    plan_seconds: float  # [s] time of planning, including compilation
+    compile_seconds: float  # [s] time in which JAX traced or compiled
+    referee_seconds: float  # [s] time of judging the plans
 
 
 Made = tuple[bytes, Record]  # the bytes of a Parquet file of rows, and its record
-# A function that starts to plan the chunks with some numbers on workers. For each chunk, in order,
-# it yields a function that waits for the chunk's file of rows and returns it.
+# A function that sends chunks to worker processes, which plan them. Its arguments are the `Maker`
+# and the numbers of the chunks. For each chunk, in order, it yields a function that waits for the
+# chunk's file of rows and returns it.
 Workers = Callable[["Maker", Iterable[int]], Generator[Callable[[], Made], None, None]]
 
 
 @dataclass(frozen=True)
 class Maker:
-    """Everything that turns a chunk of cases into rows: source, planner and referee."""
+    """What makes the rows of a sweep: the source of its cases, its planner and its referee."""
 
     sweep: Sweep
     source: Source  # draws or reads the cases
     planner: Planner
-    makers: Entries  # versions, code and devices that affect the rows
+    makers: Entries  # versions of packages and code, and the devices, which affect the rows
     description: Entries  # manifest entries that identify the cases of the source
     run: str  # SHA-256 of everything that affects the rows, such as settings and files they name
 
@@ -84,7 +85,7 @@ class Maker:
         return cls(sweep, source, sweep.planner(source.settings), makers, description, run)
 
     def plan(self, chunk: Chunk, clock: CompileClock) -> tuple[PyTree, Record]:
-        """Plan a chunk; return the plans and a record of times, with compile time from `clock`."""
+        """Plan a chunk of cases; return the plans, and a record whose compile time is `clock`'s."""
         plans, seconds, warm = measure(lambda: self.sweep.plan(self.planner, chunk.cases))
         return plans, {
             "run": self.run,
@@ -98,7 +99,7 @@ class Maker:
         }
 
     def make(self, number: int) -> Made:
-        """Draw chunk `number`, plan and judge it, and encode its rows as a Parquet file."""
+        """Draw, plan and judge the cases of chunk `number`; return the Parquet file of its rows."""
         chunk = self.source.chunk(number)
         with CompileClock() as clock:
             return self.judge(chunk, *self.plan(chunk, clock))
@@ -117,7 +118,7 @@ class Maker:
 
 
 def _files_of(parameters: Entries) -> dict[str, int]:
-    """Return CRC-32 checksums of the files in settings of the form "NAME:FILE", by setting."""
+    """Return for settings of the form "NAME:FILE" the CRC-32 checksums of the files."""
     found = {}
     for name, value in parameters.items():
         path = value.partition(":")[2] if isinstance(value, str) else ""
@@ -133,8 +134,8 @@ def make_parts(
 ) -> dict[int, Record]:
     """Plan every chunk whose file of rows is missing; return the records of all files by number.
 
-    While one chunk is planned, the next one is drawn and the previous ones are judged and written.
-    `there` has the records of existing files. `workers` plan on other processes, if not None.
+    While one chunk is planned, the next chunk is drawn, and previous chunks are judged and written.
+    `there` has the records of existing files. Unless `workers` is None, other processes plan.
     """
     source, records = maker.source, dict(there)
     done, successes = (sum(each[name] for each in there.values()) for name in ("num", "successes"))
@@ -182,7 +183,11 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return the times for the manifest; may plan chunk 0 again to measure the warm speed."""
+    """Return planning, compile and referee times for the manifest.
+
+    If JAX compiled while most cases were planned, the first chunk is planned again, to measure the
+    speed without compilation.
+    """
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

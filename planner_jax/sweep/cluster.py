@@ -31,12 +31,13 @@ from planner_jax.sweep.chunks import Made, Maker, Workers
 from planner_jax.sweep.sweep import sweep_of
 
 _ADDRESS, _GPUS = "RAY_ADDRESS", "CUDA_VISIBLE_DEVICES"  # names of environment variables
-_RETRIES = 3  # Number of times that Ray repeats a chunk whose worker died.
-_AHEAD = 2  # Number of chunks per worker that are being made or wait to be written.
+_RETRIES = 3  # number of times that Ray plans a chunk again if its worker died
+_AHEAD = 2  # number of chunks for each worker that are being planned or wait to be written
 # Greatest number of workers that share one GPU. Several workers keep the GPU busy, because a worker
 # judges its plans on the CPU while another worker plans on the GPU.
 WORKERS_OF_GPU = 8
-# Fraction of a GPU's memory for all its workers' arrays; the remainder starts the processes.
+# Fraction of a GPU's memory for the arrays of all its workers. The remainder is for CUDA itself,
+# which needs memory in each process.
 _MEMORY = 0.6
 
 
@@ -109,7 +110,7 @@ def _make_parts(
         num, threads = gpus * shared, max(2 * cores // (gpus * shared), 1)
         memory = {"XLA_CLIENT_MEM_FRACTION": f"{_MEMORY / shared:.4f}"}
         environ, config = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **memory}, {}
-        # With `max_calls` 0 a worker process is used for many chunks, always on the same GPU.
+        # With `max_calls` 0 a worker process plans any number of chunks, always on the same GPU.
         how = {"num_gpus": 1.0 / shared, "max_calls": 0}
     environ |= dict.fromkeys(("NPROC", "PJRT_NPROC"), str(threads))
     config |= {"jax_enable_x64": jnp.result_type(float) == jnp.float64}
@@ -147,7 +148,7 @@ def _make(job: bytes, number: int) -> Made:
 
 @functools.lru_cache(maxsize=1)
 def _maker_of(job: bytes) -> Maker:
-    """Return the `Maker` that plans a pickled run; raise `WorkersFailed` if the code differs."""
+    """Restore the `Maker` of a pickled run; raise `WorkersFailed` if the worker's code differs."""
     environ, config, (task, settings, makers, run) = pickle.loads(job)
     # JAX raises an error if this variable and XLA_CLIENT_MEM_FRACTION are both set.
     os.environ.pop("XLA_PYTHON_CLIENT_MEM_FRACTION", None)

@@ -19,13 +19,13 @@ from planner_jax.runs.table import align
 from planner_jax.sweep.report import read_finished
 from planner_jax.sweep.sweep import settings_of
 
-# Columns of the row files that a comparison reads. The rows of every task have these columns.
+# Columns of the files of rows that a comparison reads. The runs of every task have these columns.
 _READ = ("index", "success", "failed_limit", "cost", "iterations")
 
 
 @dataclasses.dataclass(frozen=True)
 class ComparedRun:
-    """A finished sweep, with the columns of its B cases that are compared with other sweeps."""
+    """A finished sweep of B cases, with the columns that are compared with other sweeps."""
 
     name: str  # path of the run's folder, as the user wrote it
     manifest: Entries
@@ -33,8 +33,8 @@ class ComparedRun:
     index: np.ndarray  # (B,) int, indices of the cases
     success: np.ndarray  # (B,) bool
     failed_limit: np.ndarray  # (B,) str, the first limit that fails; "" for a success
-    cost: np.ndarray  # (B,) costs of the plans
-    iterations: np.ndarray  # (B,) numbers of the planner's iterations
+    cost: np.ndarray  # (B,) cost of each plan, which the planner minimises
+    iterations: np.ndarray  # (B,) number of the planner's iterations for each plan
 
     @property
     def settings(self) -> Entries:
@@ -92,7 +92,7 @@ def require_comparable(runs: Sequence[ComparedRun]) -> None:
 
 
 def other_cases(first: ComparedRun, other: ComparedRun) -> list[str]:
-    """Return "SETTING VALUE and VALUE" for each setting that makes the cases of two runs differ."""
+    """Return a text "NAME VALUE and VALUE" for each setting by which two runs' cases differ."""
     return _unlike(first, other, first.deciding)
 
 
@@ -110,10 +110,10 @@ def _unlike(first: ComparedRun, other: ComparedRun, names: Sequence[str]) -> lis
 def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     """Return the success rate of a run minus the rate of the first run, with a 95 % interval.
 
-    If both runs planned the same cases, the test is McNemar's exact test. It uses the n cases that
-    exactly one of the two runs solves. The interval follows from the Clopper-Pearson interval of k
-    / n, where the other run solves k of these cases. For runs of different cases the interval is
-    Newcombe's, from the Wilson intervals of both rates.
+    If both runs planned the same cases, McNemar's exact test uses the n cases that exactly one of
+    them solves. If the run `other` solves k of these n cases, the interval follows from the
+    Clopper-Pearson interval of k / n. For runs of different cases the interval is Newcombe's, from
+    the Wilson intervals of both rates.
     """
     change = other.rate - first.rate
     if other_cases(first, other):
@@ -124,7 +124,8 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
     mine = int((first.success & ~other.success).sum())
     theirs = int((other.success & ~first.success).sum())
     apart, num = mine + theirs, len(first.success)
-    # If no case is solved by exactly one run, the bound is Clopper-Pearson's for 0 of `num` events.
+    # If no case is solved by exactly one run, k / n is undefined. The bound is then the end of
+    # Clopper-Pearson's interval for 0 events in all cases.
     if not apart:
         reach = float(binomtest(0, num).proportion_ci(0.95, "exact").high)
         return Difference(change, -reach, reach, mine, theirs, 1.0)
@@ -135,7 +136,10 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
 
 
 def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
-    """Return rates, costs and times of each run by name; the first run's differences are None."""
+    """Return a row of rates, costs and times for each run, and its difference from the first run.
+
+    The difference is None for the first run.
+    """
     rows = []
     for index, run in enumerate(runs):
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]
@@ -163,13 +167,12 @@ def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
 
 
 def _of(measure: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float | None:
-    """Return a measure, such as the mean, of the finite values; None if no value is finite."""
     finite = values[np.isfinite(values)]
     return float(measure(finite)) if finite.size else None
 
 
 def differing(runs: Sequence[ComparedRun]) -> list[tuple[int, list[str]]]:
-    """Return index, and each run's first failed limit, of the cases that only some runs solve."""
+    """Return the index of each case that only some runs solve, and the limit failed in each run."""
     solved = np.stack([run.success for run in runs])
     places = np.flatnonzero(solved.any(axis=0) & ~solved.all(axis=0))
     index = runs[0].index
@@ -202,7 +205,7 @@ def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
 
 
 def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> Iterator[str]:
-    """Yield sentences on how run number `k` differs from the first run in success and settings."""
+    """Yield sentences on how run number `k` differs from the first run, in success and settings."""
     low, high = 100.0 * row["difference_low"], 100.0 * row["difference_high"]
     change = f"[{k}] less [1]: {100.0 * row['difference']:+.2f} points of success"
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"
@@ -214,14 +217,13 @@ def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> It
         f"{change}, {interval}; of the same cases [1] alone solves {row['first_only']:,} and [{k}] "
         f"alone {row['this_only']:,}, p = {row['mcnemar_p']:.3g} (McNemar, exact)."
     )
-    # The batch size is not reported as a difference, as it changes only the last digits of plans.
+    # A different batch size is not reported, because it only changes the last digits of plans.
     names = [name for name in first.settings if name not in ("batch", *first.deciding)]
     if settings := _unlike(first, run, names):
         yield f"    settings that differ: {'; '.join(settings)}"
 
 
 def _cells(rows: Sequence[Entries]) -> list[list[str]]:
-    """Return a table as text cells, with a line for each quantity and a column for each run."""
     spread = [
         f"{100.0 * row['wilson_low']:.2f} to {100.0 * row['wilson_high']:.2f}" for row in rows
     ]
@@ -250,8 +252,8 @@ def _cells(rows: Sequence[Entries]) -> list[list[str]]:
 def as_csv(runs: Sequence[ComparedRun]) -> str:
     """Return the comparison as CSV text with one column for each run.
 
-    The first rows are those of `table_of`. Then follows a row for each case that only some runs
-    solve, with the first limit that fails in each run, or "success".
+    The first rows have the quantities that `table_of` returns. Then follows a row for each case
+    that only some runs solve, with the first limit that fails in each run, or "success".
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -39,14 +39,14 @@ class Drawn(NamedTuple):
     look: Look  # keyword arguments of Matplotlib for the lines of this plan
 
     def draw(self, axes: Axes, values: Callable[[SampledMotion], np.ndarray]) -> None:
-        """Draw a quantity of the plan over time; `values` computes it (N,) from a trajectory."""
+        """Draw a quantity over time, which the function `values` computes from a trajectory."""
         axes.plot(self.motion.time, values(self.motion), **self.look)
         if self.rest is not None:
             axes.plot(self.rest.time, values(self.rest), **{**self.look, **_OF_REST})
 
 
 # Panels by name. Each has the label of its y axis, its title, and a function that computes the
-# plotted values (N,) from a sampled trajectory and the gravity [m/s^2].
+# plotted values from a sampled trajectory and the gravity [m/s^2].
 PANELS: dict[str, tuple[str, str, Callable[[SampledMotion, float], np.ndarray]]] = {
     "speed": ("|v| [m/s]", "Speed", lambda m, g: np.linalg.norm(m.vel, axis=1)),
     "acceleration": ("|a| [m/s²]", "Acceleration", lambda m, g: np.linalg.norm(m.acc, axis=1)),
@@ -67,10 +67,10 @@ def quadrotor_figure(
     first: Callable[[Axes, Entries, list[Drawn]], None],
     word: Callable[[Row], str],
 ) -> None:
-    """Draw several planners' plans for the run's example case over time, together with the limits.
+    """Draw several planners' plans for one case over time, together with the limits.
 
-    The function `first` draws the first panel, which differs between tasks; `panels` names four of
-    `PANELS`. The function `word` describes a successful plan in a few words.
+    The function `first` draws the first panel, which differs between tasks. `panels` are names of
+    further panels, keys of `PANELS`. The function `word` describes a successful plan briefly.
     """
     plans, setting = run.same_case(), run.manifest["setting"]
     axes = figure.subplots(2, 3, sharex=True)
@@ -103,7 +103,7 @@ def quadrotor_figure(
 
 
 def look_of(index: int, name: str, row: Row) -> Entries:
-    """Return the line style of a plan: dashed if it failed, thick for the run's own planner."""
+    """Return the line style of a plan: dashed if it failed, thick if the run's planner made it."""
     return {
         "color": style.PLANNER_COLOURS.get(name, style.INK),
         "linestyle": "-" if row["success"] else (0, (4, 1.5)),
@@ -121,7 +121,7 @@ def draw_upper_limit(axes: Axes, limit: float) -> None:
 
 
 def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
-    """Draw hover thrust and thrust limits, or a grey bound that follows from acceleration."""
+    """Draw the thrust of hovering, and limits of the thrust or the bound from acceleration."""
     gravity = setting["gravity"]
     axes.axhline(gravity, color=style.GREY, linewidth=1.0, linestyle=":")
     if "max_thrust" in setting:
@@ -130,7 +130,7 @@ def _draw_thrust_limits(axes: Axes, setting: Entries) -> None:
         axes.axhspan(0.0, setting["min_thrust"], **FORBIDDEN)
         return
     most = setting.get("acceleration")
-    # If only the thrust of each rotor is limited, there is no limit of their sum to draw.
+    # If the thrust of each rotor is limited instead of their sum, no limit is drawn.
     if most is None:
         return
     bound = gravity + most
