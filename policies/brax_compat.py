@@ -16,8 +16,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
     """Copy a pytree to each device, and stack the copies along a new leading axis.
 
-    The stack is sharded with one copy on each device, because Brax reads a copy back as the first
-    addressable shard of every leaf.
+    Each device holds one copy as its shard, because Brax reads a copy back as the first addressable
+    shard of every leaf.
 
     Args:
         tree: pytree of array-likes; a leaf has any shape `(...)`.

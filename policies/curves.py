@@ -100,10 +100,11 @@ def _line(
     relative: bool = False,
     **look: Any,
 ) -> None:
-    """Draw the mean of a quantity over runs; for several runs also a band of one deviation.
+    """Draw the mean of a quantity over runs; for several runs also a band around it.
 
-    The x axis is the number of decisions. `value` extracts the quantity from a row, and `scale`
-    multiplies it. With `relative` each run is drawn relative to its first value.
+    The band is one standard deviation wide to each side. The x axis is the number of decisions.
+    `value` extracts the quantity from a row, and `scale` multiplies it. With `relative` each run is
+    divided by its first value.
     """
     num = min(len(rows) for rows in runs)
     values = scale * np.array([[value(row) for row in rows[:num]] for rows in runs], float)

@@ -93,7 +93,10 @@ class CatchEnv(Env):
         return State(None, self._observe(cases), zero, zero, {}, info)
 
     def step(self, state: Any, action: Array) -> State:
-        """Plan the cases with the actions (B, size * PER_TARGET), reward them, draw new cases."""
+        """Plan the cases from the policy's actions, compute the rewards, and draw new cases.
+
+        `action` has one row for each case, with `PER_TARGET` components for each of `size` targets.
+        """
         key, own = jax.random.split(state.info["key"])
         num = action.shape[0]
         actions = action.reshape(len(self.suites), -1, self.size, PER_TARGET)
@@ -112,9 +115,9 @@ class CatchEnv(Env):
         return state.replace(obs=self._observe(cases), reward=reward, done=one, info=info)
 
     def _evaluate(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
-        """Return the unweighted reward terms (B,) by name, for the actions of S suites.
+        """Return the unweighted reward terms by name, with one number for each of B cases.
 
-        `actions` has the shape (S, B / S, size, PER_TARGET).
+        `actions` (S, B / S, size, PER_TARGET) are for S suites of cases with up to `size` targets.
         """
         alike: dict[Any, list[int]] = {}
         for k, some in enumerate(cases):
@@ -138,9 +141,9 @@ class CatchEnv(Env):
         return tuple(draw_by_key(k, share, s) for k, s in zip(keys, self.suites, strict=True))
 
     def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
-        """Return the policy's observations (B, size * FEATURES) of all cases, flattened.
+        """Return the policy's observations of all cases: a row of features for each case.
 
-        The features of absent targets are zero.
+        A row has `FEATURES` numbers for each of `size` targets, zero for absent targets.
         """
 
         def of_suite(cases: CatchCase) -> Array:
@@ -168,9 +171,10 @@ class CatchEnv(Env):
 
 
 def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[str, Array]:
-    """Return the unweighted reward terms (B,) of a batch of actions, by name.
+    """Return the unweighted reward terms (B,) of the actions for B cases, by name.
 
-    `Greedy` is the decision that always catches next the target that can be caught earliest.
+    The terms compare with `Greedy`, the decision that always catches next the target that can be
+    caught earliest.
 
     Args:
         cases: batch of B cases with N targets each.
@@ -222,10 +226,10 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
 
 def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[CatchChoice, Any]:
-    """Plan a batch of decisions; return the decisions that were planned, and their plans.
+    """Plan a batch of decisions on catches; return the planned decisions, and their plans.
 
-    With optional targets, each decision is also planned without its last few catches. The longest
-    solved version is returned.
+    If targets are optional, each decision is also planned without its last few catches. The solved
+    decision with most catches is returned.
     """
     if not cases.optional:
         return choices, solve_batch(ExactCatch(), _attempt(iterations), cases.with_choice(choices))
@@ -235,7 +239,7 @@ def _plan(cases: CatchCase, choices: CatchChoice, iterations: int) -> tuple[Catc
     tried = jax.tree.map(lambda leaf: jnp.repeat(leaf, num, axis=0), cases).with_choice(flat)
     found = solve_batch(ExactCatch(), _attempt(iterations), tried)
     each = jax.tree.map(lambda leaf: leaf.reshape(-1, num, *leaf.shape[1:]), (flat, found))
-    # Versions are sorted by falling number of catches: the first solved version is the longest.
+    # The versions of a decision are sorted by falling number of catches.
     best = jnp.argmax(is_solved(each[1].status), axis=1)
     return jax.tree.map(lambda leaf: leaf[jnp.arange(len(best)), best], each)
 
@@ -252,8 +256,8 @@ def weight_terms(terms: Mapping[str, Array], weights: Mapping[str, Any]) -> Arra
     an unsolved case is its weighted violation.
 
     Args:
-        terms: unweighted terms (B,) from `evaluate_actions`, by name.
-        weights: weight of each term, () or (B,), by name.
+        terms: unweighted terms (B,) of B decisions, by name: the result of `evaluate_actions`.
+        weights: weight of each term, one number or (B,), by name.
     """
     good = sum(weights[name] * terms[name] for name in _GATED)
     bad = weights["violation"] * terms["violation"]

@@ -47,7 +47,7 @@ class KeptParts:
 
         Args:
             number: number of the part.
-            like: any parameters with the shapes and types of the stored parameters.
+            like: parameters with the shapes and types of the stored parameters, of any values.
         """
         try:
             with open_plain(self._note(number)) as file:

@@ -1,9 +1,10 @@
 """Neural networks for decisions about catches: policy networks and a value network, in Flax.
 
-A policy network maps features (..., N, F) of N targets to the parameters (..., N, 4) of a normal
-distribution of actions. An action has two components per target. The first two parameters are the
-means before tanh; the softplus of the other two gives the standard deviations. The networks are
-immutable and hashable, so that a JAX pytree can hold one as a static field.
+A policy network maps features (..., N, F), F for each of N targets, to the parameters (..., N, 4)
+of a normal distribution of actions. An action is the tanh of a sample, and has two components per
+target. The first two parameters are means, and the softplus of the other two gives standard
+deviations. The networks are immutable and hashable, so that a JAX pytree can hold one as a static
+field.
 """
 
 from typing import Any
@@ -20,7 +21,10 @@ _FIRST_STD = 0.15  # standard deviation of actions before tanh at the start of t
 
 
 def _head(features: Array) -> Array:
-    """Apply the last layer; its initial weights give means of 0 and the deviation `_FIRST_STD`."""
+    """Apply the last layer, from features to the parameters of the distribution of actions.
+
+    Its initial weights give means of 0 and the standard deviation `_FIRST_STD`.
+    """
     raw = float(np.log(np.expm1(_FIRST_STD - LEAST_STD)))
     first = lambda *_: jnp.repeat(jnp.array([0.0, raw]), PER_TARGET)  # noqa: E731
     return nn.Dense(2 * PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=first)(features)
@@ -34,7 +38,7 @@ class Mlp(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Map features (..., N, F) of targets to distribution parameters (..., N, 4) of actions.
+        """Map F features of each of N targets to distribution parameters (..., N, 4) of actions.
 
         Raises:
             ValueError: there are more than `size` targets.
@@ -52,10 +56,7 @@ class Mlp(nn.Module):
 
 
 class Attention(nn.Module):
-    """Self-attention over the targets; their number and order are arbitrary.
-
-    Absent targets are masked.
-    """
+    """A policy network of self-attention over any number of targets; absent targets are masked."""
 
     width: int = 64  # number of features of each target within the network
     heads: int = 4  # number of attention heads
@@ -63,7 +64,7 @@ class Attention(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Map features (..., N, F) of targets to distribution parameters (..., N, 4) of actions."""
+        """Map F features of each of N targets to distribution parameters (..., N, 4) of actions."""
         return _head(_apply_attention(self, seen))
 
 
@@ -76,7 +77,7 @@ class Value(nn.Module):
 
     @nn.compact
     def __call__(self, seen: Array) -> Array:
-        """Return expected rewards (...) of cases, from features (..., N, F) of their targets."""
+        """Return the expected reward of each case, from F features of each of its N targets."""
         present = seen[..., -1:]
         num = jnp.maximum(jnp.sum(present, axis=-2), 1.0)
         mean = jnp.sum(present * _apply_attention(self, seen), axis=-2) / num
@@ -85,9 +86,10 @@ class Value(nn.Module):
 
 
 def _apply_attention(module: Any, seen: Array) -> Array:
-    """Apply a module's attention layers to targets (..., N, F); return features (..., N, width)."""
+    """Apply a module's attention layers to the features of targets, and return new features."""
     present = seen[..., -1] > 0.5
-    # Each target attends to itself even if it is absent. A row without any entry would give NaN.
+    # Each target attends to itself even if it is absent. A row of the mask that is false everywhere
+    # would give NaN.
     mask = (present[..., None, :] | jnp.eye(seen.shape[-2], dtype=bool))[..., None, :, :]
     hidden = nn.Dense(module.width)(seen)
     for _ in range(module.layers):
@@ -98,7 +100,7 @@ def _apply_attention(module: Any, seen: Array) -> Array:
 
 
 def _attend(module: Any, hidden: Array, mask: Array) -> Array:
-    """Apply multi-head attention to targets (..., N, width) under a mask (..., 1, N, N).
+    """Apply multi-head attention to the features of targets, under a mask (target, target).
 
     One matrix product computes queries, keys and values together. The matrices are so small that
     the run time depends on the number of products rather than on their sizes.

@@ -22,18 +22,18 @@ from planner_jax.task.catch.case import CatchCase, CatchChoice
 from planner_jax.task.catch.context import targets_at
 from planner_jax.task.catch.estimate import INSTANT, Timetable, arrivals, earliest_next, top_speed
 
-HANDICAP = 4.0  # [s] added to a target's earliest time if its first action component is 1
+HANDICAP = 4.0  # [s] added to a target's earliest catch time if its first action component is 1
 STRETCH = 0.5  # logarithm of the factor on a catch time if the second action component is 1
 _SHARES = 8  # number of future times at which a target's predicted position is a feature
-FEATURES = 3 + 3 + 3 + 1 + 3 * _SHARES + 3 + 1  # number per target; the last is 1 if present
+FEATURES = 3 + 3 + 3 + 1 + 3 * _SHARES + 3 + 1  # number of features of each target
 PER_TARGET = 2  # number of action components per target
 
 
 def observe(case: CatchCase, table: Timetable) -> Array:
     """Return the features (N, FEATURES) of the N targets of one case; zero for absent targets.
 
-    Lengths are divided by 4 m, speeds by 4 m/s and times by 5 s. `table` holds the sampled possible
-    catches of the targets.
+    Lengths are divided by 4 m, speeds by 4 m/s and times by 5 s. The last feature of a present
+    target is 1. `table` has possible times and positions at which each target can be caught.
     """
     num = case.num_targets
     place, velocity = case.head_state[0], case.head_state[1]
@@ -61,15 +61,15 @@ def choice_of(case: CatchCase, table: Timetable, action: Array) -> CatchChoice:
 
     Args:
         case: one case with N targets.
-        table: sampled possible catches of the targets, from `timetable`.
-        action: (N, PER_TARGET), components from -1 to 1.
+        table: possible times and positions of catches, from `timetable`.
+        action: (N, PER_TARGET), a handicap and a stretch for each target, from -1 to 1.
     """
     action = jnp.where(case.present[:, None], action, 0.0)
     choice = earliest_next(case, table, HANDICAP * action[:, 0])
     times = choice.times * jnp.exp(STRETCH * action[choice.order, 1])
     taken = choice.taken[choice.order]
     times = jnp.where(taken, jnp.minimum(times, case.horizon[choice.order]), times)
-    # Make the times increase by at least INSTANT [s] from catch to catch.
+    # Make the times of the catches increase by at least INSTANT [s] from one to the next.
     steps = jnp.asarray(INSTANT * np.arange(times.size), times.dtype)
     rising = lax.cummax(times - steps) + steps
     return dataclasses.replace(choice, times=rising)

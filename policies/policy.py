@@ -60,9 +60,10 @@ class Policy(CatchDecision):
             )
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return K proposals for the order and times of one case with N targets, leaves (K, N).
+        """Return proposals for the order and times of the catches in one case with N targets.
 
-        With optional targets, each proposal is also returned without its last few catches.
+        The leaves are (K, N) for K proposals. If targets are optional, further proposals are the
+        same without the last few catches.
         """
         table = timetable(case)
         numbers = self.network.apply(self.params, observe(case, table))

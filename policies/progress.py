@@ -3,10 +3,11 @@
 Each line of `progress.jsonl` is a row in JSON. A row has the number of the `part` of the training,
 and the number of `decisions` since the start of the training. There are two kinds of rows:
 
-* Rows of the learning curve hold means over the decisions since the previous row: `reward`, the
-  share `solved`, `last` and `ratio` of solved cases, and `violation` of unsolved cases (terms of
-  `environment.evaluate_actions`). They also hold the decisions `per_second`, the `divergence` of a
-  PPO update, the `learning_rate`, and `spread`, the standard deviation of the actions.
+* Rows of the learning curve hold means over the decisions since the previous row. These are
+  `reward`, the share `solved`, `last` and `ratio` of solved cases, and `violation` of unsolved
+  cases, which `environment.evaluate_actions` defines. They also hold the number of decisions
+  `per_second`, the KL `divergence` of a PPO update, the `learning_rate`, and `spread`, the standard
+  deviation of the actions.
 * Rows with `suites` hold an evaluation of the policy with the full number of planner iterations.
 
 The first line of the file instead holds the format, the number of rows and their digest.
@@ -73,7 +74,7 @@ def report_terms() -> Iterator[None]:
 
 
 def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Convert the metrics that Brax reports in `report_terms` to a row of the learning curve."""
+    """Convert the metrics that Brax's PPO reports to a row of the learning curve."""
     found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     solved, others = found["solved"], 1.0 - found["solved"]
     return {

@@ -9,8 +9,8 @@ from planner_jax.task.catch.spec import SUITES
 
 _MOST_DECISIONS = 1e12  # greatest accepted number of decisions of a part
 _CASE_BYTES = 20_000  # [bytes] estimated memory of one case in a batch
-NETWORK_NAMES = ("attention", "mlp")  # keys of `networks.NETWORKS`
-# Weights of the reward terms that `environment.evaluate_actions` returns and describes.
+NETWORK_NAMES = ("attention", "mlp")  # names of the policy networks that can be trained
+# Default weights of the terms of the reward, which `environment.evaluate_actions` defines.
 WEIGHTS = {"solved": 1.0, "last": 5.0, "ratio": -5.0, "caught": 5.0, "violation": -0.5}
 LEARNING_RATE = 1e-4  # default learning rate at the start of each part of a training
 _PAPER = ("parabola1", "parabola2", "harmonic2", "triangle3", "hexagon6")

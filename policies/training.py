@@ -262,7 +262,10 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """Return the number of rows in a part's learning curve, and of batches of decisions per row."""
+    """Return the number of rows in a part's learning curve, and of batches for each row.
+
+    A batch has one decision for each of `lanes` cases.
+    """
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each
@@ -320,7 +323,7 @@ def _train_part(
 
 
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
-    """Return policy and value network in the form of Brax, which passes flattened observations."""
+    """Return policy and value network in the form of Brax, which flattens the observations."""
     value = Value()
 
     def unflatten(flat: Array) -> Array:
@@ -328,8 +331,8 @@ def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONe
 
     def numbers(_: Any, params: Any, flat: Array) -> Array:
         found = network.apply(params, unflatten(flat))
-        # Give absent targets constant distributions. They then add nothing to the KL divergence by
-        # which PPO adapts its learning rate.
+        # Give absent targets constant distributions of actions. They then add nothing to the KL
+        # divergence, by which PPO adapts its learning rate.
         found = jnp.where(unflatten(flat)[..., -1:] > 0.5, found, 0.0)
         means, spreads = found[..., :PER_TARGET], found[..., PER_TARGET:]
         shape = (*flat.shape[:-1], -1)

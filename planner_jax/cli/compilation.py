@@ -1,7 +1,7 @@
 """`planner-jax doctor --compile`: the compiled programs of every default planner, as a table.
 
-A program is one function that JAX compiles. The table shows the size of each program and how long
-its compilation takes without the cache on the disk, so that a planner's growth is noticed.
+A program is a function that JAX compiles. The table shows the size of each program, and how long
+its compilation takes without the cache on the disk.
 """
 
 import collections
@@ -33,13 +33,13 @@ _HEAD = (
 
 @dataclasses.dataclass
 class Program:
-    """A function's compiled programs; all fields are sums over its versions."""
+    """Size and compile times of one function, summed over all shapes of its arguments."""
 
-    versions: int = 0  # number of programs, such as one for each shape of the arguments
-    equations: int = 0  # of the jaxprs (traced functions), with those of inner functions
-    tracing: float = 0.0  # [s]
-    lowering: float = 0.0  # [s]
-    compiling: float = 0.0  # [s]
+    versions: int = 0  # number of compiled programs, one for each combination of argument shapes
+    equations: int = 0  # number of equations in the jaxprs (traced functions), with inner jaxprs
+    tracing: float = 0.0  # [s] time of tracing to jaxprs
+    lowering: float = 0.0  # [s] time of lowering to MLIR
+    compiling: float = 0.0  # [s] time of compiling
 
 
 @contextlib.contextmanager
@@ -76,9 +76,9 @@ def record_programs() -> Iterator[dict[str, Program]]:
 
 
 def format_rows(planner: str, num: int, seconds: float, programs: dict[str, Program]) -> list[str]:
-    """Format rows of the table: the programs of a planner for `num` cases, the slowest first.
+    """Format rows of the table: a planner's programs for `num` cases, the longest to compile first.
 
-    The last row holds their sums and the duration [s] of the first plan.
+    The last row has the sums over all programs, and the duration `seconds` of the first plan.
     """
     columns = zip(*map(dataclasses.astuple, programs.values()), strict=True)
     shown = [row for row in programs.items() if row[1].compiling >= _SMALL]

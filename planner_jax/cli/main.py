@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns the exit code: 0 for success, 1 if the command fails, 2 for a bad argument, 130 after
     Ctrl-C.
     """
-    flags: dict[str, str] = {}  # by name of an argument, its option, such as "num": "--num"
+    flags: dict[str, str] = {}  # options of the command by argument name, such as "num": "--num"
     try:
         # Print warnings of other packages, such as a task that is not imported, in one line each.
         with warnings.catch_warnings():

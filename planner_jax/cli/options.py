@@ -1,6 +1,7 @@
 """Parsers of the command line; a command's options are the fields of its dataclass of settings.
 
-The fields' metadata have `metavar` and `help`, which `planner_jax.runs.settings.option` sets.
+The metadata of a field have `help`, the text on the option, and `metavar`, the word that stands for
+its value. `planner_jax.runs.settings.option` makes such fields.
 """
 
 import argparse
@@ -31,7 +32,10 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, with the options in `flags` for argument names; return `code`."""
+    """Print an error in one line, and return the exit code `code`.
+
+    Where the error names an argument, the text has the argument's option in `flags`.
+    """
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -43,25 +47,28 @@ class Parser(argparse.ArgumentParser):
 
     Args:
         fill: function that adds the parser's options; it is called when the parser is used.
-        **look: arguments of `argparse.ArgumentParser`.
+        **look: further arguments of `argparse.ArgumentParser`.
     """
 
     def __init__(self, *, fill: Callable[["Parser"], None] = lambda parser: None, **look: Any):
         shape = partial(argparse.RawDescriptionHelpFormatter, max_help_position=28, width=100)
         super().__init__(**{"formatter_class": shape, "allow_abbrev": False, **look})
         self._fill, self._flags = fill, {}
-        # A word that starts like this is a negative number and not an option. The own pattern of
-        # argparse does not match numbers with an exponent, such as -1e3.
+        # A word that matches this pattern is a negative number and not an option. The pattern that
+        # argparse uses by default does not match numbers with an exponent, such as -1e3.
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the parser's options, then parse; the result has `flags`, options by argument."""
+        """Add the parser's options, then parse the words.
+
+        In the result, `flags` has the option of each argument by name, such as "num": "--num".
+        """
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
 
     def add(self, flag: str, *, type: type | None = None, **how: Any) -> None:
-        """Add the option `flag`; with `type` int or float its word must be a number."""
+        """Add the option `flag`, whose value is converted to `type`, or else remains text."""
         if type in (int, float):
             how["type"] = partial(_read_number, flag, type)
         self._flags[self.add_argument(flag, **how).dest] = flag
@@ -107,7 +114,7 @@ def add_settings(parser: Parser, kind: Any, task: Task | None = None) -> None:
 
 
 def _form_of(field: dataclasses.Field) -> Options:
-    """Return a field's arguments of `add_argument`: metavar, number of words, required."""
+    """Return the arguments of argparse's `add_argument` that follow from a field of settings."""
     names = field.metadata["metavar"].split()
     how: Options = {"required": True} if field.default is dataclasses.MISSING else {}
     if len(names) == 1:
@@ -118,7 +125,7 @@ def _form_of(field: dataclasses.Field) -> Options:
 
 
 def _type_of(hint: Any) -> type:
-    """Return the type of an option's words, int, float or str, from the type of its field."""
+    """Return the type of an option's values, int, float or str, from the type of its field."""
     held = typing.get_args(hint) or (hint,)
     if str in held:  # the field accepts numbers or a word, such as "uniform"
         return str
@@ -127,7 +134,10 @@ def _type_of(hint: Any) -> type:
 
 
 def pop_out(given: Options, kind: str = "folder") -> str | None:
-    """Remove the option `--out`, the name of a `kind`, from the options; return it, or None."""
+    """Remove the option `--out`, the path of a file or folder, from the options; return it or None.
+
+    `kind` names what the path is of, in error messages.
+    """
     out = given.pop("out", None)
     if out == "":
         raise ArgumentError("out", f"a {kind}", out, verb="name")

@@ -216,7 +216,7 @@ def _quote_command() -> str:
 
 
 def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
-    """Return the hint `again` if the stopped run had started, which its file `sign` shows."""
+    """Return the advice `again` if the folder has the file `sign`, so that the run had started."""
     return again if (out / sign).exists() else stopping.NOTHING
 
 
@@ -224,7 +224,10 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Add `remainder()`, how to continue a run, to the message of an interruption or failure."""
+    """Within the `with` block, add `remainder()` to messages of interruptions and failures.
+
+    It is a sentence on how to continue the run.
+    """
     try:
         yield
     except KeyboardInterrupt:

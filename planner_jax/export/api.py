@@ -32,10 +32,11 @@ class Format:
     """A file format in which plans can be exported, and the functions that write it."""
 
     summary: str  # short description for the command's help
-    robots: tuple[str, ...]  # names of the supported robots of `export.setpoints.ROBOTS`
-    # By file extension, the function "module:name" that writes the file; the first is the default.
+    robots: tuple[str, ...]  # kinds of robots that are supported: quadrotor, car, arm
+    # For each file extension, the function "module:name" that writes the file. The first extension
+    # is the default.
     writers: Mapping[str, str]
-    is_sampled: bool = True  # whether the format holds setpoints at a rate, not polynomials
+    is_sampled: bool = True  # True for setpoints at equal time steps, False for polynomials
 
 
 FORMATS = {
@@ -72,14 +73,15 @@ def export(
 
     | `to` | file | content | frame |
     |---|---|---|---|
-    | `csv` | `.csv` | setpoints, header with units | as `plan.sample`: ENU, FLU |
+    | `csv` | `.csv` | setpoints, header with units | ENU, FLU |
     | `ros2` | `.mcap` | a message of `trajectory_msgs` (extra `export`) | ENU, FLU |
     | `px4` | `.tlog` | MAVLink SET_POSITION_TARGET_LOCAL_NED (extra `export`) | NED, FRD |
     | `px4` | `.mcap`, `.csv` | messages or rows of TrajectorySetpoint (extra `export`) | NED, FRD |
     | `crazyflie` | `.csv`, `.bin` | polynomials of degree 7, a row or 132 bytes a piece | ENU |
 
-    `csv` and `ros2` support quadrotors, cars and arms, the other formats quadrotors only. All units
-    are SI.
+    ENU and NED are world frames (x east, y north, z up; x north, y east, z down), FLU and FRD body
+    frames (forward, left, up; forward, right, down). `csv` and `ros2` support quadrotors, cars and
+    arms, the other formats quadrotors only. All units are SI.
 
     Args:
         plan: one solved plan. `pj.take(plans, k)` selects one from a batch.
@@ -87,9 +89,9 @@ def export(
         out: path of the file, whose extension selects the variant of the format. The file must not
             exist.
         rate: setpoints per second [Hz], 100 by default; not allowed for `crazyflie`.
-        recovery: a plan that does not end at standstill gets a recovery trajectory to standstill:
-            "brake" stops where that is cheapest, "home" at the first position of the case. None
-            exports the plan up to its last contact.
+        recovery: which trajectory to standstill is appended to a plan that does not end at
+            standstill. "brake" stops where this costs least, "home" at the robot's first position.
+            None exports the plan up to its last contact.
         case: case of the plan, whose limits the recovery trajectory keeps.
 
     Returns:
@@ -161,8 +163,9 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
     """Return one plan with a recovery trajectory, so that the robot ends at standstill.
 
     Args:
-        plan: solved plan of a quadrotor, a car or an arm.
-        recovery: "brake" or "home"; a plan that ends at standstill is returned unchanged. None
+        plan: solved plan of a quadrotor, a car or an arm. If it ends at standstill, it is returned
+            unchanged.
+        recovery: "brake" stops where this costs least, "home" at the robot's first position. None
             removes the recovery trajectory.
         case: case of the plan; needed unless the plan ends at standstill.
 

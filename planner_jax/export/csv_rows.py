@@ -8,7 +8,8 @@ from planner_jax.core.protocol import Plan
 from planner_jax.export.setpoints import robot_of, setpoints_of
 
 _AXES, _JOINTS = ("x", "y", "z"), ("1", "2", "3", "4", "5", "6")
-# For each robot, the columns of its table: a field of the setpoints, the columns' names, unit.
+# For each robot, the columns of its table. An entry is a field of the setpoints, the names of the
+# columns with the field's components, and the unit.
 _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
     "quadrotor": [
         ("time", ["time"], "s"),
@@ -39,7 +40,7 @@ _COLUMNS: dict[str, list[tuple[str, list[str], str]]] = {
 
 
 def write(plan: Plan, rate: float, file: BinaryIO) -> None:
-    """Write the setpoints of a plan at `rate` [Hz], in the units and frames of `plan.sample`."""
+    """Write the setpoints of a plan at `rate` [Hz], in SI units and the frames ENU and FLU."""
     columns = _COLUMNS[robot_of(plan).name]
     setpoints = setpoints_of(plan, rate)
     header = [f"{name} [{unit}]" for _, names, unit in columns for name in names]
@@ -47,7 +48,7 @@ def write(plan: Plan, rate: float, file: BinaryIO) -> None:
 
 
 def write_table(file: BinaryIO, header: list[str], columns: list[np.ndarray]) -> None:
-    """Write a header line and K rows as CSV; an array (K, N) in `columns` gives N columns."""
+    """Write a header line and rows as CSV; an array of two axes in `columns` is several columns."""
     file.write((",".join(header) + "\n").encode())
     blocks = [np.asarray(column).reshape(len(column), -1) for column in columns]
     for parts in zip(*blocks, strict=True):

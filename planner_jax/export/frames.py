@@ -5,7 +5,8 @@
 | library, ROS | ENU: x east, y north, z up | FLU: forward, left, up | counter-clockwise from east |
 | PX4 | NED: x north, y east, z down | FRD: forward, right, down | clockwise from north |
 
-Both worlds have the same origin. The library's x axis counts as east, whatever its true direction.
+Both world frames have the same origin. The library's x axis counts as east, whatever its true
+direction.
 """
 
 import numpy as np
@@ -26,15 +27,15 @@ _VERTICAL = 1e-6
 
 
 def yaw_of(quat_wxyz: np.ndarray, body_rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return yaw and yaw rate of attitudes: the direction of the body's x axis, seen from above.
+    """Return yaw and yaw rate of K attitudes: the direction of the body's x axis, seen from above.
 
     Args:
-        quat_wxyz: (K, 4), FLU body to ENU world.
+        quat_wxyz: (K, 4), quaternions from the body frame FLU to the world frame ENU.
         body_rate: (K, 3) [rad/s], in the body frame.
 
     Returns:
-        (K,) [rad], counter-clockwise from east, and its rate (K,) [rad/s]; both are 0 if the x axis
-        is vertical within 1e-6.
+        Yaw (K,) [rad], counter-clockwise from east, and its rate (K,) [rad/s]. Both are 0 where the
+        horizontal part of the body's x axis is shorter than 1e-6.
     """
     forward, left, up = (rotate(quat_wxyz, axis) for axis in np.eye(3))
     moved = body_rate[:, 2:] * left - body_rate[:, 1:2] * up  # derivative of `forward`

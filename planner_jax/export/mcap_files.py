@@ -41,9 +41,9 @@ def _full_name(kind: str) -> str:
 
 
 def _definition(kind: str) -> str:
-    """Return a ROS message type's definition, followed by those of the types in its fields."""
+    """Return the definition of a ROS message type, and of all types that its fields have."""
     types = [kind]
-    for each in types:  # the loop appends to the list that it iterates over
+    for each in types:  # the loop also visits the types that it appends
         inner = (line.split()[0].removesuffix("[]") for line in _TYPES[each].splitlines())
         types += [name for name in dict.fromkeys(inner) if name in _TYPES and name not in types]
     parts = [_TYPES[kind], *(f"MSG: {each}\n{_TYPES[each]}" for each in types[1:])]

@@ -13,14 +13,14 @@ _VECTORS = ("position", "velocity", "acceleration", "jerk")
 
 
 def trajectory_setpoints(plan: QuadrotorPlan, rate: float) -> dict[str, np.ndarray]:
-    """Return the fields of K messages `px4_msgs/TrajectorySetpoint` by name, local NED frame.
+    """Return the fields of messages `px4_msgs/TrajectorySetpoint` by name, in the local NED frame.
 
     Args:
         plan: one solved plan.
         rate: [Hz], setpoints per second.
 
     Returns:
-        timestamp: (K,) uint64 [us], since the start of the plan.
+        timestamp: (K,) uint64 [us], times of the K setpoints since the start of the plan.
         position, velocity, acceleration, jerk: (K, 3) float32 [m], [m/s], [m/s^2], [m/s^3]. The
             acceleration is without gravity, which PX4 adds itself.
         yaw: (K,) float32 [rad], yaw of the attitude, clockwise from north, in [-pi, pi].

@@ -23,7 +23,7 @@ WORLD, BODY = "world", "base_link"
 JOINTS = [f"joint_{k}" for k in range(1, 7)]  # joint names in the ROS packages of the arm's maker
 BODIES, ARM = "trajectory_msgs/MultiDOFJointTrajectory", "trajectory_msgs/JointTrajectory"
 TOPICS = {BODIES: "/command/trajectory", ARM: "/joint_trajectory_controller/joint_trajectory"}
-# By ROS message type, the types and names of its fields, also for the types of these fields.
+# For each ROS message type, and for the types of its fields: the types and names of the fields.
 TYPES = {
     BODIES: "std_msgs/Header header\nstring[] joint_names\n"
     "trajectory_msgs/MultiDOFJointTrajectoryPoint[] points",
@@ -43,7 +43,7 @@ TYPES = {
     "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
     "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
 }
-_NOW = {"sec": 0, "nanosec": 0}  # with this time stamp controllers start a trajectory at once
+_NOW = {"sec": 0, "nanosec": 0}  # time stamp for which controllers start a trajectory at once
 
 
 def trajectory_message(plan: Plan, rate: float = DEFAULT_RATE) -> object:
@@ -100,7 +100,10 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
 
 
 def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, ...]:
-    """Return position, quaternion xyzw, velocity, angular velocity, acceleration, world frame."""
+    """Return position, quaternion (x, y, z, w), velocity, angular velocity and acceleration.
+
+    All are in the world frame, with one row for each setpoint.
+    """
     if isinstance(setpoints, QuadrotorSetpoints):
         quat = setpoints.quat_wxyz
         spin = rotate(quat, setpoints.body_rate)

@@ -27,7 +27,7 @@ class Robot:
 
     name: str
     plan: type[Plan]  # class of the robot's plans
-    # Shapes of the plan's arrays by name. Axes with the same letter must have the same size.
+    # Shapes of the plan's arrays by name. A letter stands for any size, equal in all the shapes.
     shapes: Mapping[str, tuple[int | str, ...]]
     case_field: str  # name of a field that only the cases of this robot have
     end: Callable[..., float]  # function that returns the duration [s] of a plan
@@ -94,7 +94,7 @@ def _require_shapes(plan: Plan, robot: Robot) -> None:
 
 
 def setpoints_of(plan: Plan, rate: float) -> Setpoints:
-    """Return the setpoints `plan.sample(rate)` of one plan of a robot at a rate [Hz].
+    """Sample the setpoints of one plan of a robot at a rate [Hz].
 
     Raises:
         ArgumentError: the plan cannot be exported (see `robot_of`) or is not finite; or the rate is

@@ -1,9 +1,9 @@
 """Checks which received packets live planning may use.
 
-A packet is used once, and only in the order of sending. All senders use one common clock, with any
-offset to the clock of this process. A packet whose sending time disagrees with earlier packets by
-more than a second is ignored. If no packet was used for a second, such a packet is the first one of
-a new clock.
+Each packet is used at most once, and only if it was sent after all used packets of its sender. All
+senders use one clock, which may differ from this process's clock by any offset. A packet whose
+offset differs by more than a second from the offset of earlier packets is ignored. If no packet was
+used for a second, the senders are assumed to have a new clock, and the packet is used.
 """
 
 import math
@@ -11,8 +11,8 @@ from collections.abc import Hashable
 
 from planner_jax.live.packets import Fault, Packet
 
-LATE = 0.02  # [s], delay above the least observed delay from which a packet counts as late
-_APART = 1.0  # [s], disagreement above which a sending time counts as of another clock
+LATE = 0.02  # [s], a packet is late if its delay exceeds the least observed delay by more than this
+_APART = 1.0  # [s], difference of delays above which a packet was sent by another clock
 _SILENCE = 1.0  # [s], time without a used packet after which another clock is accepted
 _DRIFT = 1e-4  # greatest relative drift between the senders' clock and the receiver's clock
 _SENDERS = 32  # greatest number of senders whose newest packet is remembered
@@ -26,11 +26,14 @@ class Arrivals:
         self.was_late = False  # whether the last packet was late
         self._least = math.nan  # [s], least difference of arrival time and sending time
         self._used = -math.inf  # [s], arrival time of the last used packet
-        # By sender: sending time [s] and sequence number of its newest packet.
+        # For each sender, the sending time [s] and the sequence number of its newest packet.
         self._senders: dict[Hashable, tuple[float, int]] = {}
 
     def check(self, packet: Packet, sender: Hashable, now: float) -> tuple[Fault, bool]:
-        """Check a packet that arrives `now` [s]; return its fault, and whether its clock is new."""
+        """Check a packet that arrives at the time `now` [s].
+
+        Returns the reason for not using it, if any, and whether the senders have a new clock.
+        """
         self.was_late = False
         if packet.fault:
             return packet.fault, False

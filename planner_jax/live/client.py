@@ -45,7 +45,11 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's state (3,), SI units; return the answer, or None after the timeout."""
+        """Send the robot's position, velocity and acceleration in SI units.
+
+        Returns the answer, or None after the timeout. `measured` [s] is the time of the measurement
+        by `time.monotonic()`; the default is the time of this call.
+        """
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 
     def _send(

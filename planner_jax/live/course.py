@@ -1,4 +1,4 @@
-"""The course of a robot in live planning: a trajectory that it follows until standstill."""
+"""The course of a robot in live planning: a trajectory that ends at standstill."""
 
 from typing import Any
 
@@ -29,7 +29,10 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make the course of a plan, with pieces of zero duration in place of a recovery trajectory."""
+    """Make a course from the polynomials of a plan alone, without a trajectory to standstill.
+
+    Pieces of zero duration take its place, so that all courses have equal shapes.
+    """
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,7 +40,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a recovery trajectory; return the course of both, and whether limits hold."""
+    """Append a trajectory to standstill; return the course, and whether it keeps the limits."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])
@@ -47,10 +50,10 @@ def with_recovery(
 def recovery_from(
     state: Float[np.ndarray, "4 3"], pieces: int, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan a trajectory from a state (position to jerk) to standstill; return it as a course.
+    """Plan a trajectory from a state to standstill; return the course, and whether it keeps limits.
 
-    The course starts with `pieces` pieces of zero duration instead of a plan. The second result is
-    whether the limits hold.
+    `state` has the rows position, velocity, acceleration and jerk. The course starts with `pieces`
+    pieces of zero duration in the place of a plan.
     """
     path = _stand_still(pieces, state[0])
     path.coeffs[-1, :4] = state / np.array([[1.0], [1.0], [2.0], [6.0]])
@@ -58,7 +61,6 @@ def recovery_from(
 
 
 def _stand_still(pieces: int, pos: np.ndarray) -> PiecewisePolynomial:
-    """Return `pieces` polynomial pieces of zero duration at a position (3,) [m]."""
     coeffs: Any = np.zeros((pieces, 8, 3), np.float32)
     durations: Any = np.zeros(pieces, np.float32)
     coeffs[:, 0] = pos
@@ -79,7 +81,7 @@ class Query:
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample K = `num` setpoints of a course; columns are `packets.FIELDS`."""
+    """Sample `num` setpoints of a course; the columns of the result are `packets.FIELDS`."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)
@@ -97,7 +99,10 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk (4, 3) after `elapsed` [s] of a course, whose end is standstill."""
+    """Return position, velocity, acceleration and jerk at the time `elapsed` [s] of a course.
+
+    After the end of the course the robot stands still.
+    """
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:
@@ -106,5 +111,5 @@ def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
 
 
 def state_on(path: PiecewisePolynomial, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk (4, 3) after `elapsed` [s] of a trajectory, as float32."""
+    """Return position, velocity, acceleration and jerk at the time `elapsed` [s], as float32."""
     return states_at(path, np.asarray(elapsed)).astype(np.float32)

@@ -1,7 +1,7 @@
 """Packet format of live planning (`planner-jax serve`): little-endian, packed, with a version.
 
-A request has a header, and an observation of a ball or a state of the robot. An answer has a header
-that repeats the request's, a description and K setpoints. `docs/live.md` lists all fields.
+A request has a header, and an observation of a ball or a state of the robot. An answer has the
+header of its request, a description and the setpoints. `docs/live.md` lists all fields.
 """
 
 import dataclasses
@@ -14,7 +14,7 @@ import numpy as np
 MAGIC, VERSION = b"PJLV", 1  # first bytes of every packet, and version of the format
 BALL, ROBOT, ANSWER = 1, 2, 129  # kinds of packets
 MOST_SETPOINTS = 17  # greatest number of setpoints that fit an Ethernet frame
-LONGEST = 2048  # [bytes], greatest number of bytes read from a packet
+LONGEST = 2048  # [bytes], greatest length of a packet; longer packets are cut
 FARTHEST = 1e4  # greatest accepted magnitude of a measured value, in SI units
 OLDEST = 1.0  # [s], greatest accepted age of a measurement when it is sent
 
@@ -22,8 +22,8 @@ _HEADER = struct.Struct("<4sBBHId")  # magic, version, kind, ball, sequence, tim
 _MEASURED = struct.Struct("<d")  # time of the measurement
 _VALUES = {BALL: struct.Struct("<3d"), ROBOT: struct.Struct("<9d")}
 _SIZES = {kind: _HEADER.size + 8 + body.size for kind, body in _VALUES.items()}
-# Description in an answer: motion, fault, number K of setpoints, time of the first setpoint, period
-# between setpoints, time of the contact.
+# Description in an answer: kind of motion, fault of the request, number of setpoints, time of the
+# first setpoint, period between setpoints, time of the contact with the ball.
 _ANSWERED = struct.Struct("<BBBxddd")
 FIELDS = {"pos": 3, "vel": 3, "acc": 3, "jerk": 3, "quat_wxyz": 4, "body_rate": 3, "thrust": 1}
 WIDTH = sum(FIELDS.values())
@@ -95,7 +95,7 @@ class Answer:
     setpoints: np.ndarray  # (K, 20), the columns of `FIELDS`
 
     def column(self, name: str) -> np.ndarray:
-        """Return one field of all K setpoints, (K, N); `name` is a key of `FIELDS`, as "pos"."""
+        """Return a field of all setpoints, such as "pos"; `name` is a key of `FIELDS`."""
         names = list(FIELDS)
         before = sum(FIELDS[each] for each in names[: names.index(name)])
         return self.setpoints[:, before : before + FIELDS[name]]
@@ -104,7 +104,7 @@ class Answer:
 def request(
     kind: int, sequence: int, sent: float, measured: float, values: tuple, ball: int = 0
 ) -> bytes:
-    """Encode a request: an observed ball or a robot's state; times [s] by the sender's clock."""
+    """Encode an observed ball or a robot's state; `sent` and `measured` are times [s]."""
     head = _HEADER.pack(MAGIC, VERSION, kind, ball, sequence, sent)
     return head + _MEASURED.pack(measured) + _VALUES[kind].pack(*values)
 
@@ -139,7 +139,10 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """Encode an answer with setpoints (K, 20) float32; `times` are begin, period, contact [s]."""
+    """Encode an answer to a packet.
+
+    `times` [s] are the time of the first setpoint, the period, and the time of the contact.
+    """
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 

@@ -1,7 +1,8 @@
 """Live planning without the socket: a packet with a measurement in, a packet with setpoints out.
 
-The robot always follows a course, which ends at standstill, and an answer has its next setpoints.
-Planning runs in a separate thread, for which an answer waits only for a fraction of the deadline.
+The robot always follows a course, a trajectory that ends at standstill. An answer has the next
+setpoints of the course. Planning runs in a separate thread; an answer waits for the thread only for
+a fraction of the deadline.
 """
 
 import concurrent.futures
@@ -45,7 +46,8 @@ from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
 _ASTRAY = 0.5  # [m], distance of the robot from its course above which a new course starts
-# [m] and [m/s] Greatest jump to a plan that was found too late for its start.
+# Greatest jump of position [m] and velocity [m/s] with which the robot switches to a plan that was
+# found after the time at which it starts.
 _JOIN = (0.02, 0.2)
 _KNOWN = 0.3  # [m/s], standard deviation of a ball's velocity below which planning starts
 _NOTHING = np.zeros((0, WIDTH), np.float32)
@@ -53,7 +55,7 @@ _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 @dataclasses.dataclass(frozen=True)
 class _Flight(Generic[PlanT]):
-    """A course of the robot, and the plan that it follows. Times are of the senders' clock."""
+    """A trajectory of the robot to standstill, and the plan in it. Times are by senders' clock."""
 
     course: Course
     start: float  # [s], time at which the course starts
@@ -105,12 +107,12 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self._forget()
 
     def _forget(self) -> None:
-        """Delete the robot's course, the search for a plan and the ball's estimate."""
         self._flight: _Flight[PlanT] | None = None
-        # Course before the plan, for a return if the plan has no recovery within the limits.
+        # Course before the current plan. The robot returns to it if no trajectory from the plan's
+        # end to standstill keeps the limits.
         self._before: _Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
-        self._done = -1  # number of the last ball that the robot met
+        self._done = -1  # number of the last ball that the robot hit or caught
         self._sight.forget()
 
     def close(self) -> None:
@@ -166,7 +168,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             return self._pack(packet, fault, due)
 
     def record_sent(self, data: bytes, received: float) -> None:
-        """Count an answer that was sent, and complete the current plan's course (`_complete`)."""
+        """Record the time of an answer that was sent; then plan the current plan's recovery."""
         taken = time.perf_counter() - received
         self.report.counts["answered"] += 1
         self.report.counts["missed"] += taken > self.deadline
@@ -229,7 +231,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Search for a plan from the time `due`, first near a plan for the same ball."""
+        """Plan for a ball from the time `due`; an existing plan for this ball is improved first."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
@@ -269,7 +271,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Plan the recovery from the plan's end; if it fails, return to the previous course."""
+        """Append a trajectory to standstill to the plan; if none keeps limits, undo the switch."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return
@@ -296,7 +298,6 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return answer(packet, fault, motion, times, self._setpoints(flight, due))
 
     def _setpoints(self, flight: _Flight[PlanT], due: float) -> np.ndarray:
-        """Sample the K setpoints (K, 20) of a flight's course from the time `due` [s] on."""
         times: Any = np.float32(due - flight.start), np.float32(self._period)
         query = Query(flight.course, *times)
         return call_packed(setpoints_of, self._num, None, query)

@@ -13,7 +13,7 @@ from planner_jax.host.machine import format_size, resident_memory
 from planner_jax.live.packets import Fault
 
 _SHORTEST = 1e-6  # [s], lower end of the histogram of times
-_STEP = 0.01  # relative width of a bin of the histogram
+_STEP = 0.01  # width of a bin of the histogram, relative to its time
 _CLASSES = math.ceil(math.log(100.0 / _SHORTEST) / _STEP)  # number of bins, up to 100 s
 _COMPILING = "/jax/core/compile/"  # prefix of the events that JAX reports when it compiles
 
@@ -39,7 +39,7 @@ class Latencies:
         self.add(time.perf_counter() - start)
 
     def quantile(self, share: float) -> float:
-        """Return the time [s] that a fraction `share` of the times do not exceed; NaN if empty."""
+        """Return the time [s] that the fraction `share` of all times do not exceed, or NaN."""
         if not self.num:
             return math.nan
         index = int(np.searchsorted(np.cumsum(self._counts), share * self.num))

@@ -102,7 +102,7 @@ class Server:
 def compute_in_place() -> None:
     """Let JAX run CPU computations in the calling thread; call this before any computation.
 
-    By default JAX passes a computation to another thread, which takes longer than small
-    computations.
+    By default JAX passes a computation to another thread. For small computations this takes longer
+    than the computation itself.
     """
     jax.config.update("jax_cpu_enable_async_dispatch", False)

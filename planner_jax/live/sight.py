@@ -23,7 +23,7 @@ from planner_jax.planning.programs import call_packed
 
 _SPREAD = 15.0  # [m/s], assumed standard deviation of the velocity at the first observation
 _DENSITY = 0.01  # [m^2/s^3], power spectral density of accelerations not in the flight model
-# An observation is an outlier above this Mahalanobis distance [-] from the prediction.
+# An observation is an outlier if its Mahalanobis distance from the prediction is above this number.
 _GATE = 5.0
 _OTHERS = 5  # number of consecutive outliers after which the filter starts anew
 _FORGOTTEN = 0.3  # [s], time without an observation after which the filter starts anew
@@ -32,7 +32,7 @@ _LEAST = 3  # least number of observations before the velocity counts as known
 
 @struct.dataclass
 class Observation:
-    """Input of one step of the filter: the belief before an observation, and the observation."""
+    """Input of one step of the Kalman filter: a Gaussian belief, and an observation after it."""
 
     belief: EkfState
     since: Array  # () [s], time from the belief to the observation
@@ -42,7 +42,7 @@ class Observation:
 
 @struct.dataclass
 class Estimate:
-    """Output of one step of the filter: the belief after an observation, and a prediction."""
+    """Output of one step of the Kalman filter: belief after an observation, and a prediction."""
 
     belief: EkfState
     is_outlier: Array  # () bool, whether the observation was rejected
@@ -51,7 +51,7 @@ class Estimate:
 
 
 def _filter(flight: Flight, model: EkfModel, seen: Observation) -> Estimate:
-    """Update the belief with an observation, and predict the ball; the function is pure."""
+    """Update the belief about a ball with an observation, and predict the ball's state."""
     belief = ekf_predict(seen.belief, seen.since, model, flight=flight)
     away = seen.pos - belief.mean[:3]
     noise = jnp.diag(jnp.ones(3, away.dtype) * model.observation_std**2)
@@ -67,8 +67,8 @@ class Sight:
     """Estimate of position and velocity of one ball from its observed positions.
 
     Args:
-        flight: flight model (ball, duration, drag, gravity) -> ball.
-        drag: the drag in the unit that `flight` expects.
+        flight: function (ball, duration, drag, gravity) -> ball after the duration.
+        drag: drag of the ball, in the unit that `flight` expects.
         gravity: [m/s^2], magnitude.
         noise: [m], standard deviation of an observed coordinate.
     """

@@ -47,7 +47,7 @@ _LONGEST = 4.0  # [s], latest time of a catch
 # Fraction of the robot's limits that a plan may use. From a plan that uses its limits fully there
 # is often no trajectory to standstill within the limits, so it could not be flown.
 _SHARE = 0.97
-# Starts and solver for planning again: two L-BFGS steps from the previous plan.
+# Settings of the optimiser for planning again: two steps of L-BFGS from the previous plan.
 _AGAIN = Round(starts=1, solver=LbfgsConfig(max_steps=2, memory=2, trial_steps=(1.0, 0.2, 0.04)))
 
 CaseT = TypeVar("CaseT", HitCase, CatchCase)
@@ -72,11 +72,12 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
         self._case = dataclasses.replace(self.case, limits=jax.tree.map(np.asarray, limits))
         self.flight, self.drag = flight, drag
         self._planner, self._replanner = planners
-        self._solve_first, self._solve_again = solvers  # functions of round, planner and case
+        # Functions (settings of the optimiser, planner, case) -> plan.
+        self._solve_first, self._solve_again = solvers
         self.pieces = self._planner.num_pieces  # number of polynomial pieces of a plan
 
     def first(self, ball: BallState, head_state: Float[np.ndarray, "4 3"]) -> PlanT:
-        """Plan from scratch for a ball, from the robot's state: position to jerk at time 0."""
+        """Plan from scratch for a ball. `head_state` is the robot's position to jerk at time 0."""
         case = dataclasses.replace(self._with_ball(ball), head_state=head_state)
         return call_packed(self._solve_first, self._planner.rounds[1], self._planner, case)
 
@@ -99,7 +100,7 @@ class Stroke(abc.ABC, Generic[CaseT, PlanT]):
 
 
 def _state_in(task: Replanning) -> Array:
-    """Return position to jerk (4, 3) in the previous plan, `task.elapsed` [s] after its start."""
+    """Return position, velocity, acceleration, jerk in the previous plan at `task.elapsed` [s]."""
     path, elapsed = task.previous.trajectory, jnp.asarray(task.elapsed)
     return jnp.stack([evaluate(path, elapsed, order) for order in range(4)])
 
@@ -146,7 +147,10 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until the falling ball is too low for an upright net, or 0."""
+    """Return the time (1,) [s] at which the falling ball is too low for the net, or 0.
+
+    The net is then upright, with the quadrotor at its least height.
+    """
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's apex, since a rising ball may be too low at time 0.
@@ -162,7 +166,7 @@ def _time_left(case: CatchCase) -> Array:
 
 
 def _catch_first(attempt: Round, planner: ExactCatch, case: CatchCase) -> CatchPlan:
-    """Plan a catch from scratch; the first guess is the earliest catch that the robot can reach."""
+    """Plan a catch from scratch; the first guess is the earliest catch within the robot's reach."""
     case = dataclasses.replace(case, horizon=_time_left(case))
     choice = jax.tree.map(lambda leaf: leaf[0], Greedy().propose(case))
     case = case.with_choice(choice)

@@ -177,7 +177,7 @@ class RunFolder:
 
 @dataclasses.dataclass(frozen=True)
 class RunRows:
-    """What the figures of a finished run are drawn from: its manifest and its rows."""
+    """Manifest and rows of a finished run, from which its figures are drawn."""
 
     folder: RunFolder
     manifest: Entries
@@ -193,7 +193,7 @@ class RunRows:
         return shown + others[: max(missing, 0)]
 
     def same_case(self) -> list[tuple[str, Row]]:
-        """Return all plans for the example case as (planner, row), the run's own plan first."""
+        """Return all planners' plans for one case as (planner, row), the run's own plan first."""
         own = self.folder.plans.pick([self.manifest["example"]])[0]
         others = self.folder.baselines
         rows = others.read().to_pylist() if others.files() else []

@@ -52,7 +52,7 @@ _RESTS = {
 
 
 def recovery_remark(parameters: Row) -> list[str]:
-    """Return a sentence on the trajectory to standstill after the last contact; [] without one."""
+    """Return a sentence on the setting `recovery`: how the robots stop; [] if they do not."""
     words = _RESTS.get(parameters.get("recovery", ""))
     if words is None:
         return []
@@ -76,8 +76,8 @@ def sample_motion(
     """Sample a piecewise polynomial of M pieces at `num` evenly spaced times, in float64.
 
     Args:
-        coeffs: flattened (M, powers, 3), for each piece of ascending powers of the time since its
-            start.
+        coeffs: coefficients (M, powers, 3), flattened to one axis; ascending powers of the time
+            since the start of each piece.
         durations: (M,) [s], durations of the pieces.
         num: number of samples from the start of the first piece to the end of the last.
     """
@@ -90,7 +90,7 @@ def sample_motion(
 
 
 def sample_rest(row: Row, num: int) -> SampledMotion | None:
-    """Sample a row's recovery trajectory, flown after its last contact; None if it has none."""
+    """Sample the recovery trajectory to standstill in a stored row; None if it has none."""
     if row["recovery_durations"] is None:
         return None
     rest = sample_motion(row["recovery_coeffs"], row["recovery_durations"], num)
@@ -98,12 +98,12 @@ def sample_rest(row: Row, num: int) -> SampledMotion | None:
 
 
 def net_thrust(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the thrust per unit mass  a + g e_3  in the world frame, (N, 3) [m/s^2]."""
+    """Return the thrust per unit mass, acceleration minus gravity, at N times, (N, 3) [m/s^2]."""
     return motion.acc + gravity * np.array([0.0, 0.0, 1.0])
 
 
 def body_rate(motion: SampledMotion, gravity: float) -> np.ndarray:
-    """Return the magnitude (N,) [rad/s] of the body's angular velocity at zero heading.
+    """Return the magnitude [rad/s] of the body's angular velocity at N times, at zero heading.
 
     With the thrust vector f and c = f x jerk, the angular velocity normal to the body z axis has
     the magnitude |c| / |f|^2. The component about the z axis is -c_z / (|f| (|f| + f_z)) by the

@@ -14,13 +14,16 @@ if TYPE_CHECKING:
 
 
 def robot_option(usual: str) -> Any:
-    """Return the dataclass field of the setting `robot`; `usual` names the default in its help."""
+    """Return the dataclass field of the setting `robot`, in whose help `usual` is the default."""
     words = f"as `planner-jax robots` lists them, or a file .yaml, .yml, .xml (default: {usual})"
     return option(None, "NAME", words)
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the robot for a setting (name, file, mapping, model), or raise `ArgumentError`."""
+    """Return the robot with the tool `tool` for a setting; raise `ArgumentError` if it is unknown.
+
+    A setting is a name, the path of a file, a mapping of the model's fields, or a model.
+    """
     if given is None:
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of
@@ -59,7 +62,8 @@ class QuadrotorSettings(SweepSettings):
     recovery: str = recovery_option()
 
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
-    WITHOUT_EFFORT: ClassVar[str]  # planner that minimises no cost, so that `effort` is rejected
+    # Name of the planner that minimises no cost and for which the setting `effort` is rejected.
+    WITHOUT_EFFORT: ClassVar[str]
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -88,7 +88,6 @@ def write_report(folder: RunFolder) -> None:
 
 
 def _pick_failures(plans: Dataset) -> list[Row]:
-    """Return the first `FAILURES_SHOWN` rows whose plans the referee rejected."""
     failed, first = [], 0
     for rows in plans.parts(["success"]):
         failed += (first + np.flatnonzero(~np.asarray(rows["success"]))).tolist()

@@ -39,7 +39,7 @@ def case_of_row(folder: RunFolder, row: int) -> PyTree:
 
 
 def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
-    """Restore the plan from a stored row of results, with the referee's reason for rejecting it."""
+    """Restore the plan from row `row` of a run, with the referee's reason if it was rejected."""
     manifest, sweep = read_finished(folder)
     last = manifest["summary"]["num"] - 1
     if row is None or not 0 <= row <= last:
@@ -54,7 +54,7 @@ def read_plan(folder: RunFolder, row: int | None) -> PlannedRow:
 
 
 def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
-    """Restore a quadrotor's plan from a stored row of results; `setting` holds the gravity."""
+    """Restore a quadrotor's plan from a run's row; the manifest's `setting` holds the gravity."""
     rest = row.get("recovery_durations")
     return QuadrotorPlan(
         **_outcome(row),
@@ -65,14 +65,14 @@ def quadrotor_plan(row: Row, setting: Entries) -> QuadrotorPlan:
 
 
 def arm_plan(row: Row, _: Entries) -> ArmPlan:
-    """Restore an arm's plan from a stored row of results; it starts at the row's `delay`."""
+    """Restore an arm's plan from a run's row; its motion starts at the time `delay` in the row."""
     return ArmPlan(
         **_outcome(row), motion=_polynomial(row["motion_coeffs"], row["motion_durations"], 6)
     )
 
 
 def car_plan(row: Row, _: Entries) -> CarPlan:
-    """Restore a car's plan from a stored row of results: speed and curvature at knots in time."""
+    """Restore a car's plan from a run's row: speed and curvature at equally spaced times."""
     knots = {name: _numbers(row[name]) for name in ("start", "speed", "curvature")}
     return CarPlan(**_outcome(row), time=_numbers(row["meeting_time"]), **knots)
 

@@ -144,7 +144,7 @@ def resume_sweep(
 
 
 def _session(workers: str | None) -> Entries:
-    """Return a manifest entry on this process: its start time, versions, device and workers."""
+    """Return the manifest's entry on this process: start time, versions, device and workers."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     made = {} if workers is None else {"workers": workers}
     return {"started": now, **environment(), **made}
@@ -223,7 +223,7 @@ def _finish(
         write_report(folder)
         return folder.write_manifest({**manifest, "state": "complete"})
     except ArgumentError:
-        # A case of a later chunk breaks a rule. The run can never be finished and is deleted.
+        # A case breaks a rule, so the run can never be finished. Its folder is deleted.
         folder.discard()
         raise
     except (KeyboardInterrupt, WorkersFailed, OSError) as error:
@@ -239,7 +239,7 @@ def _finish(
 def plan_baselines(
     sweep: Sweep, source: Source, planners: Mapping[str, Planner], index: int
 ) -> pa.Table:
-    """Plan case `index` with several other planners; return a row for each, with its name."""
+    """Plan case `index` with other planners for comparison; return a row for each planner."""
     chunk, tables = source.cases(index, index + 1), []
     for name, planner in planners.items():
         stopping.check()
@@ -256,7 +256,7 @@ _OF_NETWORKS = ("parent", "name")
 
 
 def _fields_of(planner: object) -> Entries:
-    """Return a planner's fields for the manifest; an array is described by its shape alone."""
+    """Return a planner's fields for the manifest, where an array is described by its shape."""
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
         if field.name in _OF_NETWORKS:

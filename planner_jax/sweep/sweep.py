@@ -37,20 +37,21 @@ class RunFigure:
 
 
 class Sweep(Generic[AnySettings]):
-    """What a sweep does for one task: provide cases, plan, judge, and report."""
+    """Base class of the sweeps of a task: it provides cases, plans and judges them, and reports."""
 
     frame: ClassVar[str] = ""  # text on the coordinate frame and time origin of the columns
-    own_columns: ClassVar[Sequence[Column]] = ()  # columns of the rows; () stores every leaf
+    # Columns of the rows; () stands for a column for each array of cases, plans and verdicts.
+    own_columns: ClassVar[Sequence[Column]] = ()
     single_columns: ClassVar[Sequence[Column]] = ()  # columns for `planner-jax plan` of one case
     figures: ClassVar[tuple[RunFigure, ...]] = (
         RunFigure("outcomes.png", "Number of plans by iterations.", (9.0, 4.4), outcomes_figure),
     )
     counts: ClassVar[type[Tally]] = Tally  # class that counts the rows for the summary
     single_figures: ClassVar[Sequence[RunFigure]] = ()  # figures of `planner-jax plan` of one case
-    # A function that restores the plan which a row stores. Its arguments are the row and the
-    # manifest's entry `setting`, which holds the physics of all cases.
+    # A function that restores a plan from a row. Its arguments are the row and the manifest's entry
+    # `setting`, which holds the physics of all cases.
     plan_of_row: Callable[[Row, Entries], Plan] | None = None
-    # Columns in the report's list of failures, as heading -> name of the column.
+    # Columns that the report's list of failures shows: the name of the column by its heading.
     failure_words: ClassVar[Mapping[str, str]] = {
         "case": "index",
         "solver's status": "status",
@@ -66,11 +67,11 @@ class Sweep(Generic[AnySettings]):
         return f"sweep {self.task.name}"
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the rows' columns: `own_columns`, or else all leaves of case, plan and verdict."""
+        """Return the columns of the rows; by default one for each array of case, plan, verdict."""
         return self.own_columns or leaf_columns(batch)
 
     def planner(self, settings: AnySettings) -> Planner:
-        """Return the planner that the settings of a run name, with the options that they set."""
+        """Create the planner that the settings of a run name, with its options in the settings."""
         return self.task.planner(settings.planner, **settings.planner_options())
 
     def other_planners(self, settings: AnySettings) -> Entries:
@@ -164,8 +165,8 @@ def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
 def first_values(tree: PyTree, names: Sequence[str] = (), prefix: str = "") -> Entries:
     """Return fields of the first case of a batch as plain numbers, rounded to six decimals.
 
-    Names are of fields of `tree`, by default all, and get a `prefix` in the result. Fields that are
-    None or dataclasses are left out.
+    `names` are names of fields of `tree`, by default all. In the result each name has the `prefix`.
+    Fields that are None or dataclasses are left out.
     """
     names = names or [field.name for field in dataclasses.fields(tree)]
     known = {name: vars(tree)[name] for name in names}

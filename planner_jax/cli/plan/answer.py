@@ -31,7 +31,7 @@ SingleT = TypeVar("SingleT", bound=SingleSettings)
 
 _SAMPLES = 4001  # number of times at which a plan is compared with the limits
 
-# Units of the quantities that have an upper limit; the names are those of `PANELS`.
+# Units of the quantities of a flight that have an upper limit. The names are keys of `PANELS`.
 _ABOVE = {"speed": "m/s", "acceleration": "m/s^2", "body_rate": "rad/s"}
 
 
@@ -71,8 +71,8 @@ class Answer:
 class Single(abc.ABC, Generic[SingleT]):
     """Base class of the command `plan` for one task: it makes, plans and describes a case."""
 
-    # By field of the case, the option that sets the field. A field that is not listed has the
-    # option with the last name of its dotted path.
+    # For a field of the case, the name of the option that sets the field. Other fields are set by
+    # an option of the same name.
     NAMES: ClassVar[dict[str, str]] = {"head_state": "start"}
 
     def __init__(self, task: Task, settings: SingleT):
@@ -101,7 +101,7 @@ class Single(abc.ABC, Generic[SingleT]):
         return Answer(case, found, self.task.judge(case, found))
 
     def _setting_of(self, field: str) -> tuple[str, str]:
-        """Return a field of the case, and the name of the option that sets this field."""
+        """Return the name of a case's field, and the name of the option that sets this field."""
         return field, self.NAMES.get(field, field.rpartition(".")[2])
 
     def describe(self, answer: Answer) -> list[str]:
@@ -129,7 +129,7 @@ def sample_plan(found: QuadrotorPlan) -> SampledMotion:
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Return coefficients (M, D + 1, 3) and durations (M,) [s] of a plan and its recovery."""
+    """Return the coefficients and durations [s] of the pieces of a plan and its recovery."""
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0

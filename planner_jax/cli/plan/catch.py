@@ -48,7 +48,7 @@ class SingleCatch(Single[SingleCatchSettings]):
         return lines
 
     def task_margins(self, answer: Answer) -> list[Margin]:
-        """Return margins to the net's radius, its angle and the horizon, at the closest catch."""
+        """Return margins to the net's radius, its angle and the latest catch time (horizon)."""
         net, verdict = answer.case.net, answer.verdict
         times = np.asarray(verdict.catch_times)
         horizons = np.asarray(answer.case.horizon)[np.asarray(answer.plan.order)]

@@ -22,8 +22,8 @@ _MOST_BALLS = 6
 class SingleSettings:
     """Options of `planner-jax plan` for every task of a quadrotor; a subclass adds the task's.
 
-    Each field is an option, whose `metavar` has one word for each of its numbers. A value that
-    breaks a rule raises `ArgumentError`.
+    Each field is an option. Its `metavar`, such as "X Y Z", has one word for each number of the
+    option's value. A value that breaks a rule raises `ArgumentError`.
     """
 
     planner: str | None = option(None, "NAME", "")  # None selects the first planner of the task
@@ -35,11 +35,11 @@ class SingleSettings:
     min_height: float | None = option(None, "Z", f"least height [m] {_OWN}")
     gravity: float | None = option(None, "G", "magnitude [m/s^2] (default: the task's)")
     robot: object = robot_option("the task's")
-    recovery: str = recovery_option("brake")  # a controller needs setpoints until standstill
+    recovery: str = recovery_option("brake")  # "brake", since controllers need a stop at the end
 
     RUN: ClassVar[str]  # subclass of `Single` that runs the command, as "module:Class"
-    PLANNER: ClassVar[tuple[str, ...]] = ()  # fields that are options of the planner
-    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # fields that are not arguments of `task.case`
+    PLANNER: ClassVar[tuple[str, ...]] = ()  # names of fields that are arguments of the planner
+    ELSEWHERE: ClassVar[tuple[str, ...]] = ()  # names of fields that are no argument of `task.case`
     TOOL: ClassVar[str]  # tool that the robot must carry, "net" or "racket"
 
     def __post_init__(self) -> None:
@@ -47,7 +47,7 @@ class SingleSettings:
         require_one_of(CHOICES, "recovery", self.recovery)
         for field in dataclasses.fields(self):
             value = vars(self)[field.name]
-            if isinstance(value, list):  # the parser returns lists
+            if isinstance(value, list):  # argparse returns several numbers as a list
                 value = tuple(tuple(x) if isinstance(x, list) else x for x in value)
                 object.__setattr__(self, field.name, value)
             for number in _numbers(value):

@@ -1,9 +1,9 @@
 """A pinhole camera that projects world points to pixels with depths, and pixels back to points.
 
-A pixel is (column, row); whole numbers are the centres of pixels. In the camera frame x points to
-the right of the image, y down in the image, and z forward. The depth of a point is its z coordinate
-in the camera frame, as in depth images, and not its distance. Points and pixels may have any
-leading axes.
+A position in the image is (column, row) in pixels; whole numbers are the centres of pixels. In the
+camera frame x points to the right of the image, y down in the image, and z forward. The depth of a
+point is its z coordinate in the camera frame, and not its distance from the camera. Arrays of
+points and pixels may have any leading axes.
 """
 
 import functools
@@ -32,19 +32,19 @@ class Camera:
 
     @property
     def centre(self) -> Array:
-        """Pixel (2,) [px] of the optical axis, which is the centre of the image."""
+        """Position (2,) [px] of the optical axis in the image: its centre."""
         return jnp.asarray(0.5 * (np.array(self.size) - 1.0), jnp.result_type(self.focal))
 
 
 def from_numbers(kind: Callable[..., Kind], **leaves: ArrayLike) -> Kind:
-    """Create an object of a dataclass whose fields are converted to NumPy float32 arrays."""
+    """Create an object of the dataclass `kind`; fields are converted to NumPy float32 arrays."""
     return kind(**{name: np.asarray(leaf, np.float32) for name, leaf in leaves.items()})
 
 
 def looking_at(
     position: ArrayLike, target: ArrayLike, *, size: tuple[int, int], field_of_view: float
 ) -> Camera:
-    """Create a camera that points at a target and has no roll; its leaves are NumPy float32.
+    """Create a camera that points at a target, with its x axis horizontal.
 
     Args:
         position: (3,) [m], position of the camera in the world frame.
@@ -71,10 +71,7 @@ def looking_at(
 
 
 def move_camera(camera: Camera, pose: np.ndarray) -> Camera:
-    """Return the camera at another pose (4, 4), the homogeneous camera-to-world transform.
-
-    Such a pose is the result of a calibration.
-    """
+    """Return the camera at another pose, a homogeneous transform (4, 4) from camera to world."""
     moved = functools.partial(Camera, focal=camera.focal, size=camera.size)
     return from_numbers(moved, rotation=pose[:3, :3], position=pose[:3, 3])
 

@@ -21,17 +21,17 @@ from planner_jax.task.block.plan import BlockPlan
 
 @struct.dataclass
 class TimedPlan(BlockPlan):
-    """A plan of a block, and how long the planner took to find it."""
+    """A motion of an arm that blocks a ball, and the time that the planner took to find it."""
 
-    planning_time: Array  # () [s], without compilation
+    planning_time: Array  # () [s], time of planning without compilation
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class CountedPlanner(Planner[BlockCase, TimedPlan]):
-    """A planner that plans cases one after another with another planner, and measures its time.
+    """A planner that plans cases one after another by another planner, and measures each time.
 
-    If planning a case takes longer than `allowed`, its motion starts later by the excess.
+    If planning a case takes longer than `allowed`, its motion starts later by the difference.
     """
 
     case_type: ClassVar[type] = BlockCase
@@ -39,7 +39,7 @@ class CountedPlanner(Planner[BlockCase, TimedPlan]):
     allowed: float  # [s] planning time that the delay of every case already contains
 
     def plan_by(self, drive: Drive, cases: BlockCase) -> TimedPlan:
-        """Plan each case of a batch, delay late motions, and cut each where it meets the ball."""
+        """Plan each case, delay motions that were planned late, and cut motions at the contact."""
         plans, spent = measure_plans(self.planner, cases)
         late = np.maximum(spent - self.allowed, 0.0).astype(cases.delay.dtype)
         met = delay_motion(cases, plans, late)

@@ -21,7 +21,7 @@ from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _SAMPLES = 256  # number of times at which the positions of ball and shield are compared
-_HALVINGS = 24  # number of bisections of the interval between two of the sampled times
+_HALVINGS = 24  # number of bisections between two sampled times, to find the time of the contact
 
 
 def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
@@ -34,11 +34,11 @@ def end_at_contact(cases: BlockCase, plans: BlockPlan) -> BlockPlan:
     rejects the plan.
 
     Args:
-        cases: a batch of B cases with the true balls, and with the delays of the plans.
+        cases: a batch of B cases with the true balls. Their `delay` is the start of the motions.
         plans: plans for estimated balls of these cases; polynomials of degree 2 or more.
 
     Returns:
-        Plans with one more piece for braking; its duration is zero if the contact comes before.
+        Plans with one more piece for braking, of zero duration if the contact is before braking.
     """
     return _end_each_at_contact(cases, plans)
 
@@ -49,7 +49,7 @@ def delay_motion(cases: BlockCase, plans: BlockPlan, late: np.ndarray) -> BlockP
     Args:
         cases: a batch of B cases in which the arms start at rest.
         plans: plans of these cases.
-        late: (B,) [s], additional delay of each start, >= 0. A plan with 0 is not changed.
+        late: (B,) [s], time >= 0 by which each motion starts later; 0 leaves a plan unchanged.
 
     Returns:
         Plans with two more pieces: one for waiting before the motion, one for braking after it.

@@ -1,11 +1,11 @@
 """Least-squares fit of a ball's flight to its observations [Natarajan2024, eqs 5 to 8].
 
-Without drag, after gravity's known term is added back, the position is linear in the six unknowns:
+Without drag, once the known term of gravity is removed, the position is linear in six unknowns:
 the ball's position and velocity at one time. The normal equations are therefore a linear system of
-size six. It is centred and scaled by the mean and spread of the observations, and solved a second
-time for the residuals of the first solution. Float32 then suffices even if depths are a hundred
-times less certain than other coordinates. Positions are in the world frame with z up, in SI units.
-The functions treat one ball; use `jax.vmap` for a batch.
+size six. Its unknowns are centred and scaled by the mean and the spread of the observations. The
+system is solved a second time for the residuals of the first solution, so that float32 suffices
+even if depths are a hundred times less certain than other coordinates. World frame with z up, SI
+units. The functions treat one ball; use `jax.vmap` for a batch.
 
 Every fit uses all observations up to its time, from an array of fixed size in which later
 observations are NaN. No state is stored between fits, and every fit takes the same time.
@@ -31,7 +31,7 @@ class Sight(enum.IntEnum):
 
     @property
     def message(self) -> str:
-        """Explanation of the outcome for the user, with a remedy if the flight is unknown."""
+        """Sentence for the user, with advice if there were too few observations for a fit."""
         return _MESSAGES[self]
 
 
@@ -48,7 +48,9 @@ class FlightFit:
 
     belief: EkfState  # mean and covariance of the ball's position and velocity at `time`
     time: Array  # () [s], weighted mean of the times of the observations
-    misfit: Array  # () root mean square residual in standard deviations, about 1 for a good fit
+    # () Root mean square of the residuals, each divided by its standard deviation; about 1 if the
+    # standard deviations are right.
+    misfit: Array
     num: Array  # () int32, number of fitted observations
     status: Array  # () int32, a `Sight`: whether there were enough observations
 
@@ -61,14 +63,15 @@ class FlightFit:
 def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Array) -> FlightFit:
     """Fit a drag-free flight to observed positions by least squares; usable with jit and vmap.
 
-    The fit minimises  sum_k e_k' W_k e_k  over the position p and the velocity v, where
-    e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k.  With equal weights this is [Natarajan2024, eq. 8].
-    The covariance is correct if every W_k is the inverse covariance of its observation.
+    The fit minimises  sum_k e_k' W_k e_k  over the ball's position p and velocity v at time 0,
+    where e_k = p + v t_k - (0, 0, g t_k^2 / 2) - x_k is the error of the observation x_k. If the
+    weights W_k are equal, this is [Natarajan2024, eq. 8]. The fit's covariance is correct if every
+    W_k is the inverse covariance of its observation.
 
     Args:
-        times: (N,) [s], times t_k in any order.
+        times: (N,) [s], times t_k of N observations, in any order.
         places: (N, 3) [m], observed positions x_k. A position that is not finite is ignored, so
-            that arrays keep a fixed shape whatever the number of observations.
+            that arrays of a fixed shape can hold fewer observations.
         information: W_k [1/m^2], (N, 3, 3); or (N,) or () for isotropic noise. An observation with
             zero information is ignored too.
         gravity: () [m/s^2], magnitude g.
@@ -183,7 +186,7 @@ def error_across(belief: EkfState, ball: BallState) -> Array:
 
 
 def _root(square: Array) -> Array:
-    """Return the square root (); zero with derivative zero if rounding made the square negative."""
+    """Return the square root; 0 with the derivative 0 if rounding made `square` negative."""
     there = square > 0.0
-    # The product with the square keeps NaN, which marks a ball that was not seen.
+    # NaN marks a ball that was not seen. The product 0 * square is NaN then, and else 0.
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0 * square)

@@ -29,9 +29,11 @@ class StereoNoise:
 
     baseline: Array  # () [m], distance between the two lenses
     pixel_std: Array  # () [px], standard deviation of the ball's centre along each image axis
-    disparity_std: Array  # () [px], standard deviation of the ball's mean disparity
+    disparity_std: Array  # () [px], standard deviation of the disparity, averaged over the ball
     speckle_std: Array  # () [px], additional standard deviation of the disparity of one pixel
-    dropout: Array  # () probability that a pixel, or in `sightings` a frame, has no depth
+    # () Probability that a pixel of a depth image has no depth. Where no images are rendered
+    # (`sightings`), it is the probability that a frame does not show the ball.
+    dropout: Array
     mismatch: Array  # () probability that a pixel has the depth of another object
 
 
@@ -74,7 +76,7 @@ def stereo_noise(
 
 
 def depth_std(camera: Camera, noise: StereoNoise, depths: Array) -> Array:
-    """Return the standard deviations (...) [m] of the depths (...) [m] that noise causes."""
+    """Return the standard deviations of measured depths, in the shape of `depths` (...) [m]."""
     return depths**2 * noise.disparity_std / (camera.focal * noise.baseline)
 
 
@@ -93,7 +95,8 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
     sharp = camera.focal / (depth * noise.pixel_std)
     blurred = 1.0 / depth_std(camera, noise, depth)
     none = jnp.zeros_like(depth)
-    # The matrix W of these rows whitens the error e in the camera frame: W e has unit covariance.
+    # These are the rows of a matrix W that scales an error e in the camera frame: W e has the
+    # identity matrix as its covariance.
     rows = [
         jnp.stack([sharp, none, -sharp * point_in_camera[..., 0] / depth], axis=-1),
         jnp.stack([none, sharp, -sharp * point_in_camera[..., 1] / depth], axis=-1),

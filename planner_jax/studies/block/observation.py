@@ -1,7 +1,8 @@
 """Simulated camera observations of thrown balls, and the cases that planners get from them.
 
-The first frame is at a case's time 0. A flight is fitted to the observations up to some moment. The
-planner gets a case with the fitted ball, and the referee gets the case with the true ball.
+The camera's first image (frame) is at a case's time 0. A flight is fitted to the observations up to
+some time. The planner gets a case with the fitted ball. The referee, an independent check of the
+plan, gets the case with the true ball.
 Positions are in the robot's base frame with z up, in SI units.
 """
 
@@ -38,7 +39,7 @@ from planner_jax.task.block.scene import RIG_HALF, Box
 
 @struct.dataclass
 class Eye:
-    """A camera in the scene, with its measurement noise and its frame rate."""
+    """A camera that observes the ball, with its measurement noise and its frame rate."""
 
     camera: Camera
     noise: Noise
@@ -50,10 +51,10 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
 
     Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
     throws of all suites almost until they enter the outer box, the region in which the arm may
-    block them. From the mast it looks over the arm; 0.3 m to the left of the arm's axis it looks
-    past the pole. [Natarajan2024] mounts its camera on the beams of the rig. Its authors' model has
-    the camera in front of the arm, where 110 degrees do not cover throws that come from up to 60
-    degrees to either side.
+    block them. From the mast it looks over the arm; it is 0.3 m to the left of the arm's axis, so
+    that it looks past the pole. [Natarajan2024] mounts its camera on the beams of the rig, in front
+    of the arm. There, 110 degrees do not cover throws that come from up to 60 degrees to either
+    side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])
@@ -83,7 +84,7 @@ def eye(*, rate: float = 60.0, std: float | None = None, camera: Camera | None =
 
 def frame_times(eye: Eye, seconds: float) -> np.ndarray:
     """Return the times (N,) [s] of all frames from time 0 up to and including `seconds` [s]."""
-    # The small term keeps a frame exactly at `seconds`, which rounding could exclude.
+    # The small term prevents that rounding excludes a frame exactly at `seconds`.
     return np.arange(int(np.floor(seconds * eye.rate + 1e-6)) + 1) / eye.rate
 
 
@@ -131,7 +132,7 @@ def fit_throws(
 
     Returns:
         balls: estimated states of the balls at time 0, leaves (B, 3).
-        fits: the fits, leaves (B, ...).
+        fits: the fitted flights with their uncertainty, leaves (B, ...).
     """
     fits = jax.vmap(fit_until, (None, None, 0, 0, None))(eye, times, places, cases.gravity, moment)
     start = jnp.zeros((), times.dtype)
@@ -151,8 +152,8 @@ def see(
 ) -> SeenThrows:
     """Simulate the observation of a batch of throws, and return cases with the estimated balls.
 
-    Pass the returned cases through `cautious` and then to a planner. To judge the plans, set the
-    delay of the true cases to the returned delay, and pass true cases and plans to
+    Pass the returned cases through `cautious` and then to a planner. To judge the plans, copy the
+    field `delay` of the returned cases to the true cases, and pass true cases and plans to
     `studies.block.contact_check.end_at_contact`. A ball that was seen at fewer than two times is
     NaN, and `fits.status` states the reason.
 
@@ -216,9 +217,9 @@ def cautious(
 
 @jax.jit
 def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
-    """Return the position errors of fits at the middle of the time in which a ball can be blocked.
+    """Return the position errors of fitted flights, halfway through the time for blocking the ball.
 
-    The ball can be blocked between its entries into the outer and the inner box.
+    The ball can be blocked from its entry into the outer box until its entry into the inner box.
 
     Args:
         cases: a batch of B cases with the true balls.

@@ -44,21 +44,22 @@ from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NEAR = 0.02  # [m] A contact within this distance of the shield's centre needs no new motion.
-_EXCESS = 0.05  # Relative excess over the limits of a contact up to which a motion is continued.
+# Greatest relative excess over the limits of a contact with which a motion is still continued.
+_EXCESS = 0.05
 _LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer than any flight.
 
 
 @dataclasses.dataclass(frozen=True)
 class Aim:
-    """Stricter requirements on a contact with an estimated ball: arguments of `cautious`."""
+    """Requirements on the contact with an estimated ball, stricter than those of its case."""
 
     offset: float  # [m] greatest distance of the contact from the shield's centre
     at_rest: bool = False  # whether the arm must be at rest at the contact
     edge: float = 0.0  # [m] length cut from both ends of the ball's usable path
 
 
-# Requirements in the order in which they are tried, the strictest first. Each is tried for the
-# balls for which no plan meets the previous requirements.
+# Requirements on a contact in the order in which they are tried, the strictest first. Each is tried
+# for the balls for which no plan meets the previous requirements.
 AIMS = (
     Aim(0.005, at_rest=True, edge=0.05),
     Aim(0.005, edge=0.05),
@@ -81,19 +82,17 @@ class Decided:
     motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return errors and estimated standard deviations (B,) [m] of the fits at one moment.
-
-        `place` is the index of the moment.
-        """
+        """Return errors and estimated standard deviations [m] of the B fits at moment `place`."""
         return fit_errors(self.cases, take(self.fits, place))
 
 
 def plan_with_aims(
     planner: Planner, cases: BlockCase | Replanning, aims: Sequence[Aim] = AIMS
 ) -> BlockPlan:
-    """Plan cases with estimated balls; each case gets the plan of the first aim that is solved.
+    """Plan cases with estimated balls, for which `aims` are tried in this order.
 
-    Later aims require less of the contact. If none is solved, the best failed plan is returned.
+    An aim is a set of requirements on the contact. Each case gets the plan for the first aim that
+    can be met, or else the best failed plan.
     """
     cases, plans = jax.tree.map(np.asarray, cases), None
     lanes = np.arange(cases.batch_shape[0])
@@ -101,7 +100,7 @@ def plan_with_aims(
         some = take(cases, lanes)
         is_again = isinstance(some, Replanning)
         aimed = cautious(some.case if is_again else some, **dataclasses.asdict(aim))
-        # Convert to NumPy arrays, because JAX's programs for NumPy inputs are compiled already.
+        # Use NumPy arrays, because JAX has compiled the programs for NumPy arrays only.
         aimed = jax.tree.map(np.asarray, aimed)
         asked = dataclasses.replace(some, case=aimed) if is_again else aimed
         found = jax.tree.map(np.array, plan(planner, asked))
@@ -129,11 +128,11 @@ def decide(
     """Simulate a batch of arms that observe their balls, and plan motions at specified moments.
 
     Args:
-        planner: planner of the motions that are not refined from an arm's current motion. A planner
-            other than `OnlineBlock` requires a single moment.
+        planner: planner of an arm's first motion, and of motions that do not start from its current
+            motion. A planner other than `OnlineBlock` requires a single moment.
         cases: a batch of B cases with the true balls, and with the arms' initial states.
         eye: the camera, its noise and its frame rate.
-        moments: [s], increasing times at which the flights are fitted to all frames so far.
+        moments: [s], increasing times at which the flights are fitted to all observations so far.
         overhead: [s], time from a moment until a new motion may start, which includes the planning
             time, >= 0.
         seed: seed of the noise, or one seed for each throw, (B,).
@@ -207,10 +206,10 @@ class _Arms:
         self.first, self.motions = np.full(num, np.inf, dtype), np.zeros(num, np.int32)
 
     def count_useful(self, known: BlockCase, aims: Sequence[Aim]) -> np.ndarray:
-        """Count for each arm the aims (B,) that would bring the contact nearer to the centre.
+        """Count for each of B arms the aims that would bring the contact nearer to the centre.
 
-        Aims are requirements on the contact. `known` holds the estimated balls. All aims count for
-        an arm without a motion, and for an arm whose motion misses its ball.
+        Aims are requirements on the contact with the shield. `known` has the estimated balls. All
+        aims count for an arm without a motion, and for an arm whose motion misses its ball.
         """
         num = np.full(len(self.motions), len(aims))
         if not self.motions.any():
@@ -227,11 +226,10 @@ class _Arms:
     def decide(
         self, planner: Planner, known: BlockCase, useful: np.ndarray, aims: Sequence[Aim]
     ) -> None:
-        """Plan new motions for the arms with useful aims, and switch to motions that are solved.
+        """Plan new motions, and switch the arms to motions that meet the requirements `aims`.
 
-        `known` holds the estimated balls, and in its delays the times at which new motions may
-        start. For each arm the first `useful` (B,) of `aims`, requirements on the contact, are
-        tried.
+        For arm b the first useful[b] aims are tried. `known` are cases with the estimated balls;
+        their delays are the times at which new motions may start.
         """
         begun = dataclasses.replace(self.cases, delay=self.since)
         tasks = ReplanBlock().begin(begun, self.plans, known.delay - self.since, ball=known.ball)
@@ -249,7 +247,7 @@ class _Arms:
             self._begin(begin, lanes, plan_with_aims(planner, take(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
-        """Switch the arms with indices `lanes` (N,) to the plans `found` that are solved."""
+        """Switch the arms with the indices `lanes` to their plans in `found` that are solved."""
         good = is_solved(found.status)
         if not good.any():
             return
@@ -303,7 +301,10 @@ class _Arms:
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Return motions of zero duration at the arms' initial states; `shape` is (pieces, powers)."""
+    """Return motions of zero duration at the initial angles of the arms.
+
+    `shape` has the numbers of pieces and of coefficients of each polynomial.
+    """
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
     coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]
@@ -312,7 +313,6 @@ def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
 
 
 def _keys(seed: int | np.ndarray) -> Array:
-    """Return the random key of a seed, or keys (B,) of seeds (B,)."""
     return jax.vmap(jax.random.key)(seed) if np.ndim(seed) else jax.random.key(seed)
 
 
@@ -324,7 +324,7 @@ def _latest(case: BlockCase) -> Array:
 
 @jax.jit
 def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
-    """Return whether motions meet their balls within the limits plus 5 %, (B,) bool."""
+    """Return which motions meet their balls within the limits of the contact, enlarged by 5 %."""
 
     def one(case: BlockCase, plan: BlockPlan) -> Array:
         time = plan.contact_time - case.delay
@@ -339,7 +339,7 @@ def _meets(cases: BlockCase, plans: BlockPlan) -> Array:
 @jax.jit
 @jax.vmap
 def _cut_executed(case: BlockCase, motion: PiecewisePolynomial, time: Array) -> PiecewisePolynomial:
-    """Return a motion with braking and standstill appended, cut at a time () [s] from its start."""
+    """Append braking and standstill to a motion, and cut it at a time () [s] from its start."""
     motion = append_braking(case, motion)
     end = jnp.sum(motion.durations)
     stand = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(evaluate(motion, end))

@@ -18,7 +18,7 @@ from planner_jax.studies.block.seeing import SeeingArms, SeenPlan
 from planner_jax.studies.block.settings import StudySettings
 from planner_jax.task.block.default_planner import OnlineBlock
 
-_ROOM = 0.1  # [m] The summary counts fits whose error is at most this distance.
+_ROOM = 0.1  # [m] the summary counts the fitted flights whose position error is at most this
 
 
 # Names of the settings that are passed to `SeeingArms` as keyword arguments.
@@ -28,7 +28,7 @@ _SEEING = ("observe", "overhead", "replan", "observe_longer", "noise", "frame_ra
 def follow_study(planner: Planner, settings: StudySettings) -> Planner:
     """Wrap a planner so that it plans from camera observations, or in measured planning time.
 
-    Without such settings the planner is returned unchanged.
+    If the settings simulate neither, the planner is returned unchanged.
 
     Raises:
         ArgumentError: the planner does not work with a camera, or cannot plan repeatedly.
@@ -71,7 +71,7 @@ def columns_of(plans: object) -> list[Column]:
 
 
 class StudyCounts:
-    """Errors of flight fits, and planning times, collected from the rows of a run.
+    """Position errors of fitted flights, and planning times, collected from the rows of a run.
 
     Rows of runs that simulate neither a camera nor the planning time add nothing.
     """
@@ -88,7 +88,7 @@ class StudyCounts:
                 values.append(rows[name].to_numpy())
 
     def summary(self) -> Entries:
-        """Return median fit error [m], share of errors up to 0.1 m, and planning times [s]."""
+        """Return the fits' median error [m], the share up to 0.1 m, and planning times [s]."""
         found = {}
         if self._errors:
             errors = np.concatenate(self._errors)

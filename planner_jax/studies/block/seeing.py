@@ -21,10 +21,10 @@ from planner_jax.task.block.plan import BlockPlan
 
 @struct.dataclass
 class SeenPlan(BlockPlan):
-    """The executed motion of an arm up to the true contact, and the quality of its observations.
+    """The executed motion of an arm up to the true contact, and errors of the fitted flight.
 
-    Errors of fits are distances normal to the ball's velocity, halfway in time between its entries
-    into the outer and the inner box.
+    The error is the distance of the fitted ball from the true ball, normal to the true velocity. It
+    is taken halfway in time between the ball's entries into the outer and the inner box.
     """
 
     sight: Array  # () int32, a `Sight`: whether the first fit had enough observations
@@ -42,9 +42,9 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
 
     case_type: ClassVar[type] = BlockCase
     planner: Planner  # planner of the cases with estimated balls
-    observe: float  # [s] time from a case's time 0 until the first fit
-    overhead: float  # [s] time from a fit until a motion planned from it may start
-    replan: float  # [Hz] rate of later fits and plans; 0 plans once
+    observe: float  # [s] time from a case's time 0 until a flight is first fitted to observations
+    overhead: float  # [s] time from a fit until a motion that is planned from it may start
+    replan: float  # [Hz] rate at which flights are fitted and motions planned again; 0 plans once
     observe_longer: float  # [s] greatest delay of the first motion to collect more observations
     noise: float  # [m] standard deviation of isotropic noise; 0 selects a stereo camera's noise
     frame_rate: float  # [Hz] frame rate of the camera
@@ -83,7 +83,7 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         )
 
     def moments(self, cases: BlockCase) -> list[float]:
-        """Return the times [s] of the flight fits, up to the arrival of the batch's last ball."""
+        """Return the times [s] at which flights are fitted, until the last ball arrives."""
         moments = [self.observe]
         if self.observe_longer:
             num = int(self.observe_longer * self.frame_rate + 1e-6)
@@ -95,6 +95,6 @@ class SeeingArms(Planner[BlockCase, SeenPlan]):
         return moments
 
     def _seeds(self, cases: BlockCase) -> np.ndarray:
-        """Return seeds (B,) of the noise, which depend on each ball but not on its batch."""
+        """Return the seed of each case's noise, computed from its ball and not from its batch."""
         balls = np.concatenate([cases.ball.pos, cases.ball.vel], axis=1).astype(np.float32)
         return np.array([zlib.crc32(ball.tobytes(), self.seed) for ball in balls], np.uint32)

@@ -31,7 +31,8 @@ class BlockSettings(StudySettings):
     RUN: ClassVar[str] = "planner_jax.sweep.block.sweep:BlockSweep"
     DRAW: ClassVar[tuple[str, ...]] = ("regime", "wide", "anywhere", "delay")
     CASE_BYTES: ClassVar[int] = 60_000
-    CPU_BATCH: ClassVar[int] = 256  # small, because planning a case takes some milliseconds
+    # Number of cases in a batch on a CPU. It is small, so that a chunk takes only some seconds.
+    CPU_BATCH: ClassVar[int] = 256
     GPU_BATCH: ClassVar[int] = 4096
 
     def __post_init__(self) -> None:
@@ -43,5 +44,8 @@ class BlockSettings(StudySettings):
             require(self.delay == 0.0, "delay", rule, self.delay)
 
     def draw_options(self) -> Entries:
-        """Return the keyword arguments for drawing cases; from `delay` [s] on the arm may move."""
+        """Return the keyword arguments for drawing cases.
+
+        One of them is `delay` [s], the time from which the arm may move.
+        """
         return {**super().draw_options(), "delay": self.delay + self.first_motion}

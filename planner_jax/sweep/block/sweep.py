@@ -36,7 +36,7 @@ class BlockTally(Tally):
         self._study.add(rows)
 
     def summary(self) -> Entries:
-        """Return success rates and means; also errors of flight fits and planning times, if any."""
+        """Return success rates and means; with a camera also errors of the fitted flights."""
         return super().summary() | self._study.summary()
 
 
@@ -47,11 +47,11 @@ class BlockSweep(Sweep[BlockSettings]):
     plan_of_row = staticmethod(arm_plan)
 
     def columns(self, batch: RefereedBatch) -> Sequence[Column]:
-        """Return the columns of the rows, and more if a camera or planning time is simulated."""
+        """Return the columns of the rows, with further columns for a simulated camera or clock."""
         return [*COLUMNS, *columns_of(batch.plans)]
 
     def planner(self, settings: BlockSettings) -> Planner:
-        """Return the run's planner, wrapped if settings ask for a simulated camera or clock."""
+        """Create the run's planner, wrapped if a camera or the planning time is simulated."""
         return follow_study(super().planner(settings), settings)
 
     def other_planners(self, settings: BlockSettings) -> Entries:

@@ -1,7 +1,7 @@
 """Columns of the rows that a sweep of catches stores: targets, decision, catches and verdict.
 
-For N targets, a list column has N numbers, or 3 N coordinates. Lists of the case follow the order
-of its targets, lists of plan and verdict the order of the catches.
+A column of lists has one number, or three coordinates, for each target. Lists that belong to the
+case are in the order of its targets, lists of plan and verdict in the order of the catches.
 """
 
 import numpy as np

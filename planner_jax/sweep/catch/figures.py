@@ -20,7 +20,7 @@ from planner_jax.sweep.quadrotor import SampledMotion, net_thrust, sample_motion
 
 
 def target_paths(row: Row) -> BallPath | HarmonicPath:
-    """Restore the paths of N targets from a stored row of results; leaves are (N, ...)."""
+    """Restore the paths of a case's N targets from a run's row; leaves are (N, ...)."""
 
     def leaf(name: str, *trailing: int) -> jax.Array:
         return jnp.asarray(np.reshape(row[name], (-1, *trailing)), jnp.float32)
@@ -55,7 +55,10 @@ class SampledCatch(NamedTuple):
 
 
 def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
-    """Sample net and targets at the times of `motion`; `setting` holds net size and gravity."""
+    """Sample net and targets of a run's row at the times of `motion`.
+
+    `setting` is the manifest's entry with the size of the net and the gravity.
+    """
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -66,7 +69,10 @@ def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCa
 
 
 def due_distance(plan: SampledCatch) -> np.ndarray:
-    """Return distances (K,) [m] from net to next target; NaN right after a catch, to draw a gap."""
+    """Return the distance [m] of the net from the next target to be caught, at each sample.
+
+    The first sample after a catch is NaN, so that the drawn curve has a gap there.
+    """
     times, num = plan.motion.time, len(plan.catches)
     place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
     due = np.array(plan.row["order"])[np.minimum(place, num - 1)]
@@ -76,7 +82,8 @@ def due_distance(plan: SampledCatch) -> np.ndarray:
 
 _SAMPLES = 1601  # number of times at which a plan is sampled
 _ROTORS = 0.165  # [m] half the diagonal distance between propellers, of the paper's quadrotor
-_CLOSE, _AROUND = 0.5, 0.4  # [m] half the side of a close-up; [s] half the time that it shows
+# Half the side [m] of a close-up of a catch, and half the time [s] that the close-up shows.
+_CLOSE, _AROUND = 0.5, 0.4
 _TARGETS = (style.ORANGE, style.GREEN, style.PURPLE, style.SKY, "#8C564B", style.INK)
 
 
@@ -160,7 +167,7 @@ def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha:
 
 
 _PANELS = ("speed", "body_rate", "thrust", "jerk")
-_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis; smaller distances are drawn here
+_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis, where smaller distances are drawn
 
 
 def motion_figure(figure: Figure, run: RunRows) -> None:

@@ -32,7 +32,11 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts of successes, and means of targets caught, catch times and optimal time ratios."""
+    """Counts of successes, and means over the rows of a run.
+
+    The means are of the share of targets caught, of the catch times, and of the optimal time ratio,
+    the relative difference of decided and planned catch times [Yu2023catch, eq. 29].
+    """
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
@@ -57,7 +61,7 @@ class CatchTally(Tally):
         self._num_ratios += int(known.sum())
 
     def summary(self) -> Entries:
-        """Return success rates, mean catch time [s] and optimal time ratio; None without values."""
+        """Return success rates, mean catch time [s] and optimal time ratio; None for no values."""
         return {
             **super().summary(),
             "caught": self._shares / self.num,
@@ -94,7 +98,10 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success and optimal time ratio, beside [Yu2023catch, Tables I and III]."""
+        """Return a table of success rate and optimal time ratio, with the published numbers.
+
+        They are from [Yu2023catch, Tables I and III].
+        """
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:

@@ -16,7 +16,7 @@ from planner_jax.task.hit import court
 from planner_jax.task.hit.court import fly, landing
 
 _SAMPLES = 48  # number of points of each drawn trajectory
-_SHORTEST = 0.12  # least ratio of half the height of a panel to its width
+_SHORTEST = 0.12  # least half height of a panel, divided by the panel's width
 _FLOOR = "#F6F8FA"
 _TARGET: Look = {"marker": "o", "mfc": "none", "mec": style.INK, "mew": 1.6}
 
@@ -58,7 +58,7 @@ def court_figure(figure: Figure, run: RunRows) -> None:
 def ball_path(
     pos: np.ndarray, vel: np.ndarray, end: float, drag: float, gravity: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return times (N,) [s] up to `end`, and positions (N, 3) [m] of a ball in free flight."""
+    """Return N times [s] from 0 to `end`, and the positions (N, 3) [m] of a flying ball then."""
     time = np.linspace(0.0, end, _SAMPLES)
     again = (_SAMPLES, 1)
     return time, fly(np.tile(pos, again), np.tile(vel, again), time, drag, gravity)[0]

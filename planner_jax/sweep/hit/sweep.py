@@ -71,7 +71,7 @@ class ServeSource(Source):
 
 
 class HitTally(Tally):
-    """Counts of successes by scenario; the report's example is like [Yu2023bat, Fig. 7]."""
+    """Counts of successes by court scenario: where a serve comes from, and where it goes."""
 
     READS = (*COUNTED, *ScenarioCounts.READS)
 
@@ -85,7 +85,10 @@ class HitTally(Tally):
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
+        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first.
+
+        It has serves like the serve of [Yu2023bat, Fig. 7].
+        """
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]

@@ -28,7 +28,10 @@ def _positions(targets: PyTree, times: jax.Array) -> jax.Array:
 
 
 def _corners(name: str) -> Callable[[RefereedBatch], np.ndarray]:
-    """Return a function that computes obstacle corners (B, N, V, 2) [m] of field `name`."""
+    """Return a function that computes the corners [m] of the obstacles in the field `name`.
+
+    The corners are (B, N, V, 2), for N obstacles of V corners in each of B cases.
+    """
 
     def values(batch: RefereedBatch) -> np.ndarray:
         group = vars(batch.cases)[name]

@@ -27,13 +27,13 @@ from planner_jax.sweep.figures import draw_upper_limit, look_of, write_verdicts
 
 @dataclasses.dataclass(frozen=True)
 class SampledDrive:
-    """The plan of a stored row: obstacles as polygons, car and target sampled at K times."""
+    """The plan in a run's row: obstacles as polygons, and car and target sampled at K times."""
 
     row: Row
     setting: Entries  # entry `setting` of the manifest
-    walls: list[np.ndarray]  # corners (V, 2) [m] of each wall
-    movers: list[np.ndarray]  # corners (V, 2) [m] of each moving obstacle at time 0
-    velocities: np.ndarray  # (N, 2) [m/s], velocities of the moving obstacles
+    walls: list[np.ndarray]  # (V, 2) [m], V corners of each wall
+    movers: list[np.ndarray]  # (V, 2) [m], V corners of each moving obstacle at time 0
+    velocities: np.ndarray  # (N, 2) [m/s], velocities of N moving obstacles
     time: np.ndarray  # (K,) [s]
     pose: np.ndarray  # (K, 3), rear axle: x, y [m], heading [rad]
     middle: np.ndarray  # (K, 2) [m], middle of the car's body
@@ -43,7 +43,7 @@ class SampledDrive:
     target: np.ndarray  # (K, 2) [m], predicted positions of the target
 
     def target_at(self, times: np.ndarray | float) -> np.ndarray:
-        """Interpolate the predicted positions (T, 2) [m] of the target at times (T,) [s]."""
+        """Interpolate the predicted position [m] of the target at one or several times [s]."""
         places = np.reshape(self.row["target_way"], (-1, 2))
         known = np.linspace(0.0, self.row["due_time"], len(places))
         return np.stack([np.interp(times, known, places[:, k]) for k in range(2)], axis=-1)
@@ -87,7 +87,7 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
-    """Return the corners (V, 2) [m] of each obstacle of a row; `kind` is "wall" or "mover"."""
+    """Return the corners (V, 2) [m] of each obstacle of a kind, "wall" or "mover", in a row."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -97,7 +97,7 @@ def _polygons(row: Row, kind: str) -> list[np.ndarray]:
 def _sample(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
-    """Return time, pose, speed, curvature and acceleration at fractions (K,) of a plan's time."""
+    """Return time, pose, speed, curvature and acceleration of a plan at K fractions of its time."""
     time = end * shares
 
     def at(time: Array) -> tuple[Array, ...]:
@@ -108,7 +108,8 @@ def _sample(
 
 
 _SAMPLES = 241  # number of times at which a plan is sampled
-_PANELS, _COLUMNS, _FAILURES = 6, 3, 2  # numbers of panels, panels in a row, and failures shown
+# Numbers of a figure's panels, each with one case, of panels in a row, and of cases that failed.
+_PANELS, _COLUMNS, _FAILURES = 6, 3, 2
 # Greatest numbers of times at which a panel shows the car, and of polygons of moving obstacles.
 _MOST_BODIES, _MOST_MOVERS = 6, 16
 # The colour map Viridis without its light end, which is hard to see on white paper.
@@ -199,7 +200,10 @@ def entries(colours: ScalarMappable) -> list[Artist]:
 
 
 def instants(end: float, most: int) -> np.ndarray:
-    """Return at most `most` times [s] from 0 to `end`, multiples of 1, 2, 2.5 or 5 times 10^n."""
+    """Return at most `most` times [s] from 0 to `end`: multiples of 1, 2, 2.5 or 5 times 10^n [s].
+
+    The whole number n is chosen so that the times are as dense as allowed.
+    """
     steps = [mantissa * 10.0**power for power in range(-3, 9) for mantissa in (1.0, 2.0, 2.5, 5.0)]
     num, step = next((n, step) for step in steps if (n := int(end / step + 1e-6)) < most)
     return step * np.arange(num + 1)
@@ -223,15 +227,15 @@ def draw_polygons(
     alpha: float = 0.25,
     zorder: float = 2,
 ) -> None:
-    """Draw polygons, each of V corners (V, 2) [m]; `alpha` is the opacity of their filling."""
+    """Draw filled polygons of V corners (V, 2) [m] each; `alpha` is the opacity of the filling."""
     look: Look = {"facecolor": (*colour[:3], alpha), "edgecolor": colour, "zorder": zorder}
     axes.add_collection(PolyCollection(polygons, linewidth=1.0, **look))
 
 
 _CURVE_SAMPLES = 801  # number of times at which a plan is sampled for curves over time
-_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis; smaller distances are drawn here
-# Panels of curves over time. Each has the name of a limit, the label of its y axis, its title, and
-# a function that computes the limited quantity (K,) from a sampled plan.
+_LEAST_DISTANCE = 1e-3  # [m] lower end of the logarithmic axis, where smaller distances are drawn
+# Panels of curves over time. Each has the name of a limit, the label of the panel's y axis, its
+# title, and a function that computes the limited quantity from a sampled plan.
 _CURVES: tuple[tuple[str, str, str, Callable[[SampledDrive], np.ndarray]], ...] = (
     ("speed", "v [m/s]", "Speed", lambda d: d.speed),
     ("acceleration", "|a| [m/s²]", "Acceleration along the path", lambda d: np.abs(d.acceleration)),

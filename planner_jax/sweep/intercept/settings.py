@@ -14,7 +14,8 @@ class InterceptSettings(SweepSettings):
 
     RUN: ClassVar[str] = "planner_jax.sweep.intercept.sweep:InterceptSweep"
     CASE_BYTES: ClassVar[int] = 100_000
-    CPU_BATCH: ClassVar[int] = 256  # small, because planning a case takes some milliseconds
+    # Number of cases in a batch on a CPU. It is small, so that a chunk takes only some seconds.
+    CPU_BATCH: ClassVar[int] = 256
     GPU_BATCH: ClassVar[int] = 4096
 
 
@@ -24,7 +25,8 @@ class GroupSettings(SweepSettings):
 
     decide: str = option("best", "NAME", f"decision about the order: {', '.join(DECISIONS)}")
 
-    # The most promising orders of a group's targets are planned together, which needs memory.
+    # Memory of one case [bytes]. It is large, because several orders of the group's targets are
+    # planned together.
     CASE_BYTES: ClassVar[int] = 1_000_000
     CPU_BATCH: ClassVar[int] = 64
     GPU_BATCH: ClassVar[int] = 512

@@ -13,18 +13,19 @@ from planner_jax.sweep.intercept.settings import InterceptSettings
 from planner_jax.sweep.rows import car_plan
 from planner_jax.sweep.sweep import RunFigure, Sweep, first_values
 
-COMPARED = ("lattice", "spacetime")  # planners that also plan the run's example case, for figures
+# Planners whose plans for one case of a run are drawn beside the plan of the run's own planner.
+COMPARED = ("lattice", "spacetime")
 
 
 class InterceptTally(Tally):
-    """Counts of successes, and means of meeting time, miss distance and acceleration."""
+    """Counts of successes, and means of meeting time, miss and acceleration over the successes."""
 
     MEANS = ("meeting_time", "miss", "rms_acceleration")
     READS = (*COUNTED, *MEANS, "mover_clearance")
-    NEAR = 0.1  # [m] the example's clearance to moving obstacles is below this distance
+    NEAR = 0.1  # [m] the figures prefer a case whose car passes a moving obstacle at less than this
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of cases that the report's figures may show, preferred masks first."""
+        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
@@ -47,7 +48,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:
-        """Return the planners in `COMPARED` alone, because each planner compiles for a minute."""
+        """Return few of the other planners, because the programs of each compile for a minute."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 
