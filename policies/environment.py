@@ -115,10 +115,6 @@ class CatchEnv(Env):
         return state.replace(obs=self._observe(cases), reward=reward, done=one, info=info)
 
     def _evaluate(self, cases: tuple[CatchCase, ...], actions: Array) -> dict[str, Array]:
-        """Return the unweighted reward terms by name, with one number for each of B cases.
-
-        `actions` (S, B / S, size, PER_TARGET) are for S suites of cases with up to `size` targets.
-        """
         alike: dict[Any, list[int]] = {}
         for k, some in enumerate(cases):
             key = (*map(jnp.shape, jax.tree.leaves(some)), jax.tree.structure(some))
@@ -141,11 +137,6 @@ class CatchEnv(Env):
         return tuple(draw_by_key(k, share, s) for k, s in zip(keys, self.suites, strict=True))
 
     def _observe(self, cases: tuple[CatchCase, ...]) -> Array:
-        """Return the policy's observations of all cases: a row of features for each case.
-
-        A row has `FEATURES` numbers for each of `size` targets, zero for absent targets.
-        """
-
         def of_suite(cases: CatchCase) -> Array:
             seen = jax.vmap(lambda case: observe(case, timetable(case)))(cases)
             absent = self.size - cases.num_targets

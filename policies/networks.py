@@ -86,7 +86,6 @@ class Value(nn.Module):
 
 
 def _apply_attention(module: Any, seen: Array) -> Array:
-    """Apply a module's attention layers to the features of targets, and return new features."""
     present = seen[..., -1] > 0.5
     # Each target attends to itself even if it is absent. A row of the mask that is false everywhere
     # would give NaN.

@@ -74,7 +74,6 @@ def report_terms() -> Iterator[None]:
 
 
 def _row_of(metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Convert the metrics that Brax's PPO reports to a row of the learning curve."""
     found = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     solved, others = found["solved"], 1.0 - found["solved"]
     return {

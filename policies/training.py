@@ -123,10 +123,6 @@ def train(training: Training, out: str | os.PathLike, *, progress: bool = True) 
 def _train_parts(
     training: Training, folder: Path, network: Any, params: Any, progress: bool
 ) -> Policy:
-    """Train the parts whose parameters are not stored yet, and write the final policy.
-
-    `params` are the parameters before the first part.
-    """
     keeper = KeptParts(folder / "parts")
     rows, before = Progress(folder, progress), 0
     for number, part in enumerate(training.parts):
@@ -208,11 +204,6 @@ def _sentence(suites: Mapping[str, Any]) -> str:
 
 
 def _record_settings(folder: Path, training: Training) -> None:
-    """Write `training.json` with the settings and the version of the code.
-
-    Raises:
-        ArgumentError: the file exists, with other settings or another version of the code.
-    """
     asked = json.loads(json.dumps(dataclasses.asdict(training)))
     maker = {"version": str(find_version("planner-jax")), "code": code_digest()}
     wanted = {**maker, **asked}
@@ -323,7 +314,6 @@ def _train_part(
 
 
 def _networks(network: Any, size: int, *_: Any, **__: Any) -> ppo_networks.PPONetworks:
-    """Return policy and value network in the form of Brax, which flattens the observations."""
     value = Value()
 
     def unflatten(flat: Array) -> Array:

@@ -123,7 +123,6 @@ def _make_parser() -> Parser:
 
 
 def _doctor(options: Options) -> int:
-    """Run the command `doctor`, which checks the installation; return the exit code."""
     from planner_jax.cli import compilation, doctor
 
     if options["compile"]:

@@ -79,7 +79,6 @@ class Parser(argparse.ArgumentParser):
 
 
 def _read_number(flag: str, kind: Callable[[str], float], word: str) -> float:
-    """Convert a word of the command line to a number, or raise `BadOption`."""
     try:
         return kind(word)
     except ValueError:
@@ -125,7 +124,6 @@ def _form_of(field: dataclasses.Field) -> Options:
 
 
 def _type_of(hint: Any) -> type:
-    """Return the type of an option's values, int, float or str, from the type of its field."""
     held = typing.get_args(hint) or (hint,)
     if str in held:  # the field accepts numbers or a word, such as "uniform"
         return str

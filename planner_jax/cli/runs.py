@@ -206,12 +206,10 @@ def _throughput(given: Options) -> None:
 
 
 def _name_run_folder(name: str) -> str:
-    """Return the default path of a run folder: runs/NAME-DATE-TIME with the current time."""
     return os.path.join("runs", f"{name}-{datetime.datetime.now():%Y%m%d-%H%M%S}")
 
 
 def _quote_command() -> str:
-    """Return the command line of this process, quoted so that a shell can run it again."""
     return shlex.join(["planner-jax", *sys.argv[1:]])
 
 

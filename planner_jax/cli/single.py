@@ -62,7 +62,6 @@ def _plan(task: Task, given: Options) -> int:
 def _write_answer(
     task: Task, planner: str, answer: "Answer", out: Path, rate: float | None
 ) -> None:
-    """Write plan and pictures into a new folder, and setpoints if the referee accepts the plan."""
     from planner_jax.cli.plan.answer import write_pictures
     from planner_jax.export.api import export
 
@@ -131,7 +130,6 @@ def _export(given: Options) -> None:
 
 
 def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
-    """Read a plan of a sweep or a file; return it, and the referee's objection (empty if none)."""
     if os.path.isdir(source):
         from planner_jax.runs.run_folder import RunFolder
         from planner_jax.sweep.rows import read_plan
@@ -145,7 +143,6 @@ def _plan_of(source: str, row: int | None) -> "tuple[Plan, str]":
 
 
 def _case_of(source: str, row: int | None, recovery: str) -> "Case":
-    """Return the case of one row of a sweep, whose limits the recovery trajectory must keep."""
     if row is None or not os.path.isdir(source):
         rule = "none for plans of a file that do not come to rest, as it does not hold their limits"
         raise ArgumentError("recovery", rule, recovery)

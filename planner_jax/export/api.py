@@ -203,7 +203,6 @@ def lacks_recovery(plan: Plan) -> bool:
 
 
 def _require_name(to: str) -> str:
-    """Return `to` if it names a format; else raise `UnknownName`, with the most similar name."""
     if to not in FORMATS:
         alike = difflib.get_close_matches(str(to).lower(), FORMATS, n=1)
         hint = f"; did you mean {alike[0]!r}?" if alike else ""
@@ -212,7 +211,6 @@ def _require_name(to: str) -> str:
 
 
 def _require_format(to: str, plan: Plan) -> Format:
-    """Return the format with the name `to`; raise unless it supports the robot of the plan."""
     form, robot = FORMATS[_require_name(to)], robot_of(plan)
     if robot.name not in form.robots:
         rule = f"a format for plans of the {robot.name}"

@@ -123,12 +123,10 @@ def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, .
 
 
 def _vector(values: Sequence[float]) -> dict[str, float]:
-    """Convert a vector or a quaternion to a dictionary with the keys x, y, z and w."""
     return dict(zip("xyzw"[: len(values)], values, strict=True))
 
 
 def _make_message(kind: str, fields: Mapping[str, Json]) -> object:
-    """Make an object of the ROS 2 message class `kind`, and set its fields recursively."""
     package, name = kind.split("/")
     message = pkgutil.resolve_name(f"{package}.msg:{name}")()
     for line in TYPES[kind].splitlines():

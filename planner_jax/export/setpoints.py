@@ -79,7 +79,6 @@ def robot_of(plan: Plan) -> Robot:
 
 
 def _require_shapes(plan: Plan, robot: Robot) -> None:
-    """Raise `ArgumentError` unless the arrays of one plan have the shapes in `robot.shapes`."""
     sizes: dict[int | str, int] = {}
     leaves = leaves_by_name(plan)
     for name, expected in robot.shapes.items():

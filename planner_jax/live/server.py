@@ -80,7 +80,6 @@ class Server:
         self.planner.record_sent(data, received)
 
     def _warn(self, data: bytes, sender: tuple[str, int]) -> None:
-        """Print a warning about a packet that cannot be read, once for each kind of fault."""
         fault = read_request(data)
         assert isinstance(fault, Fault)
         if fault in self._reported:

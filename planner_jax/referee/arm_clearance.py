@@ -46,7 +46,6 @@ class _Capsule:
 
     @property
     def middle(self) -> np.ndarray:
-        """Middle (3, B, S) [m] of the capsule's axis."""
         return 0.5 * (self.first + self.second)
 
     @property
@@ -61,7 +60,6 @@ class _Capsule:
         return from_segment(point, self.first, self.second) - self.radius
 
     def distance_to_capsule(self, other: "_Capsule") -> np.ndarray:
-        """Return the distances (P,) [m] between two capsules, each at the P samples of `at`."""
         apart = between_segments(self.first, self.second, other.first, other.second)
         return apart - self.radius - other.radius
 
@@ -93,14 +91,12 @@ class _Box:
         return length(np.maximum(np.abs(inside) - self.half, 0.0))
 
     def distance_to_capsule(self, other: _Capsule) -> np.ndarray:
-        """Return the distances (P,) [m] of a box from a capsule, each at the P samples of `at`."""
         first, second = (
             rotate_back(self.turn, end - self.middle) for end in (other.first, other.second)
         )
         return segment_to_box(first, second, self.half) - other.radius
 
     def distance_to_box(self, other: "_Box") -> np.ndarray:
-        """Return the distances (P,) [m] between two boxes, each at the P samples of `at`."""
         middle = rotate_back(self.turn, other.middle - self.middle)
         turn = np.stack([rotate_back(self.turn, other.turn[:, k]) for k in range(3)], axis=1)
         return between_boxes(middle, turn, other.half, self.half)
@@ -283,7 +279,6 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
     distances = np.full_like(bounds, np.inf)
 
     def compute(selected: np.ndarray) -> None:
-        """Store exact distances where `selected` (plans, pairs x samples) is true."""
         for k, pair in enumerate(pairs):
             here = slice(k * num_samples, (k + 1) * num_samples)
             lane, sample = np.nonzero(selected[:, here])
@@ -309,7 +304,6 @@ def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> n
 
 
 def _product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the matrix products of `first` and `second`, both (3, 3, ...)."""
     return np.stack([rotate(first, second[:, k]) for k in range(3)], axis=1)
 
 

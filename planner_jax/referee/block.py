@@ -147,7 +147,6 @@ def referee_blocks(
 
 
 def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
-    """Read the arrays of cases and plans by name, and the index of each capsule's link."""
     coeffs = np.asarray(plans.motion.coeffs)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 6 or 0 in coeffs.shape[1:]:
         raise ValueError(f"plan.motion.coeffs must be (B, M, D + 1, 6), got {coeffs.shape}")
@@ -174,7 +173,6 @@ def _read(cases, plans) -> tuple[dict[str, np.ndarray], tuple[int, ...]]:
 
 
 def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
-    """Judge some plans of a batch, and return the fields of `BlockVerdict` by name."""
     finite = finite_lanes(case, _UNBOUNDED_LEAVES)
     execution = case["plan.motion.durations"].sum(axis=1)
     # Time [s] from the end of the arm's motion to the contact with the ball.
@@ -316,7 +314,6 @@ def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.nda
 
 
 def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
-    """Return joint angles (6, B) [rad] at the contact, `stays` (B,) [s] after the motion's end."""
     beyond = np.where(np.abs(stays) > CONTACT_TIME_TOLERANCE, 0.0, stays)
     return derivative(motion.coeffs[..., -1], motion.durations[:, -1] + beyond, 0)
 
@@ -400,7 +397,6 @@ def _tunnel(case: dict, contact: float) -> tuple:
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
-        """Return the time [s] by which the contact is too early or too late, for changed boxes."""
         begin, end = times_inside(case, "outer", grown)
         out = np.maximum(np.maximum(begin - time, time - end), 0.0).min(axis=0)
         begin, end = times_inside(case, "inner", -grown)

@@ -167,7 +167,6 @@ def referee_catches(
 
 
 def _read(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans by name, except the targets, and check their shapes."""
     coeffs, present = check_coeffs(plans.trajectory.coeffs), np.asarray(cases.present)
     batch, pieces = coeffs.shape[:1], coeffs.shape[1]
     if present.ndim != 2 or present.shape[:1] != batch or 0 in present.shape[1:]:
@@ -196,7 +195,6 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
-        """Return an array of the targets, with its axis 1 sorted in the order of the catches."""
         value = check_leaf(f"targets.{name}", value, order.shape + trailing)
         value = value[lanes, order].astype(np.float64)
         finite[...] &= np.isfinite(value).all(axis=tuple(range(2, value.ndim)))
@@ -282,7 +280,6 @@ def _table_states(pos, vel, resolution, times) -> tuple[np.ndarray, np.ndarray]:
 def _judge(
     case: dict, extras: tuple, intervals: int, net_test: str, optional: bool, tolerances: dict
 ) -> dict:
-    """Judge some plans of a batch, and return the fields of `CatchVerdict` by name."""
     durations, present = case["durations"], case["present"] != 0.0
     num = present.shape[1]
     ends = _ends(durations, num)

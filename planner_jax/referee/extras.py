@@ -60,7 +60,6 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
 def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[float, float]:
 
     def excess(coeffs: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Evaluate the excess at times (...) [s] since the start of polynomial pieces."""
         state = (derivative(coeffs, times, order) for order in range(3))
         rows = [np.moveaxis(each, 0, -1).reshape(-1, 3) for each in state]
         return np.asarray(extra.excess(*rows), float).reshape(times.shape)
@@ -93,7 +92,6 @@ def _worst_excess(pieces: Pieces, extra: ExtraLimit, u: np.ndarray) -> tuple[flo
 
 
 def _of_lane(extra, lane: int) -> ExtraLimit:
-    """Return the extra limit of case `lane` alone: a copy with this case's numbers in float64."""
     numbers = [f.name for f in dataclasses.fields(extra) if f.metadata.get("pytree_node", True)]
     own = {name: np.asarray(vars(extra)[name], float)[lane] for name in numbers}
     return dataclasses.replace(extra, **own)

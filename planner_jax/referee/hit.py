@@ -139,7 +139,6 @@ def referee_hits(
 def _judge(
     case: dict, extras: tuple, intervals: int, drag_after_impact: bool, tolerances: dict
 ) -> dict:
-    """Judge some plans of a batch, and return the fields of `HitVerdict` by name."""
     pieces = append_recovery(pieces_of(case["coeffs"], case["durations"]), case)
     measured, tests = judge_motion(
         pieces, case, extras, intervals, tolerances["relative"], tolerances["continuity"]
@@ -156,7 +155,6 @@ def _ball_acc(vel: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndar
 
 
 def _ball_step(state, step: np.ndarray, drag, gravity) -> np.ndarray:
-    """Advance `state` (6, B), the positions and velocities of B balls, by a Runge-Kutta step."""
     half, sixth, vel = 0.5 * step, step / 6.0, state[3:]
     acc_1 = _ball_acc(vel, drag, gravity)
     acc_2 = _ball_acc(vel + half * acc_1, drag, gravity)
@@ -231,7 +229,6 @@ def _return_in_vacuum(state, height, gravity) -> tuple:
 
 
 def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tuple[dict, dict]:
-    """Compute the impact and the ball's landing; return measurements, and tests by limit."""
     durations, drag, gravity = case["durations"], case["drag"], case["gravity"]
     end = durations.sum(axis=1)
     state = np.concatenate([case["ball.pos"].T, case["ball.vel"].T])
@@ -270,7 +267,6 @@ def _judge_impact(case: dict, drag_after_impact: bool, tolerances: dict) -> tupl
 
 
 def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
-    """Test contact, hitting speed, apex and landing; return (failed, excess, time) by limit."""
     relative = tolerances["relative"]
     contact, landing = measured["contact_error"], measured["landing_error"]
     widest = np.minimum(tolerances["contact"], RIM * case.get("racket_radius", np.inf))

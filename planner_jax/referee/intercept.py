@@ -151,7 +151,6 @@ _SHAPES: dict[str, tuple[int, ...]] = {
 
 
 def _leaves(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans by name, except the target, and check their shapes."""
     speed = np.asarray(plans.speed)
     if speed.ndim != 2 or speed.shape[1] < 2:
         raise ValueError(f"plan.speed must be (B, K + 1), K >= 1, got {speed.shape}")
@@ -164,7 +163,6 @@ def _leaves(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _obstacle_leaves(name: str, group, batch: int) -> dict[str, np.ndarray]:
-    """Return the arrays of walls or moving obstacles by name; for absent obstacles all are zero."""
     corners = np.asarray(group.corners)
     if corners.ndim != 4 or corners.shape[::3] != (batch, 2) or corners.shape[2] < 3:
         raise ValueError(f"{name}.corners must be ({batch}, N, V >= 3, 2), got {corners.shape}")
@@ -208,7 +206,6 @@ def target_positions_of(target: object, times: np.ndarray) -> np.ndarray:
 
 
 def _judge(case: dict, relative: float, contact: float) -> dict:
-    """Judge some plans of a batch, and return the fields of `InterceptVerdict` by name."""
     end = case["plan.time"]
     finite = finite_lanes(case, _UNBOUNDED)
     driven = finite & (end > 0.0) & (end <= LONGEST_PLAN)
@@ -267,7 +264,6 @@ def _wrap(angle: np.ndarray) -> np.ndarray:
 
 
 def _start(case: dict, allowed: float) -> tuple:
-    """Test that plans start with the case's pose, speed and curvature, to the error `allowed`."""
     away = case["plan.start"] - case["start"]
     errors = [
         np.linalg.norm(away[:, :2], axis=1),
@@ -280,13 +276,11 @@ def _start(case: dict, allowed: float) -> tuple:
 
 
 def _greatest(values: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the greatest value (B,) of each of B plans, and its time (B,) [s]."""
     lanes, top = np.arange(len(values)), values.argmax(axis=1)
     return values[lanes, top], np.broadcast_to(times, values.shape)[lanes, top]
 
 
 def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, dict]:
-    """Measure and test speed, curvature and other limits of B motions with pieces of `span` [s]."""
     v, k, h = case["plan.speed"], case["plan.curvature"], span[:, None]
     knots = h * np.arange(v.shape[1])
     v0, k0, k1, starts = v[:, :-1], k[:, :-1], k[:, 1:], knots[:, :-1]
@@ -335,7 +329,6 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
     rise, bend = (np.where(h > 0.0, np.diff(each, axis=1) / h, 0.0) for each in (v, k))
 
     def heading_change(tau: np.ndarray) -> np.ndarray:
-        """Integrate speed v times curvature k from each piece's start to its time tau [s]."""
         return tau * (v0 * k0 + tau * (0.5 * (v0 * bend + rise * k0) + tau * rise * bend / 3.0))
 
     count = np.maximum(np.ceil(span / LONGEST_STEP - 1e-9), 1.0)

@@ -166,7 +166,6 @@ def _norm_squared(vector: np.ndarray) -> np.ndarray:
 
 
 def _thrust_squared(gravity, acc: np.ndarray) -> np.ndarray:
-    """Return the squared thrust per unit mass, |a + g e_z|^2, for accelerations a (3, ...)."""
     return acc[0] ** 2 + acc[1] ** 2 + (acc[2] + gravity) ** 2
 
 
@@ -239,7 +238,6 @@ def peaks(pieces: Pieces, gravity: np.ndarray, intervals: int) -> dict[str, tupl
 
 
 def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tuple]:
-    """Compute `peaks` for a few plans, from samples at fractions u (S,) of each piece."""
     num_lanes, num_pieces = pieces.durations.shape
     products = num_pieces * pieces.coeffs.shape[-1] * len(u)
     tiles = cut(num_lanes, max(_PRODUCT // products, 1))
@@ -258,10 +256,6 @@ def _peaks(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> dict[str, tupl
 
 
 def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
-    """Sample the six quantities `_MEASURES` of B plans at fractions `u` of each piece.
-
-    Returns the three results (6, B) of `_tops`, and the two results (B,) of `_fastest_turn`.
-    """
     motion = _motion(pieces, u)
     gravity = gravity[:, None, None]
     values = np.empty((len(_MEASURES), *motion[0].shape[1:]))
@@ -273,7 +267,6 @@ def _sample(pieces: Pieces, gravity: np.ndarray, u: np.ndarray) -> tuple:
 
 
 def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
-    """Return the time [s] of sample index[b] among the samples of all pieces of each plan b."""
     piece, sample = np.divmod(index, len(u))
     lanes = np.arange(len(index))
     return pieces.starts[lanes, piece] + pieces.durations[lanes, piece] * u[sample]

@@ -37,7 +37,6 @@ def judge_rotors(pieces: Pieces, case: dict, u: np.ndarray, relative: float) -> 
 
 
 def _rotor_range(pieces: Pieces, case: dict, u: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Return for each plan the least thrust [N] of any rotor, its time, the greatest, its time."""
     times = pieces.durations[:, :, None] * u
     body = (case[f"limits.rotors.{name}"] for name in ("mass", "inertia", "mixer"))
     thrusts = rotor_thrusts(pieces.coeffs, times, case["gravity"], *body)
@@ -91,10 +90,6 @@ def rotor_thrusts(
 def _pull_and_rate(
     coeffs: np.ndarray, times: np.ndarray, gravity: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the thrusts per unit mass [m/s^2] and angular velocities [rad/s] in the world frame.
-
-    Both are (B, M, S, 3), at S times in each of M pieces of B trajectories.
-    """
     powers = np.moveaxis(coeffs, -1, 0)[..., None]
     pull, jerk = (np.moveaxis(derivative(powers, times, order), 0, -1) for order in (2, 3))
     pull[..., 2] += gravity[:, None, None]

@@ -68,7 +68,6 @@ def segment_to_box(first: np.ndarray, second: np.ndarray, half: np.ndarray) -> n
     span = second - first
 
     def beyond(share: np.ndarray) -> list:
-        """Return the vector from the box to the point first + share * (second - first)."""
         point = [first[k] + share * span[k] for k in range(3)]
         return [x - np.clip(x, -half[k], half[k]) for k, x in enumerate(point)]
 

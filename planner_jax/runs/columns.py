@@ -158,7 +158,6 @@ def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.T
 
 
 def _array(values: Values, kind: pa.DataType, num: int) -> pa.Array:
-    """Convert `num` numbers (num,) or arrays (num, ...) to an Arrow array of numbers or lists."""
     if values is None:
         return pa.nulls(num, kind)
     if isinstance(values, pa.Array):

@@ -82,7 +82,6 @@ class RunFolder:
 
     @contextlib.contextmanager
     def _hold_lock(self) -> Iterator[None]:
-        """Hold the lock within the `with` block; the lock file contains this process's number."""
         with contextlib.ExitStack() as opened:
             try:
                 handle = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_NONBLOCK, 0o644)
@@ -97,7 +96,6 @@ class RunFolder:
             yield
 
     def _acquire(self, handle: int) -> None:
-        """Lock an open file; raise `ArgumentError` if another process holds the lock for 0.2 s."""
         for _ in range(_TRIES):
             with contextlib.suppress(BlockingIOError):
                 return fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -113,7 +111,6 @@ class RunFolder:
         return ArgumentError(self.name, rule, shown=f"{str(self.path)!r}{why}")
 
     def _require_empty(self) -> None:
-        """Raise `ArgumentError` if the folder holds files other than a lock and scratch files."""
         if not all(path.name == LOCK or is_scratch(path) for path in self.path.iterdir()):
             rule = "a new or empty folder"
             if (self.path / MANIFEST).exists():
@@ -135,7 +132,6 @@ class RunFolder:
                 folder.rmdir()
 
     def _remove_scratch(self) -> None:
-        """Remove incomplete files that a killed process left behind."""
         for folder in (self.path, self.plans.folder, self.baselines.folder, self.figures):
             for path in folder.iterdir() if folder.is_dir() else ():
                 if is_scratch(path):

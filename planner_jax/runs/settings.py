@@ -151,7 +151,6 @@ def settings_of_manifest(
 
 
 def _difference(name: str, old: object, new: object) -> tuple[str, object, object]:
-    """Return the dotted name and both values of the first field in which two values differ."""
     if dataclasses.is_dataclass(old) and dataclasses.is_dataclass(new) and type(old) is type(new):
         for field in dataclasses.fields(old):
             mine, other = vars(old)[field.name], vars(new)[field.name]

@@ -130,7 +130,6 @@ def _make_parts(
 
 
 def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
-    """Return a chunk's finished file of rows from its worker, or raise the worker's exception."""
     try:
         return ray.get(promise)
     except ray.exceptions.RayTaskError as error:
@@ -142,7 +141,6 @@ def _fetch(ray: ModuleType, number: int, promise: object) -> Made:
 
 
 def _make(job: bytes, number: int) -> Made:
-    """Plan and judge chunk `number` in a worker process, and return its file of rows."""
     return _maker_of(job).make(number)
 
 

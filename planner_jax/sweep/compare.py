@@ -205,7 +205,6 @@ def describe(runs: Sequence[ComparedRun], most: int | None = 10) -> list[str]:
 
 
 def _sentences(first: ComparedRun, run: ComparedRun, row: Entries, k: int) -> Iterator[str]:
-    """Yield sentences on how run number `k` differs from the first run, in success and settings."""
     low, high = 100.0 * row["difference_low"], 100.0 * row["difference_high"]
     change = f"[{k}] less [1]: {100.0 * row['difference']:+.2f} points of success"
     interval = f"95 % interval {low:+.2f} to {high:+.2f}"

@@ -115,7 +115,6 @@ tr { border-bottom: 1px solid #e6e8eb; } th { border-bottom: 2px solid #8a8f98; 
 
 
 def _page(sweep: Sweep, manifest: Entries, lines: Sequence[str], failures: Sequence[Row]) -> str:
-    """Return the HTML of `index.html`: headline, figures, table, remarks and list of failures."""
     title, rates = html.escape(sweep.title(manifest)), sweep.table(manifest)
     lead = "".join(f"<p class=lead>{html.escape(line)}</p>\n" for line in lines)
     notes = "".join(f"<li>{html.escape(line)}</li>\n" for line in sweep.remarks(manifest))

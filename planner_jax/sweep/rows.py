@@ -78,7 +78,6 @@ def car_plan(row: Row, _: Entries) -> CarPlan:
 
 
 def _outcome(row: Row) -> Entries:
-    """Restore the fields that all plan classes have: cost, violation, iterations and status."""
     counts = {"iterations": row["iterations"], "status": Status[row["status"]]}
     return {
         **{name: _numbers(row[name]) for name in ("cost", "violation")},

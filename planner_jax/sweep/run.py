@@ -144,7 +144,6 @@ def resume_sweep(
 
 
 def _session(workers: str | None) -> Entries:
-    """Return the manifest's entry on this process: start time, versions, device and workers."""
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     made = {} if workers is None else {"workers": workers}
     return {"started": now, **environment(), **made}
@@ -153,7 +152,6 @@ def _session(workers: str | None) -> Entries:
 def _settings_of_run(
     folder: RunFolder, sweep: Sweep, given: Mapping[str, object]
 ) -> tuple[Entries, SweepSettings]:
-    """Return the manifest and the settings of a run that is resumed; `given` must equal them."""
     manifest = folder.read_manifest()
     if manifest["kind"] != sweep.kind:
         raise ArgumentError(
@@ -256,7 +254,6 @@ _OF_NETWORKS = ("parent", "name")
 
 
 def _fields_of(planner: object) -> Entries:
-    """Return a planner's fields for the manifest, where an array is described by its shape."""
     found = {}
     for field in dataclasses.fields(planner) if dataclasses.is_dataclass(planner) else ():
         if field.name in _OF_NETWORKS:

@@ -101,7 +101,6 @@ class Single(abc.ABC, Generic[SingleT]):
         return Answer(case, found, self.task.judge(case, found))
 
     def _setting_of(self, field: str) -> tuple[str, str]:
-        """Return the name of a case's field, and the name of the option that sets this field."""
         return field, self.NAMES.get(field, field.rpartition(".")[2])
 
     def describe(self, answer: Answer) -> list[str]:
@@ -129,7 +128,6 @@ def sample_plan(found: QuadrotorPlan) -> SampledMotion:
 
 
 def _pieces(found: QuadrotorPlan) -> tuple[np.ndarray, np.ndarray]:
-    """Return the coefficients and durations [s] of the pieces of a plan and its recovery."""
     path = found.whole
     coeffs, durations = (np.asarray(each, float) for each in (path.coeffs, path.durations))
     there = durations > 0.0
@@ -174,7 +172,6 @@ def _of_flight(answer: Answer, motion: SampledMotion) -> list[Margin]:
 
 
 def _of_rotors(answer: Answer) -> list[Margin]:
-    """Return margins to the least and the greatest thrust of a rotor, if the case limits them."""
     rotors = answer.case.limits.rotors
     if rotors is None:
         return []
@@ -194,7 +191,6 @@ def _of_rotors(answer: Answer) -> list[Margin]:
 
 
 def _table(margins: Sequence[Margin]) -> list[str]:
-    """Format margins as a text table with a header and one line for each limit."""
     rows = [("limit", "reached", "allowed", "share", "at [s]")]
     for margin in margins:
         share = f"{100.0 * margin.share:.1f} %" if np.isfinite(margin.share) else "exceeded"

@@ -113,11 +113,9 @@ def fit_flight(times: Array, places: Array, information: ArrayLike, gravity: Arr
     normal = jnp.where(enough, normal, jnp.eye(6, dtype=dtype))
 
     def residuals(unknowns: Array) -> Array:
-        """Return the observed minus the predicted positions (N, 3) [m] for unknowns (6,)."""
         return seen - unknowns[None, :3] - steps[:, None] * unknowns[None, 3:]
 
     def refine(unknowns: Array) -> Array:
-        """Return the unknowns (6,) after one step of iterative refinement of the linear system."""
         pull = jnp.einsum(
             "nij,nj->ni", weights, residuals(unknowns), precision=lax.Precision.HIGHEST
         )

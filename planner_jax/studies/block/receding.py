@@ -247,7 +247,6 @@ class _Arms:
             self._begin(begin, lanes, plan_with_aims(planner, take(tasks.case, lanes), aims))
 
     def _begin(self, begin: np.ndarray, lanes: np.ndarray, found: BlockPlan) -> None:
-        """Switch the arms with the indices `lanes` to their plans in `found` that are solved."""
         good = is_solved(found.status)
         if not good.any():
             return
@@ -276,7 +275,6 @@ class _Arms:
         self.motions[lanes] += 1
 
     def compose(self) -> BlockPlan:
-        """Return the executed and planned pieces of each arm as one plan."""
         motions = [*self.done, self.plans.motion]
         coeffs = np.concatenate([motion.coeffs for motion in motions], axis=1)
         durations = np.concatenate([motion.durations for motion in motions], axis=1)
@@ -301,10 +299,6 @@ class _Arms:
 
 
 def _still(cases: BlockCase, shape: tuple[int, ...]) -> PiecewisePolynomial:
-    """Return motions of zero duration at the initial angles of the arms.
-
-    `shape` has the numbers of pieces and of coefficients of each polynomial.
-    """
     num, dtype = cases.batch_shape[0], cases.gravity.dtype
     coeffs = np.zeros((num, *shape, 6), dtype)
     coeffs[:, :, 0], coeffs[:, :, 1] = cases.angles[:, None], cases.rates[:, None]

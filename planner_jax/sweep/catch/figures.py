@@ -123,7 +123,6 @@ def flight_figure(figure: Figure, run: RunRows) -> None:
 
 
 def _window(plan: SampledCatch) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds (3,) [m] of the plan and of targets up to their catches."""
     caught = zip(plan.row["order"], plan.catches, strict=False)
     paths = [plan.targets[target][: at + 1] for target, at in caught]
     points = np.concatenate([plan.motion.pos, plan.centre, *paths])
@@ -154,7 +153,6 @@ def _draw_view(axes: Axes, plan: SampledCatch, second: int, only: int | None = N
 
 
 def _draw_quadrotor(axes: Axes, plan: SampledCatch, at: int, where: list, alpha: float) -> None:
-    """Draw rotors, net hoop and the stick between them at the sample with index `at`."""
     axis, centre, pos = plan.axis[at], plan.centre[at], plan.motion.pos[at]
     across = np.cross(axis, [0.0, 1.0, 0.0])
     across /= max(np.linalg.norm(across), 1e-9)
@@ -176,7 +174,6 @@ def motion_figure(figure: Figure, run: RunRows) -> None:
 
 
 def _draw_distances(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw each plan's distance from the net's centre to the next target to be caught."""
     for plan in plans:
         away = due_distance(sample_catch(plan.row, plan.motion, setting))
         axes.plot(plan.motion.time, np.maximum(away, _LEAST_DISTANCE), **plan.look)

@@ -146,7 +146,6 @@ def _word(row: Row) -> str:
 
 
 def _draw_heights(axes: Axes, setting: Entries, plans: list[Drawn]) -> None:
-    """Draw the heights of the quadrotor's plans, and of the served ball up to its landing."""
     row, physics = plans[-1].row, (setting["drag"], setting["gravity"])
     pos, vel = np.array(row["ball_pos"]), np.array(row["ball_vel"])
     time, path = ball_path(pos, vel, float(landing(pos, vel, *physics)[0]), *physics)

@@ -23,16 +23,10 @@ def _target_way(batch: RefereedBatch) -> np.ndarray:
 
 @jax.jit
 def _positions(targets: PyTree, times: jax.Array) -> jax.Array:
-    """Return positions (B, K, 2) [m] of B targets, each at its own K times (B, K) [s]."""
     return jax.vmap(jax.vmap(lambda path, time: path.at(time).pos, (None, 0)))(targets, times)
 
 
 def _corners(name: str) -> Callable[[RefereedBatch], np.ndarray]:
-    """Return a function that computes the corners [m] of the obstacles in the field `name`.
-
-    The corners are (B, N, V, 2), for N obstacles of V corners in each of B cases.
-    """
-
     def values(batch: RefereedBatch) -> np.ndarray:
         group = vars(batch.cases)[name]
         return np.asarray(group.centre)[:, :, None] + np.asarray(group.corners)

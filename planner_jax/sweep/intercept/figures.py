@@ -87,7 +87,6 @@ def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
 
 
 def _polygons(row: Row, kind: str) -> list[np.ndarray]:
-    """Return the corners (V, 2) [m] of each obstacle of a kind, "wall" or "mover", in a row."""
     present = np.array(row[f"{kind}_present"], bool)
     corners = np.reshape(row[f"{kind}_corners"], (len(present), -1, 2))
     return list(corners[present])
@@ -97,7 +96,6 @@ def _polygons(row: Row, kind: str) -> list[np.ndarray]:
 def _sample(
     start: Array, end: Array, speed: Array, curvature: Array, shares: Array
 ) -> dict[str, Array]:
-    """Return time, pose, speed, curvature and acceleration of a plan at K fractions of its time."""
     time = end * shares
 
     def at(time: Array) -> tuple[Array, ...]:
