@@ -21,7 +21,7 @@ _FACING = 0.5  # least cosine between the board's normal and the direction to th
 
 
 class BoardViews(NamedTuple):
-    """K views of the board: the arguments of `calibrate`."""
+    """K views of a calibration board that an arm holds up: the arguments of `calibrate`."""
 
     flange: np.ndarray  # (K, 4, 4), poses of the arm's flange in the base frame
     points: np.ndarray  # (M, 3) [m], positions of the corners in the flange's frame
@@ -32,7 +32,7 @@ class BoardViews(NamedTuple):
 def show_board(
     arm: Arm, camera: Camera, noise: StereoNoise, num: int, *, seed: int = 0, draws: int = 20000
 ) -> BoardViews:
-    """Return views of the board in `num` poses of the arm, drawn within the joint limits.
+    """Return views of a calibration board on the arm, in `num` random poses of the arm.
 
     Args:
         arm: the arm, with NumPy leaves.
@@ -63,8 +63,8 @@ def show_board(
     depth = own[..., 2]
     across = depth * float(noise.pixel_std) / float(camera.focal)
     along = np.asarray(depth_std(camera, noise, jnp.asarray(depth, jnp.float32)))
-    # The depth error acts along the ray. The pixel errors act across the ray; their components
-    # along it are neglected.
+    # The depth error acts along the ray from camera to corner. The pixel errors act across the
+    # ray; their components along the ray are neglected.
     ray = own / depth[..., None]
     none = np.zeros_like(depth)
     errors = rng.normal(size=own.shape)

@@ -1,11 +1,11 @@
 """Hand-eye calibration of a fixed camera beside a robot, on the host, in float64.
 
-The robot holds a board of known points before the camera, which does not move. Four poses are
-involved: A_k of the flange in the robot's base frame, Z of the board on the flange, X of the camera
-in the base frame, and B_k of the board in the camera's frame. They satisfy  A_k Z = X B_k.  Two
-views eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the equation A X = X B of the literature. This
-equation is solved in closed form, and the solution is refined on the measured points. Poses are
-(4, 4) matrices, lengths are in metres.
+The robot holds a board of known points before the camera, which does not move. Poses in view k:
+A_k of the flange in the robot's base frame, and B_k of the board in the camera's frame. Poses that
+are the same in all views: Z of the board on the flange, and X of the camera in the base frame. They
+satisfy  A_k Z = X B_k.  Two views j and k eliminate Z:  (A_j A_k^-1) X = X (B_j B_k^-1),  the
+equation A X = X B of the literature. It is solved in closed form, and the solution is refined on
+the measured points. Poses are (4, 4) matrices, lengths are in metres.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ _LEAST_TURN = 0.05  # [rad], least rotation between two views whose equation A X
 
 @dataclasses.dataclass(frozen=True)
 class Calibration:
-    """The poses of the camera and the board, and the residual of the views."""
+    """The poses of camera and board that a calibration found, and how well they fit the views."""
 
     camera: np.ndarray  # (4, 4), pose of the camera in the robot's base frame
     board: np.ndarray  # (4, 4), pose of the board on the flange
@@ -34,7 +34,7 @@ def pose(rotation: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 
 def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """Return the pose (4, 4) that maps points (M, 3) [m] onto measured points (M, 3) [m].
+    """Return the pose (4, 4) that maps M points (M, 3) [m] onto measured points (M, 3) [m].
 
     The pose minimises the sum of squared distances in closed form, by a singular value
     decomposition [Kabsch1976]. The result is never a reflection.
@@ -57,15 +57,15 @@ def rigid_motion(points: np.ndarray, seen: np.ndarray) -> np.ndarray:
 
 
 def hand_eye(flange: np.ndarray, views: np.ndarray) -> np.ndarray:
-    """Return the pose X (4, 4) of the camera that solves A X = X B over every pair of views.
+    """Return the pose X (4, 4) of the camera that solves A X = X B for every pair of views.
 
-    The rotation of X is the rotation that best maps the rotation vectors of the camera's motions
-    onto the rotation vectors of the robot's motions, by a singular value decomposition as in
-    [Park1994]. The position then follows from linear least squares.
+    A is the motion of the flange between the two views, and B the motion of the board in the
+    camera's frame. The rotation of X best maps the rotation vectors of all B onto the rotation
+    vectors of all A [Park1994]. The position then follows from linear least squares.
 
     Args:
-        flange: (K, 4, 4) A_k, poses of the flange in the base frame, K >= 3.
-        views: (K, 4, 4) B_k, poses of the board in the camera's frame.
+        flange: (K, 4, 4), poses of the flange in the robot's base frame in K >= 3 views.
+        views: (K, 4, 4), poses of the board in the camera's frame in the same views.
 
     Raises:
         ValueError: there are too few views, or all views rotate about one axis, so that the
@@ -103,8 +103,8 @@ def calibrate(
     measured and expected points, each in units of its standard deviation.
 
     Args:
-        flange: (K, 4, 4), poses of the flange in the base frame, K >= 3.
-        points: (M, 3) [m], points of the board in its own frame, M >= 3.
+        flange: (K, 4, 4), poses of the flange in the base frame in K >= 3 views.
+        points: (M, 3) [m], M >= 3 points of the board in its own frame.
         seen: (K, M, 3) [m], the measured points in the camera's frame.
         std: [m], standard deviations of the measured points: one number, or (K, M, 3) along the
             camera's axes.

@@ -2,9 +2,9 @@
 # pyright: reportAttributeAccessIssue=false
 """A simulated camera beside the arm: colour and depth images, rendered off-screen by MuJoCo.
 
-Positions are in the robot's base frame, z up, in SI units. The scene contains the arm, the pole,
-the beams around the arm, a floor, walls and a ball. The two boxes of the block task are invisible.
-The light is even, and the exposure takes no time, so that images have no motion blur.
+Positions are in the robot's base frame, z up, in SI units. The scene contains the arm, a pole as
+obstacle, the beams around the arm, a floor, walls and a ball. The light is even, and the exposure
+takes no time, so that images have no motion blur.
 
 Rendering needs OpenGL without a display. The default is EGL; MuJoCo's environment variable
 `MUJOCO_GL` selects another library.
@@ -51,10 +51,10 @@ class SceneCamera:
         """Create the scene and the OpenGL context.
 
         Args:
-            camera: size, focal length and pose of the camera, with NumPy leaves.
-            scene: the surroundings of the arm in one case.
-            ball_radius: [m].
-            arm_xml: MJCF text of the arm; by default the arm of the paper.
+            camera: size, focal length and pose of the camera, in NumPy arrays.
+            scene: the obstacles around the arm in one case.
+            ball_radius: [m], radius of the ball.
+            arm_xml: MJCF text of the arm; by default the IRB 1600 of [Natarajan2024].
 
         Raises:
             RenderError: OpenGL is not available.
@@ -69,7 +69,7 @@ class SceneCamera:
             self._context: Any = _context_class()(width, height)
             self._context.make_current()
             self._to: Any = mujoco.MjrContext(self._model, mujoco.mjtFontScale.mjFONTSCALE_100)
-        # The type of the exception depends on which library is missing.
+        # The type of the exception depends on which OpenGL library is missing.
         except Exception as error:
             reason = str(error).partition("\n")[0] or type(error).__name__
             raise RenderError(
@@ -103,7 +103,7 @@ class SceneCamera:
         Args:
             ball: (3,) [m], centre of the ball; None for a scene without a ball.
             angles: (6,) [rad], joint angles of the arm; by default the angles of the previous
-                frame, and for the first frame the home position.
+                frame, and for the first frame the pose `home` of the arm's model.
 
         Returns:
             image: (rows, columns, 3) bytes, red, green and blue.
@@ -138,7 +138,7 @@ class SceneCamera:
 def measure_ball(
     key: Array, image: Array, depth: Array, camera: Camera, noise: StereoNoise, ball: BallThresholds
 ) -> Sighting:
-    """Return where the ball is in one frame of a stereo camera, from an image and its true depth.
+    """Detect a ball in a rendered frame, after adding a stereo camera's noise to the depth.
 
     Args:
         key: random key of the noise.
@@ -199,7 +199,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
     visual = _element("visual")
     visual.append(_element("map", znear=_NEAR, zfar=_FAR))
     visual.append(_element("global", offwidth=width, offheight=height))
-    # Antialiasing is off: it blends samples and would shift small objects by up to half a pixel.
+    # Antialiasing is off: it blends nearby pixels and would shift small objects by half a pixel.
     visual.append(_element("quality", offsamples=0, numslices=48, numstacks=48))
     visual.append(_element("headlight", ambient=[0.45] * 3, diffuse=[0.25] * 3))
     root.append(visual)
@@ -227,7 +227,7 @@ def _scene_model(arm_xml: str, camera: Camera, scene: Scene, ball_radius: float)
     ball = _element("body", name="ball", mocap="true")
     ball.append(_element("geom", type="sphere", size=[ball_radius], rgba=xml_colour(_BALL)))
     world.append(ball)
-    # Cameras of MuJoCo have the y axis up and look along -z.
+    # MuJoCo's cameras look along -z with y up, the cameras of this library along z with y down.
     axes = np.asarray(camera.rotation, float)
     angle = np.rad2deg(2.0 * np.arctan(0.5 * height / float(camera.focal)))
     eye = {"pos": camera.position, "xyaxes": [*axes[:, 0], *-axes[:, 1]], "fovy": angle}

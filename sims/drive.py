@@ -3,10 +3,10 @@
 Each physics step is also a control step. A frame is a fixed number of steps, at whose end the pose
 is stored. The caller may replace the plan between frames (`sims.tasks.intercept` does).
 
-Measured poses of the car are noisy and arrive one latency late. Between measurements the car
+Measured poses of the car are noisy and arrive late by a fixed latency. Between measurements the car
 integrates its own speed and steering angle (dead reckoning). A measurement corrects the estimate of
-the time at which the measurement was taken. The code is written for one drive; `drive_on` batches
-it. Times count from the start of the first plan.
+the pose at the time at which the measurement was taken. The code is written for one drive;
+`drive_on` batches it. Times count from the start of the first plan.
 """
 
 import dataclasses
@@ -32,12 +32,12 @@ _TRUST = 0.1  # gain of the pose estimator: fraction of the innovation that a st
 
 @dataclasses.dataclass(frozen=True)
 class DriveLoop:
-    """World and sensing of a drive; static under jit.
+    """World and sensing of a simulated drive; static under `jax.jit`.
 
-    Changing only the noise does not compile the program again.
+    A change of the noise alone does not compile the program again.
 
     Raises:
-        ValueError: the world has no car, or its time step is not the control step.
+        ValueError: the world has no car, or its time step is not the period of control.
     """
 
     world: World  # the simulated world, which must hold a car
@@ -82,7 +82,7 @@ class DriveState:
 
 @struct.dataclass
 class Frame:
-    """The pose of a car at the end of a frame, and its planned position."""
+    """The pose of a car at the end of a frame (some control steps), and its planned position."""
 
     time: Array  # () [s]
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
@@ -107,7 +107,7 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
 
     Args:
         loop: settings of the loop, with the world.
-        plans: first plans, leaves (B, ...).
+        plans: first plans of B drives, leaves (B, ...).
         keys: (B,) random keys of the noise.
     """
 
@@ -132,14 +132,14 @@ def start_drives(loop: DriveLoop, plans: CarPlan, keys: Array) -> DriveState:
 
 
 def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Array]:
-    """Return estimated pose (3,), own speed () [m/s] and own path curvature () [1/m] of a drive."""
+    """Return a car's estimated pose (3,), and its true speed [m/s] and path curvature [1/m]."""
     state = loop.car.state(drive.physics)
     curvature = jnp.tan(state.steering) / loop.car.vehicle.wheelbase
     return drive.believed[-1], state.speed, curvature
 
 
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
-    """Simulate a drive for one frame; errors and saturation are summed up to `until` () [s]."""
+    """Simulate a drive for one frame; sum tracking errors and saturation up to `until` () [s]."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
     steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)
@@ -158,7 +158,7 @@ def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveStat
         over = car.saturation(physics, command)
         physics = step(world, physics, command, jnp.zeros(0, dtype))
         after = car.state(physics)
-        # The measurement shows the pose of one latency ago. Compare it with the estimate of then.
+        # A measured pose is one latency old, and is compared with the estimate for that time.
         seen = car.sense(dataclasses.replace(true, pose=shown[0]), noise, drive.pose_stds)
         correction = _TRUST * (seen.pose - believed[0])
         next_pose = _advance_estimate(car, believed[-1], true, after, span) + correction
@@ -206,7 +206,7 @@ def _advance_estimate(
 def drive_on(
     world: World, drives: DriveState, until: Array, *, num_frames: int
 ) -> tuple[DriveState, Frame]:
-    """Simulate a batch of drives for some frames.
+    """Simulate a batch of B drives for some frames of 20 ms.
 
     Args:
         world: a world with a car.

@@ -31,7 +31,7 @@ FRAME = _STEPS * TIMESTEP  # [s], duration of a frame
 
 @struct.dataclass
 class ArmState:
-    """The variables that change while an arm follows its course, a timed joint motion."""
+    """The variables that change while an arm follows its course (a timed joint motion)."""
 
     physics: Physics
     torques: Array  # (6,) [N m], acting torques
@@ -59,7 +59,7 @@ class _Setting:
 
 @dataclasses.dataclass(frozen=True)
 class Executed:
-    """The result of executing B courses (timed joint motions), in float64; leaves (B, ...).
+    """The result of executing B courses (timed joint motions), in float64 arrays (B, ...).
 
     Errors and torques are evaluated from the time at which the arm may start until its contact.
     """
@@ -68,7 +68,7 @@ class Executed:
     angles: np.ndarray  # (B, S, 6) [rad]
     wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without the drives' delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
-    # (B, 6) [rad], rms error of each joint from the commanded course, which may start late.
+    # (B, 6) [rad], rms error of each joint from the commanded motion, which may start late.
     error_rms: np.ndarray
     error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from that course
     torque_rms: np.ndarray  # (B, 6) [N m], rms torque of each joint
@@ -85,12 +85,12 @@ def _arm(world: World) -> ShieldArm:
 def _one_frame(
     world: World, setting: _Setting, state: ArmState
 ) -> tuple[ArmState, tuple[Array, Array]]:
-    """Simulate an arm for one frame; return its state, and the angles (6,) and rates (6,)."""
+    """Simulate an arm for one frame of 2 ms; return its state, joint angles and joint rates."""
     robot, dtype, span = _arm(world), state.time.dtype, world.timestep
     key, noise_key = jax.random.split(state.key)
     noise = jax.random.normal(noise_key, (_STEPS, *robot.noise_shape), dtype)
     times = state.time + span * jnp.arange(_STEPS, dtype=dtype)
-    # The torques lag. The feedforward acceleration is taken from one lag ahead to compensate this.
+    # The torques lag behind the commands. The planned acceleration of one lag later compensates it.
     references = robot.references(setting.course, times, world)
     ahead = robot.references(setting.course, times + setting.lag, world)
     references = dataclasses.replace(references, accelerations=ahead.accelerations)
@@ -184,7 +184,7 @@ def execute(
     late: np.ndarray | float = 0.0,
     drives: Drives = IDEAL,
 ) -> Executed:
-    """Simulate arms that execute courses (timed joint motions); return their motions and errors.
+    """Simulate B arms that execute courses (timed joint motions); return motions and errors.
 
     Args:
         world: a world with an arm, and steps of `TIMESTEP`.

@@ -1,4 +1,4 @@
-"""Pictures and films of a flight, drawn without a display: robot, plan, balls and ghost images."""
+"""Pictures and films of simulated flights by matplotlib: robot, planned path and balls."""
 
 import shutil
 from pathlib import Path
@@ -26,7 +26,7 @@ _GHOSTS, _APART = 7, 0.45  # greatest number of ghost images, and their spacing 
 
 
 def require_film(path: Path) -> None:
-    """Raise `ArgumentError` unless this machine can write a film in the file's format."""
+    """Raise `ArgumentError` unless this machine can write films of the path's suffix."""
     if path.suffix not in FORMATS:
         raise ArgumentError("video", " or ".join(FORMATS), path.name, verb="end in")
     if path.suffix == ".mp4" and shutil.which("ffmpeg") is None:
@@ -34,7 +34,7 @@ def require_film(path: Path) -> None:
 
 
 class Scene:
-    """A drawing of one flight in 3-D axes."""
+    """A drawing of one recorded flight in matplotlib's 3-D axes."""
 
     def __init__(
         self,
@@ -125,9 +125,9 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-        """Return the trajectories (K, N, 3) of balls, with NaN outside the bounds of the axes.
+        """Return positions (K, N, 3) [m] of N balls at K samples, NaN outside the axes' bounds.
 
-        The stored trajectories of flying and returned balls are clipped to the same bounds.
+        Positions in `self.balls` and `self.back` outside these bounds are replaced by NaN, too.
         """
         balls = self.recording.balls[self.flight]
         inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)
@@ -136,7 +136,7 @@ class Scene:
         return np.where(inside, balls, np.nan)
 
     def _fill(self, prism: Prism, time: float) -> list[Any]:
-        """Draw a prism's top as a filled polygon at a time [s]; return the drawn artists."""
+        """Draw a prism's top as a filled polygon at a time [s]; return matplotlib's artists."""
         top = prism.outlines(time)[1]
         style = {"facecolor": prism.colour, "edgecolor": GREY, "linewidth": 0.5, "alpha": 0.6}
         return [self.axes.add_collection3d(Poly3DCollection([top], **style))]
@@ -149,12 +149,12 @@ class Scene:
         return self.axes.add_collection3d(Poly3DCollection(faces, **style))
 
     def plan_path(self) -> np.ndarray:
-        """Return the path (M, 3) [m] of the executed plans, up to the last contact."""
+        """Return the planned positions of the robot, one per row [m], up to the last contact."""
         wanted = self.recording.wanted[self.flight, : self.find_last_contact() + 1]
         return wanted[np.isfinite(wanted).all(axis=1)]
 
     def find_last_contact(self) -> int:
-        """Return the index of the sample at the last contact; without one, of the last sample."""
+        """Return the index of the sample at the last contact, or of the last sample."""
         end = np.nanmax(np.append(self.met, -np.inf))
         at = int(np.searchsorted(self.times, end)) if np.isfinite(end) else self.num_samples
         return min(at, self.num_samples - 1)
@@ -165,7 +165,7 @@ class Scene:
         return machine_parts(*launch) if launch and self.world.mouth else []
 
     def robot(self, at: int, alpha: float = 1.0) -> list[Any]:
-        """Draw the robot at a sample, with its tool as a filled polygon; return the artists."""
+        """Draw the robot at sample `at` with opacity `alpha`; return the matplotlib artists."""
         robot = self.world.robot
         pose = frame(self.recording, robot, self.flight, at).robot
         drawn: list[Any] = []
@@ -183,9 +183,9 @@ class Scene:
         return drawn
 
     def ghosts(self, last: int) -> None:
-        """Draw images of robot and balls at equal distances along the path up to a sample.
+        """Draw robot and balls at several times in one picture, up to the sample `last`.
 
-        Later images are more opaque.
+        The images are equally far apart along the robot's path; later images are more opaque.
         """
         path = self.world.robot.place(self.recording.robot[self.flight, : last + 1])
         path = path[np.isfinite(path).all(axis=1)]
@@ -198,7 +198,7 @@ class Scene:
                 self.axes.plot(*ball[:, None], ".", ms=7, color=trail.get_color())
 
     def contacts(self, label: str) -> None:
-        """Draw a star at each contact, and a cross at the target."""
+        """Draw a star at each contact of ball and tool, and a cross at the target of the flight."""
         target = self.recording.target[self.flight]
         if np.isfinite(target).all():
             self.axes.plot(*target[:, None], "X", ms=10, color=INK, label="target")
@@ -210,9 +210,9 @@ class Scene:
         self.axes.legend(loc="upper left", fontsize=9, frameon=False)
 
     def show(self, at: int, back: int | None = None) -> None:
-        """Draw the moving objects at a sample.
+        """Draw robot, balls and moving obstacles at the sample with index `at`.
 
-        The trajectory of the returned ball ends at the sample `back`, by default at this sample.
+        The drawn path of the returned ball ends at the sample `back`, by default at `at`.
         """
         for trail, path in zip(self.trails, np.moveaxis(self.balls[: at + 1], 1, 0), strict=True):
             trail.set_data_3d(*path.T)
@@ -240,7 +240,7 @@ def draw_flight(
     title: str | None = None,
     view: tuple[float, float] | None = None,
 ) -> None:
-    """Write a picture of one flight, with ghost images of robot and balls at earlier times.
+    """Write a picture of one flight, in which robot and balls also appear at earlier times.
 
     Args:
         path: path of the picture, which ends in .png.
@@ -261,9 +261,9 @@ def draw_flight(
 
 
 def film_flights(path: Path, task: FlightTask, recording: Recording, num: int) -> None:
-    """Write a film of the first flights, one after the other.
+    """Write a film of the first `num` flights of a recording, one after the other.
 
-    If the film is interrupted, no file remains.
+    If writing is interrupted, no file remains.
 
     Args:
         path: path of the film, which ends in .gif, or in .mp4 where ffmpeg is installed.

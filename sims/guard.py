@@ -22,7 +22,7 @@ _OWN = {"localhost", "127.0.0.1", "::1"}
 
 
 def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> bool:
-    """Return whether the server may answer a request.
+    """Return whether the viewer's web server may answer a request.
 
     Args:
         headers: headers of the request.
@@ -47,7 +47,7 @@ def is_allowed(headers: Any, path: str, names: set[str], token: str | None) -> b
 
 @contextlib.contextmanager
 def guard_server(names: set[str], token: str | None) -> Iterator[Callable[[], bool]]:
-    """Make servers that are started inside this context reject requests that are not allowed.
+    """Make web servers that start inside this context reject requests unless `is_allowed`.
 
     Yields:
         A function that returns whether a server has been started.

@@ -1,8 +1,8 @@
 """The start of a flight: a robot at standstill, launched balls, and first observations of them.
 
-A ball is already in flight when the first plan starts: the papers observe it for the first 2 m of
-its path [Yu2023catch, Section VII-A]. This first part of the flight is not simulated in MuJoCo. It
-is integrated backwards from the ball's state at the start of the plan.
+A ball is already in flight when the plan for it starts: it is first observed for 2 m of its path
+[Yu2023catch, Section VII-A]. This first part of the flight is not simulated in MuJoCo. It is
+integrated backwards from the ball's state at the start of the plan.
 """
 
 import dataclasses
@@ -24,7 +24,7 @@ from planner_jax.sims.sensing import Estimate
 
 
 def flight_keys(seed: int, index: np.ndarray) -> Array:
-    """Return random keys (B,) of flights, from a seed and their indices in the run.
+    """Return random keys (B,) of B flights, from a seed and their indices (B,) in the run.
 
     A flight's key does not depend on the batch to which the flight belongs.
     """
@@ -37,7 +37,7 @@ def ready(loop: Loop, starts: Array, keys: Array) -> FlightState:
 
     Args:
         loop: settings of the loop, with the world.
-        starts: (B, 3) [m], positions of the robots.
+        starts: (B, 3) [m], positions of the robots of B flights.
         keys: (B,) random keys of the noise.
     """
     number = loop.world.num_balls
@@ -80,8 +80,8 @@ def launch_ball(
 
     Args:
         loop: settings of the flights' loop.
-        flights: states of the flights, leaves (B, ...).
-        balls: leaves (B, N, 3), state of each ball at the start of the plan for it.
+        flights: states of the B flights, leaves (B, ...).
+        balls: leaves (B, N, 3), states of the N balls, each at the start of the plan for it.
         drag: (B, N), true drag coefficient K_D [1/m].
         believed: (B, N), initial estimate of K_D [1/m].
         ball: index of the launched ball among the N balls.
@@ -102,8 +102,6 @@ def _launch_ball(
     ball: Array,
     seen: float,
 ) -> FlightState:
-    """Launch a ball in flights without plans; see `launch_ball`."""
-
     def one(flight: FlightState, balls: BallState, drag: Array, believed: Array) -> FlightState:
         key, look_key = jax.random.split(flight.key)
         own = jax.tree.map(lambda leaf: leaf[ball], balls)
@@ -127,16 +125,16 @@ def _launch_ball(
 def await_ball(
     loop: Loop, flights: FlightState, coming: BallState, believed: Array, *, ball: int, ahead: float
 ) -> FlightState:
-    """Return the flights with a guess of one more ball that has not been observed yet.
+    """Return the flights with a guessed estimate of one more ball, which is not yet observed.
 
-    The estimate of this ball is the guessed flight, integrated backwards from the start of the plan
-    for the ball.
+    The estimate is the guessed flight of the ball, integrated backwards from the start of the plan
+    for this ball.
 
     Args:
         loop: settings of the flights' loop.
-        flights: states of the flights, leaves (B, ...).
+        flights: states of the B flights, leaves (B, ...).
         coming: leaves (3,), guessed state of the ball at the start of the plan for it.
-        believed: (B, N), initial estimate of K_D [1/m].
+        believed: (B, N), initial estimate of the drag coefficients K_D [1/m].
         ball: index of the awaited ball among the N balls.
         ahead: [s], time until the plan for the ball starts (static).
     """
@@ -175,8 +173,8 @@ def watch_ball(
         duration: [s], how long the ball has been in flight at the start of the plan (static).
 
     Returns:
-        Positions (L, 3) [m] that are observed later because of the latency, and the estimates of
-            one planning period ago and of now.
+        The last L true positions (L, 3) [m], which are observed later because of the latency; and
+            the estimates one planning period before the plan's start, and at its start.
     """
     sensing, dtype = loop.sensing, drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
@@ -207,8 +205,8 @@ def require_world(loop: Loop, kind: str, num_balls: int, **planned: Any) -> None
         loop: settings of the loop, with the world.
         kind: required kind of the tool, net or racket.
         num_balls: required number of balls of a flight.
-        planned: (B,) each, the values of `gravity`, `net_height`, `net_radius`, `racket_height` or
-            `racket_radius` in the plans' cases; only the passed values are compared.
+        planned: values, one per case of the plans, of `gravity`, `net_height`, `net_radius`,
+            `racket_height` or `racket_radius`; only the passed values are compared.
     """
     world, tool = loop.world, loop.world.carrier.tool
     if tool.kind != kind:
@@ -232,9 +230,9 @@ def require_plan(plan: Any, kind: type, head_state: Any) -> None:
     """Raise `ValueError` unless plans belong to the task and start at the robots' positions.
 
     Args:
-        plan: plans with a trajectory, leaves (B, ...).
+        plan: plans of B flights, with a trajectory, leaves (B, ...).
         kind: class of the task's plans.
-        head_state: (B, 4, 3), states of the robots at the start, position first.
+        head_state: (B, 4, 3), states of the robots at the start; the first rows are positions.
     """
     if not isinstance(plan, kind):
         raise ArgumentError("plan", f"a {kind.__name__}", shown=f"a {type(plan).__name__}")

@@ -86,7 +86,7 @@ def _fly_to_observation(loop: Loop, pilot: Pilot, flight: FlightState, drag: Arr
 
 
 def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
-    """Update the estimates (N, ...) of all balls with one observation of each ball, (N, 3)."""
+    """Update the estimates of N balls with one observed position of each ball, (N, 3) [m]."""
     gravity = jnp.asarray(loop.world.gravity, seen.dtype)
 
     def one(estimate: Estimate, at: Array) -> Estimate:
@@ -98,7 +98,7 @@ def _update_estimates(loop: Loop, estimates: Estimate, seen: Array) -> Estimate:
 
 
 def predict_balls(loop: Loop, estimates: Estimate, ahead: Any) -> BallState:
-    """Return the predicted states of the balls, `ahead` [s] from now, leaves (N, 3)."""
+    """Return the predicted states of N balls at `ahead` [s] from now, leaves (N, 3)."""
     dtype = estimates.drag.dtype
     gravity = jnp.asarray(loop.world.gravity, dtype)
     span = jnp.asarray(ahead + loop.sensing.latency, dtype)
@@ -111,7 +111,7 @@ def _pose_problems(
 ) -> tuple[Outlook, Any]:
     """Return the expected situation at the end of this period, and the planning problem for it.
 
-    Both results have leaves (B, ...), one entry per flight.
+    Both results have leaves (B, ...) for B flights.
     """
 
     def one(flight: FlightState, case: Any) -> tuple[Outlook, Any]:
@@ -132,7 +132,7 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """Run one of the pilot's searches, and return the plans (B, ...) that it finds."""
+    """Run search `number` of the pilot on B planning problems; return the B plans."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -140,7 +140,7 @@ def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
 def _fly(
     loop: Loop, pilot: Pilot, flights: FlightState, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Fly some periods along the current plans; return states (B, ...) and records (B, K, ...)."""
+    """Simulate flights along their plans for `num_periods` planning periods, without replanning."""
 
     def one(flight: FlightState, drag: Array) -> tuple[FlightState, Record | None]:
         def next_observation(flight: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -166,7 +166,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Return flights (B, ...) at the end of a period, with the new plans that the pilot accepts."""
+    """Replace the plans of flights by new plans, where the pilot accepts these."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)
@@ -204,7 +204,7 @@ def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Recor
 
 
 def in_parts(flights: FlightState) -> bool:
-    """Return whether planning and flying of a period are compiled as separate programs."""
+    """Return whether planning and flying are separate programs: for few flights on a GPU."""
     (device,) = flights.time.devices()
     return device.platform != "cpu" and len(flights.time) <= _FEW
 
@@ -217,9 +217,9 @@ def _next_period(
     Args:
         loop: settings of the flights' loop.
         pilot: the task's part of the loop.
-        flights: the flights at the start of the period.
+        flights: the B flights at the start of the period.
         cases: cases of the task, leaves (B, ...).
-        drag: (B, N), true drag coefficients K_D [1/m].
+        drag: (B, N), true drag coefficients K_D [1/m] of N balls.
         begin: function that starts one part of the period with its arguments, and returns a
             function that waits for the result.
     """
@@ -234,7 +234,7 @@ def _next_period(
 def _fly_and_plan(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Fly some periods with replanning, in one program; return states and records as `_fly`."""
+    """Simulate B flights with replanning in one program; return states and records as `_fly`."""
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
     def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:
@@ -248,7 +248,7 @@ def _fly_and_plan(
 def fly_leg(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, *, num_periods: int
 ) -> tuple[FlightState, list[Record]]:
-    """Fly a batch of flights for some planning periods.
+    """Simulate a batch of B flights of N balls for some planning periods.
 
     A large batch runs in one program. For a small batch on a GPU, planning and flying of a period
     are separate programs, which are compiled concurrently. Compiling then takes half as long, and
@@ -258,12 +258,12 @@ def fly_leg(
         loop: settings that determine the programs.
         pilot: the task's part of the loop.
         flights: the flights at the start, leaves (B, ...).
-        cases: cases of the task, leaves (B, ...), with times that count like the flights' times.
+        cases: cases of the task, leaves (B, ...); times count from the start of the first plan.
         drag: (B, N), true drag coefficients K_D [1/m].
         num_periods: number of planning periods.
 
     Returns:
-        The flights at the end, and with `loop.record` the consecutive records, leaves (B, K, ...).
+        The flights at the end, and with `loop.record` the records of all observations in order.
     """
     if loop.replan == 0.0:
         flights, record = _fly(loop, pilot, flights, drag, num_periods)
@@ -292,7 +292,7 @@ def begin_compiling(
     Args:
         loop: settings that determine the programs.
         pilot: the task's part of the loop.
-        flights: leaves (B, ...), which may have no plans.
+        flights: B flights of N balls, leaves (B, ...), which may have no plans.
         cases: cases of `fly_leg`; only their shapes count, leaves may be `jax.ShapeDtypeStruct`.
         drag: (B, N), true drag coefficients K_D [1/m].
 
@@ -301,7 +301,7 @@ def begin_compiling(
     """
     if loop.replan == 0.0 or not in_parts(flights):
         return lambda: None
-    # Zeros are created from NumPy arrays, like plans that are made on the host.
+    # Real plans come from NumPy arrays. Zeros of another origin would need other programs.
     zeros = functools.partial(
         jax.tree.map, lambda leaf: jnp.asarray(np.zeros(leaf.shape, leaf.dtype))
     )

@@ -32,10 +32,10 @@ class Outlook:
 
 
 class Pilot(Protocol):
-    """A task's part of the closed loop: what is planned, and which plan is flown; static."""
+    """A task's part of the closed loop, which poses planning problems and selects plans."""
 
     def pose_problem(self, case: Any, plan: Any, outlook: Outlook) -> Any:
-        """Return the planning problem of the expected situation, while `plan` is flown."""
+        """Return the planning problem of the situation `outlook`; `plan` is the current plan."""
         ...
 
     @property
@@ -44,27 +44,27 @@ class Pilot(Protocol):
         ...
 
     def choose(self, asked: Any, outlook: Outlook, found: tuple[Any, ...]) -> tuple[Any, Array]:
-        """Select one of the found plans; return it, and whether it is good enough to be flown."""
+        """Select one of the found plans; return it, and whether to replace the current plan."""
         ...
 
     def times(self, plan: Any) -> Array:
-        """Return planned contact times (N,) [s] since the plan's start, in the order of balls."""
+        """Return the planned contact times of N balls, (N,) [s] since the plan's start."""
         ...
 
     def plan_shapes(self, cases: Any) -> Any:
-        """Return the shapes of plans (B, ...) of cases (B, ...), leaves `jax.ShapeDtypeStruct`."""
+        """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`."""
         ...
 
     @property
     def passage(self) -> Callable[..., tuple[Array, Contact]]:
-        """The function, like `scoring.passage`, that finds a step's contacts of tool and balls."""
+        """The function, with the signature of `scoring.passage`, that finds contacts in a step."""
         ...
 
 
 def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
-    """Return the shapes of a planner's plans (B, ...), as leaves `jax.ShapeDtypeStruct`.
+    """Return the shapes of a planner's plans of a batch of cases, as `jax.ShapeDtypeStruct`.
 
-    Leaves of the cases (B, ...) may be `jax.ShapeDtypeStruct`, too.
+    Leaves of the cases may be arrays or `jax.ShapeDtypeStruct`.
     """
 
     def plan(case: Any) -> Any:
@@ -79,7 +79,8 @@ class Loop:
     """The settings that determine a flight's compiled program; static under jit.
 
     Raises:
-        ValueError: a period is not a whole multiple of the next shorter one.
+        ValueError: the planning period is no multiple of the period of observations, or this period
+            no multiple of the time step, or the latency no multiple of the period of observations.
     """
 
     world: World
@@ -155,7 +156,7 @@ class Record:
 
 @dataclasses.dataclass(frozen=True)
 class Flown:
-    """The result of a batch of flights, on the host; leaves with a leading axis B."""
+    """The result of a batch of B flights, on the host; arrays have the leading axis B."""
 
     contact: Contact  # leaves (B, N, ...)
     plan: Any  # the last plan of each flight
@@ -165,7 +166,7 @@ class Flown:
 
 
 def collect_flights(flights: FlightState, records: list[Record]) -> Flown:
-    """Return the result of flights (B, ...) at their end, with their records in order."""
+    """Return the result of finished flights, with their records in the order of time."""
     there, records = jax.device_get((dataclasses.replace(flights, key=None), records))
     joined = functools.partial(jax.tree.map, lambda *leaves: np.concatenate(leaves, axis=1))
     mean = np.sqrt(there.squared_tracking / np.maximum(there.tracked, 1e-6))

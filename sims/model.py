@@ -4,8 +4,8 @@
 
 Positions are in the world frame, z up, in SI units. `qpos` holds the robot's joint positions and
 then the balls' positions, `qvel` the robot's joint velocities and then the balls' velocities. A
-ball does not spin [Yu2023bat, Section II], so that its joint consists of three slides. Ball drag is
-a force in `qfrc_applied`.
+ball does not spin [Yu2023bat, Section II], so that its joint consists of three slide joints. Ball
+drag is a force in MuJoCo's array `qfrc_applied`.
 
 The model has no contacts. The racket's impact is computed by a function of the library, and a ball
 counts as caught when it has crossed the hoop's disc (`scoring`). Scenery and pitching machine are
@@ -50,7 +50,7 @@ _TOWARDS_NET = np.pi  # [rad], heading of a pitching machine that throws along -
 
 @dataclasses.dataclass(frozen=True)
 class World:
-    """The settings of the simulated world; static under jit."""
+    """The settings of the simulated world: robot, balls and scenery; static under `jax.jit`."""
 
     robot: Robot
     gravity: float  # [m/s^2], magnitude
@@ -80,7 +80,7 @@ class World:
 
 
 def mjcf(world: World) -> str:
-    """Return the model of a world as MJCF text."""
+    """Return the model of a world as text in MJCF, MuJoCo's model format."""
     body, actuators = world.robot.mjcf()
     machine = machine_parts(world.mouth, _TOWARDS_NET) if world.mouth else []
     slides = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
@@ -136,8 +136,8 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
     Args:
         world: settings of the model.
         physics: state before the step.
-        command: (A,), command for the robot's actuators.
-        drag: (N,), drag coefficients K_D [1/m] of the balls.
+        command: (A,), command for the robot's A actuators.
+        drag: (N,), drag coefficients K_D [1/m] of the N balls.
     """
     model, data = _mjx_model(world)
     controls, forces = world.robot.drive(physics, command, world.timestep)
@@ -149,21 +149,21 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
         ctrl=controls,
         qfrc_applied=jnp.concatenate([forces, drags]),
     )
-    # MJX combines arrays of different ranks.
+    # MJX combines arrays of different ranks, which the tests of this library forbid elsewhere.
     with jax.numpy_rank_promotion("allow"):
         data = mjx.step(model, data)
     return Physics(qpos=data.qpos, qvel=data.qvel, act=data.act)
 
 
 def _drag_force(world: World, qvel: Array, drag: Array) -> Array:
-    """Return the quadratic drag  -m K_D |v| v  of every ball as generalised forces (3 N,)."""
+    """Return the drag  -m K_D |v| v  [N] of N balls of mass m and velocity v, as (3 N,)."""
     vel = qvel.reshape(world.num_balls, 3)
     speed = jnp.sqrt(jnp.sum(vel**2, axis=1, keepdims=True))
     return (-BALL_MASS * drag[:, None] * speed * vel).ravel()
 
 
 def at_rest(world: World, place: Array) -> Physics:
-    """Return the state of a robot at standstill at a position (3,) [m]; balls lie far away."""
+    """Return the state of a robot at standstill at a position (3,) [m]; balls are 100 m away."""
     place = jnp.asarray(place)
     qpos, qvel, act = world.robot.at_rest(place, world.gravity)
     away = jnp.tile(jnp.array([100.0, 0.0, 0.0], place.dtype), world.num_balls)
@@ -182,7 +182,7 @@ def place_balls(
     Args:
         world: settings of the model.
         physics: state of one world.
-        balls: new states, leaves (N, 3).
+        balls: new states of the N balls, leaves (N, 3).
         drag: (N,), drag coefficients K_D [1/m].
         which: (N,) bool, the balls to set; other balls do not change.
     """
@@ -198,13 +198,16 @@ def place_balls(
 
 
 def ball_states(world: World, physics: Physics) -> tuple[Array, Array]:
-    """Return the positions [m] and MuJoCo's stored velocities [m/s] of the balls, (N, 3) each."""
+    """Return the positions [m] and MuJoCo's stored velocities [m/s] of N balls, (N, 3) each."""
     pos, vel = physics.qpos[world.robot.num_pos :], physics.qvel[world.robot.num_vel :]
     return pos.reshape(world.num_balls, 3), vel.reshape(world.num_balls, 3)
 
 
 def ball_velocity(world: World, vel: Array, drag: Array) -> Array:
-    """Return ball velocities (N, 3) at the positions' time, from stored velocities and K_D (N,)."""
+    """Return the velocities (N, 3) [m/s] of N balls at the time of their positions.
+
+    MuJoCo's stored velocities `vel` belong to half a step earlier; `drag` (N,) [1/m] is K_D.
+    """
     return vel + 0.5 * world.timestep * _ball_accelerations(world, vel, drag)
 
 

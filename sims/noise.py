@@ -16,7 +16,7 @@ def require_whole(ratio: float, name: str, rule: str, value: float) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class Sensing:
-    """Motion capture of the balls and of the robot; static under jit.
+    """Rates and errors of the motion capture of balls and robot; static under `jax.jit`.
 
     Raises:
         ValueError: a value is out of its range.
@@ -26,8 +26,8 @@ class Sensing:
     position_std: float = 0.0  # [m], standard deviation of a ball's coordinate
     dropout: float = 0.0  # probability that an observation is missing
     latency: float = 0.0  # [s], age of an observation when it arrives
-    # Standard deviations of the robot's estimated state, one for each field, in the field's units.
-    # The errors are drawn again at every observation of the balls. Empty: the state is exact.
+    # Standard deviations of the quadrotor's estimated position [m], velocity [m/s], attitude [rad]
+    # and body rate [rad/s]. Errors are drawn at every observation of the balls. Empty: no errors.
     robot_stds: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -60,17 +60,16 @@ class Sensing:
 
 NOISES = {
     "none": Sensing(),
-    # [Yu2023bat] and [Yu2023catch] observe with Vicon. Every module runs within 20 ms [Yu2023bat,
-    # Section VI-C], which is the latency here. The papers report no noise, rate or dropout. All
-    # other numbers are assumptions: 5 mm a coordinate for a 40 mm ball, 100 observations a second,
-    # of which 2 % are lost, and the errors of the quadrotor's estimated state: position [m],
-    # velocity [m/s], attitude [rad] and body rate [rad/s]. Both papers estimate this state with an
-    # EKF of pose and IMU.
+    # [Yu2023bat] and [Yu2023catch] observe with Vicon. Every module of their software runs within
+    # 20 ms [Yu2023bat, Section VI-C], which is the latency here. The papers report no noise, rate
+    # or dropout. All other numbers are assumptions: 5 mm a coordinate for a 40 mm ball, 100
+    # observations a second, of which 2 % are lost, and the errors of the quadrotor's state, which
+    # both papers estimate by a Kalman filter from the captured pose and an IMU.
     "lab": Sensing(
         position_std=0.005, dropout=0.02, latency=0.02, robot_stds=(0.002, 0.02, 0.005, 0.02)
     ),
-    # Worse than the papers' laboratories: three times the noise, twice the latency, and one of ten
-    # observations lost. All numbers are assumptions.
+    # Assumptions for worse conditions than in a laboratory: three times the noise of "lab", twice
+    # its latency, and one of ten observations lost.
     "harsh": Sensing(
         position_std=0.015, dropout=0.1, latency=0.04, robot_stds=(0.006, 0.06, 0.015, 0.06)
     ),
@@ -83,9 +82,9 @@ FRAME_RATE = 50  # [Hz], rate of a drive's stored poses, at which collisions are
 
 @dataclasses.dataclass(frozen=True)
 class PlaneSensing:
-    """Sensing of a car's target, of moving obstacles, and of its own pose; static under jit.
+    """Sensing of a car's target, of moving obstacles, and of its own pose; static under `jax.jit`.
 
-    Observations arrive one latency late. Poses of the car are measured at every control step. The
+    Observations arrive late by `latency`. Poses of the car are measured at every control step. The
     car knows its own speed and steering angle without delay.
 
     Raises:
@@ -95,7 +94,7 @@ class PlaneSensing:
     target_std: float = 0.0  # [m], standard deviation of an observed coordinate
     # Standard deviations of a measured coordinate [m] and heading [rad] of the car.
     pose_stds: tuple[float, float] = (0.0, 0.0)
-    # [Hz], rate of observations of the target while driving; 0 for none.
+    # [Hz], rate of observations of the target during the drive; 0 for no observations.
     observation_rate: float = 1.0
     latency: float = 0.05  # [s], age of a measurement at its arrival, planning time included
 
@@ -108,7 +107,7 @@ class PlaneSensing:
         require_whole(self.latency * CONTROL_RATE, "latency", rule, self.latency)
 
     def frames_per_plan(self, replan: float) -> int:
-        """Return the number of frames from one plan to the next; the frames of 1 s without any.
+        """Return the number of 20 ms frames from one plan to the next; 50 without replanning.
 
         Args:
             replan: [Hz], rate of replanning; 0 for never.

@@ -1,9 +1,9 @@
 """Recordings of a run's first flights, from which they are drawn, filmed and replayed.
 
-A recording is stored as the dataset `flights/` in the run folder, with one row per flight and flat
-lists in SI units; the column metadata explain the columns. Samples are equally spaced in time. They
-start when the first ball leaves its machine, before the first plan, and end when the last returned
-ball is on the ground.
+A recording is stored as the dataset `flights/` in the run folder, with one row per flight. Arrays
+are stored as flat lists in SI units; the columns' metadata explain their order. Samples are equally
+spaced in time. They start when the first ball leaves its machine, before the first plan, and end
+when the last returned ball is on the ground.
 """
 
 import dataclasses
@@ -45,7 +45,8 @@ class Recording:
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
     target: np.ndarray  # (F, 3) [m], target of a returned ball
-    # (F, K, M, 3) [m], path of the first ball as predicted at each sample; M = 0 if not recorded.
+    # (F, K, M, 3) [m], path of the first ball as predicted at each sample, with M points; M is 0 if
+    # predictions are not recorded.
     expected: np.ndarray
 
     def __len__(self) -> int:
@@ -58,7 +59,7 @@ class Recording:
         return int(np.flatnonzero(there)[-1]) + 1
 
     def launch(self, flight: int) -> tuple[np.ndarray, float] | None:
-        """Return launch position (3,) [m] and heading [rad] of the first ball, or None."""
+        """Return launch position (3,) [m] and heading [rad] of the first ball; None if unknown."""
         path = self.balls[flight, :, 0]
         path = path[np.isfinite(path).all(axis=1)]
         if len(path) < 2:
@@ -122,7 +123,7 @@ def frame(recording: Recording, robot: Robot, flight: int, sample: int) -> Frame
 def make_recording(
     world: World, flown: Flown, launches: Launches, *, index: np.ndarray, success: np.ndarray
 ) -> Recording:
-    """Return the recording of some flights.
+    """Return the recording of F flights.
 
     The recording joins the balls' flights before the simulation, the simulated flights, and the
     flights of returned balls.
@@ -150,13 +151,13 @@ def make_recording(
     time = np.broadcast_to(grid, (number, grid.size))
 
     def extend(leaf: np.ndarray) -> np.ndarray:
-        """Extend an array over all samples: its first value before the record, NaN after it."""
+        """Extend an array to all samples: its first value before the simulation, NaN after."""
         whole = np.full((number, grid.size, *leaf.shape[2:]), np.nan)
         whole[:, before : before + samples], whole[:, :before] = leaf, leaf[:, :1]
         return whole
 
     def flight_of(ball: BallState, span: np.ndarray, drag: np.ndarray) -> np.ndarray:
-        """Return positions (F, K, ..., 3) of balls (F, ..., 3) after times (F, K, ...) [s]."""
+        """Return ball positions (F, K, ..., 3) [m] in F flights after K times (F, K, ...) [s]."""
         pos, vel = (np.asarray(leaf, float)[:, None] for leaf in (ball.pos, ball.vel))
         return fly(pos, vel, span, drag[:, None], np.full(span.shape, world.gravity))[0]
 

@@ -71,15 +71,15 @@ class Robot(Protocol):
     noise_shape: ClassVar[tuple[int, ...]]  # shape of the standard normal noise that `sense` uses
 
     def mjcf(self) -> tuple[str, str]:
-        """Return the robot's body and its actuators as MJCF text."""
+        """Return two texts in MJCF, MuJoCo's model format: the robot's body, and its actuators."""
         ...
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return `qpos`, `qvel` and `act` of the robot at standstill at a position (3,) [m]."""
+        """Return MuJoCo's `qpos`, `qvel` and `act` of the robot at rest at a position (3,) [m]."""
         ...
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return MuJoCo's controls (A,) for a command (A,), and extra forces on the joints (R',).
+        """Return MuJoCo's controls for A actuators, and extra forces for R' joint velocities.
 
         The extra forces are forces for which the model has no actuators, such as tyre forces.
         """
@@ -90,18 +90,18 @@ class Robot(Protocol):
         ...
 
     def sense(self, state: Any, noise: Array, stds: Any) -> Any:
-        """Return the estimated state: the true state plus errors of standard deviations `stds`."""
+        """Return the state plus errors: normal `noise` times the standard deviations `stds`."""
         ...
 
     def references(self, plan: Any, times: Array, world: Any) -> Any:
-        """Return the references at times (K,) [s] since the start of a plan, leaves (K, ...).
+        """Return the planned states to track at K times (K,) [s] since a plan's start.
 
-        Every reference has a position `pos`.
+        Leaves are (K, ...). Every such reference has a position `pos`.
         """
         ...
 
     def command(self, state: Any, reference: Any, world: Any) -> Array:
-        """Return the command (A,) by which the actuators track one reference."""
+        """Return the command for the A actuators that tracks one planned state, the reference."""
         ...
 
     def shapes(self) -> list[Shape]:
@@ -109,11 +109,11 @@ class Robot(Protocol):
         ...
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position (3,) [m] and quaternion (4,), w x y z, of each shape at a pose (R,)."""
+        """Return position (3,) [m] and quaternion w x y z of each shape at R joint positions."""
         ...
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the point (..., 3) [m] that represents the robot at joint positions (..., R)."""
+        """Return a point (..., 3) [m] of the robot, its position, at R joint positions (..., R)."""
         ...
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Runs of simulated flights: fly all cases, and write rows, pictures and report to a folder."""
+"""Runs of simulated flights: simulate all cases, and write results and report to a folder."""
 
 import dataclasses
 import datetime
@@ -65,7 +65,7 @@ def start_flights(
     *,
     record: int = 16,
 ) -> dict[str, Any]:
-    """Fly all cases of a run into a new folder, and return the run's manifest.
+    """Simulate all flights of a run, store them in a new folder, and return its manifest.
 
     Args:
         settings: settings of the run, of the task's own class.
@@ -122,7 +122,7 @@ def _discard_unfinished(folder: RunFolder) -> str:
 def _fly_into(
     folder: RunFolder, manifest: dict[str, Any], flight: FlightTask, cases: Any, kept: int
 ) -> dict[str, Any]:
-    """Fly all cases, write all files of the run, and return the manifest."""
+    """Simulate all flights, record the first `kept` ones, write all files; return the manifest."""
     print(f"Writing {folder.path}; the simulation compiles first.", file=sys.stderr, flush=True)
     rows, times, flights = _fly_all(flight, cases, kept)
     folder.plans.write_rows(rows)
@@ -175,10 +175,10 @@ def require_sound(folder: RunFolder) -> None:
 
 
 def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict[str, Any], Any]:
-    """Fly all cases; return their rows, the times [s], and the first flights with their record.
+    """Simulate all flights; return the table of results, the times [s], and recorded flights.
 
-    A run whose flights fit into one batch of up to 256 records all of them. It then needs no second
-    program, with a record, for the first flights.
+    Batches of up to 256 flights are recorded completely, so that only one program is compiled. In
+    larger batches nothing is recorded; then the first `shown` flights are simulated once more.
     """
     num = flight.settings.num
     size = min(flight.settings.batch or 4096, num)
@@ -210,7 +210,7 @@ def _fly_all(flight: FlightTask, cases: Any, shown: int) -> tuple[pa.Table, dict
 
 
 def _summary(flight: FlightTask, rows: pa.Table) -> dict[str, Any]:
-    """Return the counts, rates and tracking errors of a run from its rows."""
+    """Return counts, success rate and tracking errors of a run, from its table of results."""
     success = np.asarray(rows["success"])
     low, high = wilson_interval(int(success.sum()), success.size)
     return {

@@ -20,7 +20,7 @@ class Part:
     """An upright box or cylinder of the surroundings, for drawing."""
 
     kind: str  # "box" or "cylinder"
-    # [m]: length, width, height; the length and width of a cylinder are its diameter.
+    # [m]: length, width, height; length and width of a cylinder both are its diameter.
     size: tuple[float, float, float]
     centre: tuple[float, float, float]  # [m], world frame
     colour: str  # as #RRGGBB
@@ -43,14 +43,14 @@ class Prism:
     velocity: tuple[float, float] = (0.0, 0.0)  # [m/s]
 
     def outlines(self, time: float) -> list[np.ndarray]:
-        """Return the edges at a time [s] as lines, each (M, 3) [m]; first base and top, closed."""
+        """Return the edges at a time [s] as lines of points [m]: closed base, closed top, sides."""
         base = self.corners + time * np.asarray(self.velocity)
         ring = np.concatenate([base, base[:1]])
         low, high = (np.pad(ring, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height))
         return [low, high, *(np.stack([low[k], high[k]]) for k in range(len(base)))]
 
     def mesh(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return corners (2 V, 3) [m] at time 0, and triangles (T, 3) of the sides and the top."""
+        """Return corners [m] at time 0, and triangles (corner indices) of the sides and the top."""
         num = len(self.corners)
         low, high = (
             np.pad(self.corners, ((0, 0), (0, 1)), constant_values=z) for z in (0.0, self.height)
@@ -89,7 +89,7 @@ def machine_parts(mouth: Sequence[float] | np.ndarray, heading: float) -> list[P
 
 
 def outlines(part: Part) -> list[np.ndarray]:
-    """Return the edges of a part as lines, each (M, 3) [m], in the world frame."""
+    """Return the edges of a part as lines of points [m], in the world frame."""
     if part.kind == "box":
         angle = np.linspace(0.25, 2.25, 5) * np.pi
         ring = np.sign(np.stack([np.cos(angle), np.sin(angle)], axis=1))
@@ -108,7 +108,7 @@ def outlines(part: Part) -> list[np.ndarray]:
 
 
 def hull(points: np.ndarray) -> Solid:
-    """Return the convex hull of points (P, 3) [m], all of which must be vertices of the hull."""
+    """Return the convex hull of P points (P, 3) [m]; every point must be a vertex of the hull."""
     found = ConvexHull(points)
     a, b, c = (points[found.simplices[:, k]] for k in range(3))
     inward = np.sum(np.cross(b - a, c - a) * found.equations[:, :3], axis=1) < 0.0
@@ -141,7 +141,7 @@ def capsule_solid(first: np.ndarray, second: np.ndarray, radius: float) -> Solid
 
 
 def part_solid(part: Part) -> Solid:
-    """Return the surface of a part, with a cylinder as a prism, in the world frame."""
+    """Return the surface of a part in the world frame; a cylinder becomes a prism."""
     return hull(np.concatenate([line[:-1] for line in outlines(part)[:2]]))
 
 

@@ -16,7 +16,7 @@ from planner_jax.sims.robot import Physics
 
 @struct.dataclass
 class Contact:
-    """One ball's contact with the tool, or its nearest passage of the disc's plane so far."""
+    """One ball's contact with the tool (a disc), or its nearest passage of the disc's plane."""
 
     met: Array  # () bool, whether the passage is within the disc's radius
     time: Array  # () [s], time of the passage
@@ -31,7 +31,7 @@ class Contact:
 
 
 def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
-    """Return the contacts of balls that have not passed the tool's plane, leaves (N, ...)."""
+    """Return the contacts of N balls that have not passed the tool's plane, leaves (N, ...)."""
     number, vector = jnp.zeros(num_balls, dtype), jnp.zeros((num_balls, 3), dtype)
     return Contact(
         met=jnp.zeros(num_balls, bool),
@@ -49,7 +49,7 @@ def no_contact(num_balls: int, dtype=jnp.float32) -> Contact:
 
 @struct.dataclass
 class Moment:
-    """Positions and velocities of the tool's body and the balls at one instant.
+    """Positions and velocities of N balls and of the body with the tool at one instant.
 
     Velocities are MuJoCo's stored velocities, which belong to half a step earlier.
     """
@@ -71,7 +71,7 @@ def moment(world: World, physics: Physics) -> Moment:
 def passage(
     world: World, before: Moment, after: Moment, time: Array, planned: Array, reference: Array
 ) -> tuple[Array, Contact]:
-    """Return which balls pass the disc's plane from above within a step, and their passages.
+    """Return which of N balls pass the plane of the tool (a disc) from above within a step.
 
     Args:
         world: the world, with the tool and the time step.
@@ -82,11 +82,11 @@ def passage(
         reference: (3,) [m], planned position of the robot at `time`.
 
     Returns:
-        (N,) bool, whether each ball passes, and the passages with leaves (N, ...).
+        (N,) bool, whether each ball passes, and the passages of all balls, leaves (N, ...).
     """
 
     def gap(at: Moment) -> Array:
-        """Return the height (N,) [m] of the balls over the disc's plane."""
+        """Return the height (N,) [m] of N balls over the disc's plane."""
         height = jnp.sum((at.ball_pos - at.robot_pos[None]) * at.normal[None], axis=1)
         return height - world.carrier.tool.height
 
@@ -120,9 +120,9 @@ def passage(
 
 
 def nearest(contact: Contact, passes: Array, later: Contact) -> Contact:
-    """Return a ball's contact so far, or a later passage that is nearer to the disc's centre.
+    """Return each ball's contact so far, or a later passage that is nearer to the tool's centre.
 
-    A ball that is already met keeps its contact.
+    `passes` marks the balls with a later passage. A ball that is already met keeps its contact.
     """
     take = passes & ~contact.met & (later.offset < contact.offset)
 

@@ -15,8 +15,8 @@ from planner_jax.studies.block.camera import Camera, back_project, from_numbers
 from planner_jax.studies.block.noise import StereoNoise
 
 WINDOW = 64  # [px], edge of the evaluated square around the median of the mask's pixels
-# Mean height of a sphere's visible half above the plane through its centre, in radii, seen from a
-# large distance.
+# Mean height of a sphere's visible half above its centre, toward a distant camera, in radii of the
+# sphere, averaged over the pixels.
 _MEAN_HEIGHT = 2.0 / 3.0
 _WHOLE = 0.7  # least fraction of a ball's pixels, expected at its depth, that must be visible
 
@@ -42,7 +42,7 @@ def ball_thresholds(
     pixels: float = 4,
     reach: float = 14.0,
 ) -> BallThresholds:
-    """Return thresholds for a ball as NumPy float32 leaves; the default ball is orange.
+    """Return thresholds for a ball as float32 NumPy arrays; the default colour is orange.
 
     Raises:
         ValueError: a colour is not between 0 and 1, or the radius is not positive.
@@ -91,14 +91,14 @@ def hue_saturation_value(rgb: Array) -> Array:
 
 
 def colour_mask(image: Array, thresholds: BallThresholds) -> Array:
-    """Return which pixels of an image (rows, columns, 3) have the ball's colour, (rows, columns).
+    """Return which pixels of an image (rows, columns, 3) have the ball's colour.
 
-    The result equals a comparison with `hue_saturation_value`, but needs no division per pixel.
+    The mask (rows, columns) bool equals the mask by `hue_saturation_value`, without divisions.
     """
     red, green, blue = (image[..., k].astype(jnp.float32) for k in range(3))
     value = jnp.maximum(jnp.maximum(red, green), blue)
     span = value - jnp.minimum(jnp.minimum(red, green), blue)
-    # `turn` is 6 * hue * span, which lies between 0 and 6 * span.
+    # `turn` is 6 * hue * span; span is the greatest minus the least of red, green and blue.
     turn = jnp.where(
         value == red,
         green - blue + jnp.where(green < blue, 6.0, 0.0) * span,
@@ -117,20 +117,21 @@ def sighting(
 ) -> Sighting:
     """Detect the ball in one frame and return its position.
 
-    1. A window of 64 pixels is centred at the medians of the mask's columns and rows, which stray
-    pixels hardly affect.
+    1. A mask marks the pixels of the ball's colour. A window of 64 x 64 pixels is centred at the
+    medians of the marked columns and rows, since single wrong pixels hardly change a median.
 
-    2. The depth is the mean over confident pixels of the window near the median depth. Near means
-    within the ball's radius plus three robust standard deviations (1.48 times the median
-    deviation).
+    2. The depth is the mean over those marked pixels of the window that have enough confidence and
+    a depth near the median. Near means within the ball's radius plus three robust standard
+    deviations (1.48 times the median deviation).
 
-    3. The centroid of these pixels is refined: it uses all pixels of the mask near this centroid.
+    3. The ball's centre in the image is the centroid of the marked pixels near the centroid of the
+    pixels of step 2.
 
-    4. Depths are of the ball's surface. Their mean over the visible half is two thirds of a radius
-    in front of the ball's centre, which is corrected.
+    4. Depths are of the ball's surface. Their mean is two thirds of a radius in front of the ball's
+    centre; this difference is added.
 
-    A ball counts as not seen if less than 0.7 of it is visible, such as behind a pole, because its
-    centroid would be biased.
+    If less than 0.7 of a ball is visible, the ball counts as not seen: its centroid would be
+    wrong.
 
     Args:
         image: (rows, columns, 3) bytes, red, green and blue; at least 64 rows and columns.
@@ -161,8 +162,8 @@ def sighting(
     across = (first + jnp.stack(corner[::-1]) - camera.centre) / camera.focal
     along = jnp.sqrt(1.0 + jnp.sum(across**2))
     deep = mean(depth, usable) + _MEAN_HEIGHT * thresholds.radius / along
-    # Holes in the depth would bias the centroid. The centroid therefore uses all pixels of the
-    # ball's colour within its apparent radius. Off the camera's axis a ball's image is stretched.
+    # The centroid uses all pixels of the ball's colour within 1.5 apparent radii, also pixels
+    # without a depth. Away from the camera's axis a ball's image is longer by the factor `along`.
     round_px = camera.focal * thresholds.radius / jnp.maximum(deep, thresholds.radius)
     within = 1.5 * along * round_px + 1.0
     near = mask & ((column - first[0]) ** 2 + (row - first[1]) ** 2 <= within**2)
@@ -213,7 +214,7 @@ def noisy_depth(
 
 
 def _middle(counts: Array) -> Array:
-    """Return the index () at which the cumulative sum of counts (n,) reaches half of its total."""
+    """Return the index () at which the cumulative sum of the counts reaches half of its total."""
     until = jnp.cumsum(counts)
     return jnp.searchsorted(until, 0.5 * until[-1])
 

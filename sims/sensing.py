@@ -1,8 +1,8 @@
 """Observations of the balls by motion capture, and estimates of the balls' states and drag.
 
-An observation shows the noisy position of a ball one latency ago, or is missing. The library's
-Kalman filter estimates position and velocity from the observations. The energy that the ball has
-lost since the first good estimate gives its drag [Yu2023bat, eqs 6 and 7]. World frame, SI units.
+An observation is the noisy position of a ball one latency ago, or is missing. The library's Kalman
+filter estimates position and velocity from the observations. The energy that a ball has lost since
+the start of the plan for it gives its drag [Yu2023bat, eqs 6 and 7]. World frame, SI units.
 """
 
 import dataclasses
@@ -23,20 +23,23 @@ _DRAG_SPREAD = 0.2  # relative standard deviation of the initial drag estimate
 
 
 def specific_energy(ball: BallState, gravity: Array) -> Array:
-    """Return a ball's mechanical energy per unit mass,  |v|^2 / 2 + g z  [m^2/s^2], with g > 0.
+    """Return a ball's energy per unit mass,  |v|^2 / 2 + g z  [m^2/s^2], at speed |v| and height z.
 
-    [Yu2023bat] prints  + g' s  above eq. 6. The paper's g points down, so that the printed sum
-    would not be conserved in free flight.
+    Here g > 0 is the magnitude of gravity. Above eq. 6, [Yu2023bat] adds the product of position
+    and gravity vector instead of g z. With that sign, energy would change in a flight without drag.
     """
     return 0.5 * jnp.sum(ball.vel**2) + gravity * ball.pos[2]
 
 
 @struct.dataclass
 class RlsState:
-    """The estimate of one unknown x from measurements  y = h x + (noise of unit variance)."""
+    """The least-squares estimate of a number x from measurements  y = h x + noise.
+
+    The factor h of each measurement is known, and the noise has unit variance.
+    """
 
     estimate: Array  # (), estimate of x
-    # (), variance of the estimate. An initial variance v counts like 1 / v measurements with h = 1.
+    # (), variance of the estimate; at first, the variance that is assumed without measurements.
     variance: Array
 
 
@@ -45,12 +48,13 @@ def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsStat
 
     Args:
         state: the estimate so far.
-        regressor: (), h.
-        measurement: (), y; if it is not finite, the estimate does not change.
+        regressor: (), known factor h; the measurement is h times the estimated number plus noise.
+        measurement: (); if it is not finite, the estimate does not change.
     """
     usable = jnp.isfinite(measurement)
     y = jnp.where(usable, measurement, 0.0)
-    # P / (1 + h^2 P) equals the textbook's (1 - K h) P, but subtracts no nearly equal numbers.
+    # Of variance P, regressor h and gain K, textbooks compute the new variance (1 - K h) P. The
+    # equal formula P / (1 + h^2 P) is used here, since it has no rounding error of a difference.
     variance = state.variance / (1.0 + regressor**2 * state.variance)
     error = y - regressor * state.estimate
     after = RlsState(estimate=state.estimate + variance * regressor * error, variance=variance)
@@ -70,7 +74,7 @@ class Estimate:
 
 
 def observe(key: Array, pos: Array, sensing: Sensing) -> Array:
-    """Return noisy observations (N, 3) [m] of balls at `pos`; missing ones are rows of NaN."""
+    """Return noisy positions (N, 3) [m] of N balls at `pos`; a lost observation is a row of NaN."""
     noise_key, drop_key = jax.random.split(key)
     seen = pos + sensing.position_std * jax.random.normal(noise_key, pos.shape, pos.dtype)
     lost = jax.random.uniform(drop_key, pos.shape[:1], pos.dtype) < sensing.dropout
@@ -87,9 +91,9 @@ def _model(sensing: Sensing, drag: Array, gravity: Array) -> EkfModel:
 
 
 def first_estimate(pos: Array, drag: Array) -> Estimate:
-    """Return the first estimate of a ball that leaves a machine at `pos` (3,) [m].
+    """Return the first estimate of a ball that leaves a pitching machine at `pos` (3,) [m].
 
-    The velocity is unknown. `drag` () [1/m] is the initial estimate of K_D.
+    The velocity is unknown. `drag` () [1/m] is the initial estimate of the drag coefficient.
     """
     zero = jnp.zeros_like(drag)
     wide = ekf_init(pos, jnp.zeros_like(pos), pos_std=zero + 0.1, vel_std=zero + 10.0)
@@ -100,7 +104,7 @@ def first_estimate(pos: Array, drag: Array) -> Estimate:
 
 
 def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array) -> Estimate:
-    """Update the estimate of one ball by the Kalman filter with one observation (3,)."""
+    """Update the estimate of one ball by the Kalman filter with one observed position (3,) [m]."""
     model = _model(sensing, estimate.drag, gravity)
     period = jnp.full_like(estimate.drag, 1.0 / sensing.rate)
     ahead = ekf_predict(estimate.belief, period, model, flight=rk4_step)
@@ -112,15 +116,16 @@ def update_estimate(estimate: Estimate, seen: Array, sensing: Sensing, gravity: 
 def update_unfiltered(
     estimate: Estimate, seen: Array, sensing: Sensing, gravity: Array
 ) -> Estimate:
-    """Update the estimate of one ball with one observation (3,), without a filter.
+    """Update the estimate of one ball with one observed position (3,) [m], without a filter.
 
-    The new position is the observed position. The velocity follows from the observed position and
-    the previous position.
+    The velocity follows from the observed position and the previous position. If the observation
+    is missing (NaN), the ball's flight is predicted instead.
     """
     period = 1.0 / sensing.rate
     before = estimate.belief.ball
     flown = rk4_step(before, jnp.full_like(estimate.drag, period), estimate.drag, gravity)
-    # The final velocity is the mean velocity over the period, plus half of the velocity's change.
+    # The mean velocity between two observations belongs to the middle of their times. Half of the
+    # predicted change of velocity is added, to get the velocity at the later observation.
     vel = (seen - before.pos) / period + 0.5 * (flown.vel - before.vel)
     taken = jnp.concatenate([seen, vel])
     blind = jnp.concatenate([flown.pos, flown.vel])
@@ -146,9 +151,9 @@ def _energy(belief: EkfState, gravity: Array) -> tuple[Array, Array]:
 def with_drag(estimate: Estimate, gravity: Array) -> Estimate:
     """Update the drag coefficient K_D from the energy that the ball has lost [Yu2023bat, eq. 7].
 
-    Drag takes the energy K_D * (integral of |v|^3) per unit mass since the reference was set. One
-    least-squares update combines this total loss with the prior of K_D. The paper instead averages
-    the losses between single observations, which would count the same noise repeatedly.
+    At speed |v|, drag takes the energy K_D * (integral of |v|^3) per unit mass. One least-squares
+    update combines the loss since `anchor_energy` with the prior estimate of K_D. The paper instead
+    averages the losses between single observations, which would count the same noise repeatedly.
     """
     energy, variance = _energy(estimate.belief, gravity)
     std = jnp.sqrt(jnp.maximum(variance + estimate.energy_variance, 1e-12))

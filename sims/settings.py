@@ -23,10 +23,10 @@ from planner_jax.task.hit.spec import TASK as HIT
 from planner_jax.task.intercept.spec import TASK as INTERCEPT
 
 _REPLAN = "replanning rate, 0 for never (default: {} with {}, 0 with other planners)"
-# The decision "given" needs an order and times in the case, which cases of flights do not have.
+# The decision "given" takes order and times of catches from the case; cases of flights have none.
 _FLOWN_DECISIONS = {name: where for name, where in DECISIONS.items() if name != "given"}
 _AT_ONCE = 4096  # greatest default number of flights per batch
-# Estimated memory [bytes] of a simulated flight in a batch, and of the rows of a finished flight.
+# Estimated memory [bytes] of a flight during its simulation, and of its results afterwards.
 _FLIGHT_BYTES, _FLOWN_BYTES = 1_000_000, 4_000
 _FASTEST = 10_000.0  # [Hz], greatest replanning rate
 # Greatest number of balls of a flight, as in the largest suite. Compile time grows with every ball.
@@ -49,7 +49,7 @@ def fly_settings(task: str) -> type["FlySettings"]:
 
 
 def require_interval(sensing: Sensing, replan: float) -> None:
-    """Raise `ValueError` unless a whole number of planning periods fits between two throws.
+    """Raise `ValueError` unless a whole number of planning periods fits between two balls.
 
     Args:
         sensing: settings of the observations.
@@ -99,7 +99,7 @@ class FlySettings:
 
     @property
     def rate(self) -> float:
-        """The rate of replanning [Hz]; only the task's first planner has a default above 0."""
+        """The rate of replanning [Hz]; by default only the task's first planner replans."""
         if self.replan is not None:
             return self.replan
         return self.RATE if self._is_first else 0.0
@@ -132,7 +132,7 @@ class BallFly(FlySettings):
         require(0.0 <= self.drag_error < 1.0, "drag_error", ">= 0 and < 1", self.drag_error)
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless a planning period is a whole number of observation periods."""
+        """Raise `ValueError` unless planning periods are multiples of the observation period."""
         NOISES[self.noise].observations_per_plan(self.rate)
 
 
@@ -187,7 +187,7 @@ class CatchFly(BallFly):
         return super().flight()
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless every throw coincides with the start of a planning period."""
+        """Raise `ValueError` unless throws and new decisions coincide with starts of plans."""
         super().check_rate()
         if self.balls > 1:
             require_interval(NOISES[self.noise], self.rate)
@@ -261,13 +261,13 @@ class InterceptFly(FlySettings):
         )
 
     def check_rate(self) -> None:
-        """Raise `ValueError` unless a planning period is a whole number of frames."""
+        """Raise `ValueError` unless the time between plans is a multiple of 20 ms, one frame."""
         self.sensing.frames_per_plan(self.rate)
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockFly(FlySettings):
-    """Settings of blocks of thrown balls by an arm with a shield."""
+    """Settings of flights of thrown balls, which an arm with a shield is to block."""
 
     replan: float | None = option(
         None, "HZ", "with --perception: rate of replanning (default: 0, the arm plans once)"
@@ -335,15 +335,15 @@ class BlockFly(FlySettings):
 
     @property
     def until_known(self) -> float:
-        """The time [s] from the first sight of the ball until its flight is known or fitted."""
+        """The time [s] for which a ball is observed before the arm plans."""
         # The default without perception is the sum of two times in [Natarajan2024, Section VI-B]:
-        # 82.9 ms for perception and 50 ms for the remaining system.
+        # 82.9 ms for perception and 50 ms for all other parts of the system.
         usual = 0.25 if self.perception else 0.133
         return usual if self.observe is None else self.observe
 
     @property
     def until_set(self) -> float:
-        """The time [s] for planning, from the end of `until_known` until the arm starts."""
+        """The time [s] for planning: from the end of the observation until the arm starts."""
         usual = 0.05 if self.perception else 0.03
         return usual if self.planning_budget is None else self.planning_budget
 
@@ -368,8 +368,8 @@ class BlockFly(FlySettings):
         """Return the task's `sims.task.FlightTask` with these settings.
 
         Raises:
-            ArgumentError: the file of a library planner is no library, or the library was built for
-                another scene or other limits.
+            ArgumentError: FILE of the planner `library:FILE` is no library of motions, or was built
+                for another scene or other limits.
         """
         if BLOCK.split_planner(self.planner)[1]:
             from planner_jax.task.block import draw

@@ -1,4 +1,4 @@
-"""The interface between a task and a run of flights; the classes in `tasks` implement it."""
+"""Base classes by which a run of simulated flights uses a task; `sims/tasks` implements them."""
 
 import abc
 import dataclasses
@@ -21,7 +21,7 @@ from planner_jax.sims.settings import BallFly
 
 @dataclasses.dataclass(frozen=True)
 class FlightCases:
-    """B cases to fly, with NumPy leaves; a task's subclass adds the balls or targets."""
+    """A batch of B cases to fly, in NumPy arrays; subclasses add the balls or targets."""
 
     index: np.ndarray  # (B,), index in the run, from which the noise is drawn
 
@@ -29,14 +29,14 @@ class FlightCases:
         return len(self.index)
 
     def __getitem__(self, rows: Any) -> Self:
-        """Return some of the cases, selected by NumPy indexing."""
+        """Return the cases that a NumPy index selects."""
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return type(self)(**jax.tree.map(lambda leaf: leaf[rows], fields))
 
 
 @dataclasses.dataclass(frozen=True)
 class Flights(abc.ABC):
-    """The result of a batch of flights; leaves with a leading axis B."""
+    """The result of a batch of B simulated flights; arrays have the leading axis B."""
 
     first_plan: Any
     flown: Any  # the simulated flights; `tracking` (B, 2) [m] has rms and greatest error
@@ -45,15 +45,15 @@ class Flights(abc.ABC):
     @property
     @abc.abstractmethod
     def success(self) -> np.ndarray:
-        """Mask of the successful flights, (B,) bool."""
+        """Mask (B,) of the B flights that succeeded."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FlightTask(abc.ABC):
-    """A task with its settings, as `run.py` uses it to fly, score and draw all cases of a run.
+    """One task, such as hits, with its settings; `run.py` flies, scores and draws a run with it.
 
-    The settings name the task's subclass in `FLIGHT`. A task with balls inherits from
-    `BallFlightTask`.
+    The class of the settings names the subclass in its attribute `FLIGHT`. A task with balls
+    inherits from `BallFlightTask`.
     """
 
     settings: Any  # settings of the task's class of `FlySettings`
@@ -63,13 +63,13 @@ class FlightTask(abc.ABC):
     CONTACT: ClassVar[str]  # participle for a met target in pictures, such as "caught"
     SUCCESS: ClassVar[str]  # predicate of a successful flight in sentences: "caught all balls"
     PUBLISHED: ClassVar[str]  # published result of the task, for the report's table
-    # Columns of the task's rows, in addition to the columns of all tasks.
+    # Columns of this task in the table with one row per flight; every task has further columns.
     COLUMNS: ClassVar[Sequence[Column]]
-    # Corners [m] of the region that pictures show; None to fit all drawn objects.
+    # Lower and upper corner [m] of the region that pictures show; None to fit all drawn objects.
     BOUNDS: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]] | None] = None
     HAS_REACH: ClassVar[bool] = False  # whether the task implements `reachable`
     VIEW: ClassVar[tuple[float, float]] = (18.0, -68.0)  # elevation and azimuth of pictures [deg]
-    # Position [m] of the viewer's camera, and the point [m] at which the camera is aimed.
+    # Position [m] of the browser viewer's camera, and the point [m] at which the camera is aimed.
     EYE: ClassVar[tuple[tuple[float, float, float], tuple[float, float, float]]] = (
         (1.5, -8.0, 3.0),
         (1.9, 0.0, 1.2),
@@ -85,25 +85,25 @@ class FlightTask(abc.ABC):
 
     @abc.abstractmethod
     def fly(self, cases: Any, record: bool) -> Any:
-        """Plan and fly some cases, and return the task's `Flights`.
+        """Plan and simulate the flights of some cases, and return their results, a `Flights`.
 
-        With `record`, the result includes a record of every observation.
+        If `record` is true, the results include the states during the flights.
         """
 
     @abc.abstractmethod
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """Return the recording of some of the recorded flights.
+        """Return a recording of some flights of a batch, for pictures and films.
 
         Args:
             cases: the cases that were flown.
             flights: the result of `fly` for these cases.
-            lanes: (F,) indices of the flights in the batch.
+            lanes: (F,) indices of the F flights in the batch.
         """
 
     @property
     @abc.abstractmethod
     def suite(self) -> str:
-        """A short name of the cases for title and table."""
+        """A short name of the cases, for the report of a run."""
 
     @property
     @abc.abstractmethod
@@ -120,31 +120,31 @@ class FlightTask(abc.ABC):
         """Return all parameters of the simulation, as plain values for the manifest."""
 
     def every_column(self) -> Sequence[Column]:
-        """Return all columns of the task's rows, without the columns of all tasks."""
+        """Return all columns that this task adds to the table with one row per flight."""
         return self.COLUMNS
 
     def surroundings(self, index: int) -> Sequence[Prism]:
-        """Return the standing and moving obstacles of one flight of the run, for drawing."""
+        """Return the standing and moving obstacles of the run's flight `index`, for drawing."""
         return ()
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return where a flight's robot could be: times [s], and points (P, 2) [m] at each time."""
+        """Return times [s], each with the P points (P, 2) [m] where the robot could be then."""
         return ()
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return the task's own numbers from the rows of a run, for the summary."""
+        """Return the task's own numbers for the summary, from the table with one row per flight."""
         return {}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return the task's own sentences for the top of the report."""
+        """Return the task's own sentences for the top of a run's report, from the run's summary."""
         return []
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return the task's own tables from the rows of a run."""
+        """Return the task's own tables for the report, from the table with one row per flight."""
         return ()
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Draw the task's own figures from the rows into a folder; return the file names."""
+        """Draw the task's own figures of the report into a folder; return the file names."""
         return ()
 
     def title(self, recording: Recording, flight: int) -> str:
@@ -166,7 +166,7 @@ _CONTACTS = leaves_of(
 
 @dataclasses.dataclass(frozen=True)
 class BallFlightTask(FlightTask):
-    """A task with balls, flown by the closed loop `sims.loop`."""
+    """A task with flying balls, whose flights the closed loop `sims.loop` simulates."""
 
     settings: BallFly
 
@@ -195,17 +195,17 @@ class BallFlightTask(FlightTask):
         return f"{robot}, motion capture {seen}, balls with quadratic drag"
 
     def parameters(self) -> dict[str, Any]:
-        """Return the settings of the closed loop as plain values for the manifest."""
+        """Return the settings of the closed loop as plain values for the run's manifest."""
         return dataclasses.asdict(self.loop(record=False))
 
     def loop(self, record: bool) -> Loop:
-        """Return the closed loop's settings, with or without a record of every observation."""
+        """Return the closed loop's settings; `record` is whether it stores states and errors."""
         settings = self.settings
         sensing = NOISES[settings.noise]
         return Loop(self.world(), sensing, replan=settings.rate, record=record)
 
     def recording(self, cases: Any, flights: Any, lanes: Sequence[int] | np.ndarray) -> Recording:
-        """Return the recording of some of the recorded flights, as in `FlightTask`."""
+        """Return a recording of the flights whose indices in the batch are `lanes`."""
         pick = lambda leaf: np.asarray(leaf)[lanes]  # noqa: E731
         flown = dataclasses.replace(
             flights.flown,

@@ -1,7 +1,7 @@
-"""A browser viewer of recorded flights, with a time slider, a speed and a choice of flights.
+"""A viewer of recorded flights in a web browser, with sliders for time and playing speed.
 
 The viewer needs the extra `view`. `recording.frame` computes which objects are visible at a sample,
-and this module displays them. The flight plays whether or not a browser is connected.
+and this module displays them by the package viser. A flight also plays without a browser.
 """
 
 import errno
@@ -36,13 +36,13 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 
 
 def segments(path: np.ndarray) -> np.ndarray:
-    """Return the segments (S, 2, 3) between consecutive points of a path (M, 3), without NaN."""
+    """Return the segments (2 points each) between consecutive points of a path, without NaN."""
     pairs = np.stack([path[:-1], path[1:]], axis=1)
     return pairs[np.isfinite(pairs).all(axis=(1, 2))]
 
 
 def free_address(host: str, port: int) -> str:
-    """Return the numeric address of a host name of this machine at which a port is free.
+    """Return the numeric address of a name of this machine, after checking that a port is free.
 
     Port 0 stands for any free port.
 
@@ -147,7 +147,7 @@ class Viewer:
 
     @property
     def sample(self) -> int:
-        """The index of the displayed sample."""
+        """The index of the displayed sample of the recorded flight."""
         times = self.recording.time[self._row]
         nearest = int(np.argmin(np.abs(times - self.time.value)))
         return min(nearest, self.recording.num_samples(self._row) - 1)
@@ -157,13 +157,13 @@ class Viewer:
         return self._titles.index(self.flight.value)
 
     def advance(self, seconds: float) -> None:
-        """Play for a time [s], and start again at the beginning after the end."""
+        """Advance the displayed time by `seconds` times the speed; restart after the end."""
         if self.playing.value:
             later = self.time.value + seconds * self.speed.value
             self.time.value = later if later <= self.time.max else self.time.min
 
     def run(self) -> None:
-        """Play until Ctrl-C is pressed, then stop the server."""
+        """Play the selected flight until Ctrl-C is pressed, then stop the server."""
         try:
             before = time.monotonic()
             while True:

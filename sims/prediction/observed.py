@@ -17,7 +17,7 @@ Pair = tuple[Array, Array]  # x and y of points of the plane, each (...)
 
 
 class Centred(NamedTuple):
-    """L observations of a target relative to their weighted means."""
+    """L observations of a target, minus the weighted means of their times and positions."""
 
     weight: Array  # (L,), 0 where the observation is absent
     after: Array  # (L,) [s], time of each observation minus the mean time
@@ -31,7 +31,7 @@ class Centred(NamedTuple):
 def centre(
     times: ArrayLike, positions: ArrayLike, weights: ArrayLike | None, least: int
 ) -> Centred:
-    """Return weighted observations of positions (L, 2) at times (L,), centred at their means.
+    """Subtract the weighted means from times (L,) and positions (L, 2) of L observations.
 
     Raises:
         ValueError: the shapes do not match, or the arrays hold fewer than `least` observations.

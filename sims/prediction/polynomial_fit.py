@@ -1,4 +1,4 @@
-"""Polynomials through observations of a target [Qu2022, eqs 9-11].
+"""Polynomials in time, fitted to observations of a target [Qu2022, eqs 9-11].
 
 Each additional degree amplifies the noise of a prediction, and a straight line misses targets that
 turn. `planner_jax.sims.prediction.select_path.select` usually predicts better than any polynomial.
@@ -16,17 +16,16 @@ from planner_jax.sims.prediction.observed import centre
 def fit_polynomial(
     times: ArrayLike, positions: ArrayLike, degree: int, weights: ArrayLike | None = None
 ) -> PolynomialPath:
-    """Fit a polynomial to observations by least squares [Qu2022, eqs 9 and 10].
+    """Fit a polynomial in time to observed positions by least squares [Qu2022, eqs 9 and 10].
 
-    The paper solves the normal equations (eq. 11). Here the columns are made orthogonal in
-    normalised time instead, which rounds less. The paper prints its H as the sum T'T, which is
-    squared once too often. If there are fewer observations than coefficients, the degree is reduced
-    to the degree that the observations determine.
+    The paper solves the normal equations (eq. 11). Here a QR decomposition by Gram-Schmidt is used
+    instead, with times scaled to -1 to 1, since it has smaller rounding errors. If there are fewer
+    observations than coefficients, the degree is reduced to what the observations determine.
 
     Args:
-        times: (L,) [s].
-        positions: (L, 2) [m].
-        degree: n, 1 to 3.
+        times: (L,) [s], times of L observations.
+        positions: (L, 2) [m], observed positions.
+        degree: degree of the polynomial, 1 to 3.
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
 
@@ -59,10 +58,10 @@ def fit_polynomial(
 
 
 def _coefficients(root: Array, values: Array, span: Array) -> Array:
-    """Solve R X = Y for the coefficients X (n + 1, 2), and undo the normalisation of time.
+    """Solve R X = Y for the coefficients X, with `root` as the triangular R and `values` as Y.
 
-    A coefficient is zero where the diagonal of R (n + 1, n + 1) is zero up to rounding, since the
-    observations do not determine this coefficient.
+    X is returned for times in seconds instead of scaled times. A coefficient is zero where R's
+    diagonal is zero up to rounding, since observations do not determine this coefficient.
     """
     found = jnp.zeros_like(values)
     rounding = (32.0 * jnp.finfo(root.dtype).eps) ** 2

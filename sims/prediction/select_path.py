@@ -1,9 +1,9 @@
 """Prediction of a target's position in the plane, and of its error, from noisy observations.
 
 [Qu2022, Section III-A] fits a polynomial (`polynomial_fit.py`) of a degree that the paper does not
-report. `select` compares a straight line with a path of constant turn rate instead. Its prediction
-also estimates its own error by `covariance` and `chance_within`. World frame in the plane, SI
-units, one target; use `jax.vmap` for several. The noise is Gaussian and equal on both axes.
+report. `select` compares a straight line with a path of constant turn rate instead. The
+functions `covariance` and `chance_within` estimate the error of its prediction. World frame in the
+plane, SI units, one target; use `jax.vmap` for several. The noise is Gaussian, equal on both axes.
 """
 
 import jax
@@ -20,7 +20,7 @@ from planner_jax.sims.prediction.turn_fit import best_turn, fit_rate, path_of, t
 
 _REACH = 5.0  # half width of the evaluated interval of turn rates, in standard deviations
 _OFFSETS = np.linspace(-1.0, 1.0, 49)  # evaluated turn rates, relative to that half width
-# Gauss-Legendre nodes and weights on (-1, 1).
+# Nodes and weights of a Gauss-Legendre quadrature on (-1, 1).
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(24)
 
 
@@ -58,13 +58,13 @@ USUAL = TurnPrior()  # the default prior
 
 @struct.dataclass
 class Alternatives:
-    """K paths that agree with the observations, with probabilities; the first path is straight.
+    """K paths with different turn rates and their probabilities; the first path is straight.
 
-    Path k is at  centre + velocity_k g_k(t - middle), a product of complex numbers. Let d_k be the
-    displacement of a target with turn rate k that starts at unit velocity along x. Then g_k is d_k
-    minus `lever` k, the weighted mean of d_k over the times of observation. The error of path k is
-    Gaussian and isotropic. Its variance is  centre_variance + velocity_variance_k
-    |g_k(t - middle)|^2.
+    Each path is fitted to the observations. With points as complex numbers, its position at time t
+    is  centre + velocity g(t - middle).  Here g is the displacement of a target that starts with
+    velocity 1 along x and turns at the path's rate, minus `lever`, the weighted mean of this
+    displacement over the observations. The position error is Gaussian and equal on both axes, with
+    variance  centre_variance + velocity_variance |g(t - middle)|^2.
     """
 
     chance: Array  # (K,), sum 1
@@ -84,7 +84,8 @@ class Prediction:
     path: TurningPath  # with turn rate 0 if it is straight
     is_turning: Array  # () bool, which of the two models was selected
     chance_turning: Array  # (), probability that the target turns
-    # (), reduction of the sum of squared residuals by the best turn, in units of noise^2.
+    # (), 2 log(L_turn / L_line): how much more likely the best turn makes the observations than the
+    # best straight line; L_turn and L_line are the likelihoods of these two fits.
     gain: Array
     residual: Array  # () [m], root mean square of (observation - path), per coordinate
     noise: Array  # () [m], standard deviation of a coordinate, passed or estimated
@@ -107,24 +108,25 @@ def select(
     rate. The prior of position and velocity is flat. The selected path has the median turn rate.
     The median is zero unless turns to one side are more probable than all other alternatives
     together. Weak turns are therefore shrunk towards zero, and the path does not jump as
-    observations change (posterior median thresholding [Johnstone2004]). With a threshold, a test
-    selects the straight line or the least-squares turn instead. Both methods have the same error
-    estimates, which average over all rates, zero included.
+    observations change (posterior median thresholding [Johnstone2004]). If `threshold` is passed,
+    the path is instead the least-squares turn if its gain exceeds the threshold, and else the
+    least-squares line. The error estimates average over all turn rates in either case.
 
     A residual far above the noise means that neither model fits the target. Do not trust such a
     prediction. With fewer than three observations, or four if the noise is estimated, the path is
     straight and the error is unbounded.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far from these times.
-        positions: (L, 2) [m].
+        times: (L,) [s], times of L observations. Time 0 of the path should not be far from them.
+        positions: (L, 2) [m], observed positions of the target.
         noise: () [m] > 0, standard deviation of a coordinate of an observation of weight 1. By
             default the noise is estimated from the residuals of the best turn.
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
         prior: probability and rate of turns.
-        threshold: (), the gain above which a target counts as turning. The gain of a straight
-            target exceeds 6.6 with a probability of 1 %.
+        threshold: (), the gain above which a target counts as turning. The gain is 2 log(likelihood
+            of the best turn / likelihood of the best line). For a straight target it exceeds 6.6
+            with a probability of 1 %.
         fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
             should turn by at most 24 rad within the observations, and by less than pi between two.
 
@@ -149,11 +151,11 @@ def select(
         variance = error_variance = jnp.square(jnp.asarray(noise, dtype))
 
     def gain(squares: Array) -> Array:
-        """Return 2 log(L_best / L), for likelihoods of the best turn and of another fit."""
+        """Return 2 log(likelihood of the best turn / likelihood of another fit)."""
         excess = (squares - best.squares) / variance
         return excess if noise is not None else (freedom + 1.0) * jnp.log1p(excess / freedom)
 
-    # Evaluate rates around the best rate, or around zero if the observations determine it poorly.
+    # Evaluate turn rates around the best rate, or around zero if observations determine it poorly.
     information = tangent(seen, best)[1] / variance
     precision = information + 1.0 / jnp.asarray(prior.variance, dtype)
     reach = _REACH / jnp.sqrt(precision)
@@ -191,7 +193,7 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median () of a turn rate: zero with probability `of_zero`, else near `rates`."""
+    """Return the median turn rate: zero has probability `of_zero`, each of `rates` a `chance`."""
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)
@@ -203,7 +205,7 @@ def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
 
 
 def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
-    """Return the mean (2,) [m] of all alternative paths' positions at a time () [s]."""
+    """Return the expected position (2,) [m] of a target at a time, by all alternative paths."""
     offset, _ = _errors(prediction, time)
     mean = jnp.sum(prediction.alternatives.chance[:, None] * offset, axis=0)
     return prediction.path.at(jnp.asarray(time)).pos + mean
@@ -212,8 +214,8 @@ def mean_position(prediction: Prediction, time: ArrayLike) -> Array:
 def covariance(prediction: Prediction, time: ArrayLike) -> Array:
     """Return the mean square (2, 2) [m^2] of the error of the path's position at a time () [s].
 
-    The error is measured from the position on the path, not from the mean of the alternatives. The
-    diagonal is infinite if there were too few observations.
+    The error is measured from the selected path, not from `mean_position`. The diagonal is infinite
+    if there were too few observations.
     """
     offset, variance = _errors(prediction, time)
     chance = prediction.alternatives.chance
@@ -237,10 +239,10 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 
 
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
-    """Return the offsets of all alternatives from the selected path at a time, and variances.
+    """Return offsets (K, 2) [m] of K alternative paths from the selected path, and variances.
 
-    The offsets are (K, 2) [m], the variances (K,) [m^2]. The variance of the centre, which is equal
-    for all alternatives, is not included.
+    The variances (K,) [m^2] do not include the variance of the centre, which is equal for all
+    paths.
     """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)
@@ -255,8 +257,9 @@ def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
 def _chance_in_circle(distance: Array, std: Array, radius: Array) -> Array:
     """Return the probability () that a Gaussian point lies in a circle at a distance from its mean.
 
-    The circle is integrated in strips perpendicular to the line from the Gaussian's mean to the
-    circle's centre. The quadrature is over an angle, and only where the Gaussian is not negligible.
+    The circle is integrated in strips perpendicular to the line from the Gaussian's mean to its
+    centre, at distances radius * sin(phi) from the centre. The quadrature is over phi, only where
+    the Gaussian is not negligible.
     """
 
     def angle(along: Array) -> Array:

@@ -1,9 +1,9 @@
 """Paths of constant speed and turn rate through observations of a target.
 
-At a given turn rate w, such a path is linear in a position and a velocity. In complex numbers it is
-position + velocity g(t), with the arc g(t) = (exp(i w t) - 1) / (i w). Position and velocity then
-follow in closed form, and only w is searched for (variable projection). The errors of position and
-velocity are Gaussian and isotropic. In this module a complex number is a pair of arrays.
+With points as complex numbers, such a path is  position + velocity g(t)  at time t, with the arc
+g(t) = (exp(i w t) - 1) / (i w)  for the turn rate w. At a given w, position and velocity follow in
+closed form by linear least squares; only w is searched for (variable projection). In this module a
+complex number is a pair of arrays.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ _STEPS = 8  # number of Gauss-Newton iterations, over the turn rate alone
 
 
 class TurnFit(NamedTuple):
-    """The best position and velocity of a path for one turn rate."""
+    """The path of one turn rate that fits L observations of a target best."""
 
     rate: Array  # () [rad/s]
     velocity: Pair  # each () [m/s], at the mean time of the observations
@@ -45,8 +45,8 @@ def fit_turn(
     three observations are present.
 
     Args:
-        times: (L,) [s]. The path counts from time 0, which should not be far from these times.
-        positions: (L, 2) [m].
+        times: (L,) [s], times of L observations. Time 0 of the path should not be far from them.
+        positions: (L, 2) [m], observed positions of the target.
         weights: (L,) >= 0, proportional to the inverse variance of each observation; 1 by default.
             An observation of weight zero, or not finite, is absent.
         fastest: () [rad/s], greatest turn rate at which the search starts. At that rate the target
@@ -73,7 +73,7 @@ def fit_rate(seen: Centred, rate: Array) -> TurnFit:
 def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array]:
     """Return the derivative of the fitted path by the turn rate, as a function of time.
 
-    Position and velocity are refitted as the rate changes.
+    The derivative includes the change of the fitted position and velocity.
 
     Returns:
         slope: function from times (...) [s] after the mean time to derivatives, each (...) [m
@@ -99,7 +99,7 @@ def tangent(seen: Centred, fit: TurnFit) -> tuple[Callable[[Array], Pair], Array
 
 
 def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
-    """Fit position, velocity and turn rate; the fit has the derivatives of the exact optimum."""
+    """Fit position, velocity and turn rate; derivatives of the fit are exact at the optimum."""
 
     def downhill(rate: Array) -> Array:
         """Return minus half the derivative of the sum of squares by the rate, () [m^2 s/rad]."""
@@ -146,7 +146,6 @@ def path_of(seen: Centred, fit: TurnFit) -> TurningPath:
 
 
 def _minus(a: Pair, b: Pair) -> Pair:
-    """Return the difference of two points."""
     return a[0] - b[0], a[1] - b[1]
 
 
@@ -156,12 +155,12 @@ def _times(a: Pair, b: Pair) -> Pair:
 
 
 def _sum(seen: Centred, a: Pair, b: Pair) -> Array:
-    """Return the weighted sum () of the scalar products of two series of points."""
+    """Return the weighted sum () over observations of the scalar products of points a and b."""
     return jnp.sum(seen.weight * (a[0] * b[0] + a[1] * b[1]))
 
 
 def _mean(seen: Centred, a: Pair) -> Pair:
-    """Return the weighted mean of points, each coordinate ()."""
+    """Return the weighted mean over observations of points, as a pair of coordinates ()."""
     x, y = (jnp.sum(seen.weight * each) / seen.total for each in a)
     return x, y
 
@@ -169,7 +168,7 @@ def _mean(seen: Centred, a: Pair) -> Pair:
 def _share(seen: Centred, arm: Pair, power: Array, a: Pair) -> Pair:
     """Return the complex factor c that minimises the weighted sum of |a - c arm|^2.
 
-    `power` is the weighted sum of the arms' squared lengths.
+    The argument `power` is the weighted sum of |arm|^2.
     """
     safe = jnp.where(power > 0.0, power, 1.0)
     return _sum(seen, arm, a) / safe, _sum(seen, (-arm[1], arm[0]), a) / safe

@@ -1,4 +1,4 @@
-"""Runs of blocks by `planner-jax fly block`: rows, recordings and findings of the flights."""
+"""Runs of `planner-jax fly block`: the table of results, recordings and report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -100,7 +100,7 @@ class BlockFlight(FlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the parameters of drives, encoders and control, for the manifest."""
+        """Return the parameters of drives, encoders and control, for the run's manifest."""
         robot = BLOCK_ARM
         return {
             "drives": dataclasses.asdict(self.settings.drives),
@@ -122,7 +122,7 @@ class BlockFlight(FlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> BlockFlights:
-        """Plan and fly blocks of some balls; the result always includes a record."""
+        """Plan and simulate the blocks of some balls; the result always includes all motions."""
         settings, planner = self.settings, block_planner(self.settings.planner)
         decided, seconds = None, 0.0
         if settings.perception:
@@ -151,7 +151,7 @@ class BlockFlight(FlightTask):
     def recording(
         self, cases: Throws, flights: BlockFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """Return the recording of some of the flights, as in `FlightTask`."""
+        """Return a recording of the flights whose indices in the batch are `lanes`."""
         lanes = np.asarray(lanes)
         some, flown, robot = cases[lanes], flights.flown, BLOCK_ARM
         kept = np.arange(0, flown.times.size, _KEPT)
@@ -177,7 +177,7 @@ class BlockFlight(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Times for sensing and planning, drives and encoders, as the beginning of a sentence."""
+        """Times for sensing and planning, drives and encoders, as a part of a sentence."""
         settings = self.settings
         meeting = "wide" if settings.wide else "strict"
         return (
@@ -204,7 +204,7 @@ class BlockFlight(FlightTask):
         )
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers of plans and contacts, and statistics of misses, torques and times."""
+        """Return numbers for the summary on plans, contacts, misses, joint errors and torques."""
         planned, miss = np.asarray(rows["planned"]), np.asarray(rows["miss"])
         blocked = np.asarray(rows["blocked"])
         late = np.asarray(rows["time_plan"]) > self.settings.until_set
@@ -234,7 +234,7 @@ class BlockFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences about plans, blocked balls, contacts with obstacles, and torques."""
+        """Return sentences for the report: shares of blocked balls and contacts, and torques."""
         number = summary["num"]
         planned, blocked, touched, after, late = (
             percent(summary[name], number)
@@ -266,11 +266,11 @@ class BlockFlight(FlightTask):
         return lines
 
     def tables(self, rows: Any) -> Sequence[RateTable]:
-        """Return the table of the time budget, and the table of the joints."""
+        """Return two tables: the parts of the balls' flight times, and the joints' errors."""
         return [budget_table(rows), joint_table(rows)]
 
     def draw(self, folder: Path, rows: Any) -> Sequence[str]:
-        """Draw the time budget of the first balls, and return the file name."""
+        """Draw the parts of the first balls' flight times, and return the file name."""
         draw(folder / "budget.png", budget_figure, (8.0, 5.0), rows)
         return ["budget.png"]
 
@@ -280,7 +280,7 @@ def _part(batch: Any, name: str) -> np.ndarray:
 
 
 def _balls(cases: BlockCase, flights: BlockFlights, lanes: np.ndarray) -> np.ndarray:
-    """Return ball positions (F, S, 3) [m] for pictures, in flight and after a bounce."""
+    """Return positions of F balls at S times, (F, S, 3) [m], in flight and after a bounce."""
     case, flown = referee_leaves(cases), flights.flown
     times, met = flown.times, flights.contact[lanes]
     free = np.moveaxis(ball_places(case, times), 0, 2)

@@ -48,36 +48,36 @@ FALL = np.array([0.0, 0.0, 1.0])  # unit vector along the vertical
 
 @dataclasses.dataclass(frozen=True)
 class Throws(FlightCases):
-    """B thrown balls and the arms' states, with NumPy leaves."""
+    """B cases, each a thrown ball and the state of an arm, in NumPy arrays."""
 
-    cases: BlockCase  # the delay is the time for sensing and planning
+    cases: BlockCase  # their field `delay` is the time for sensing and planning
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Parts of the time until a ball enters the inner box, (B,) [s] [Natarajan2024, eq. 1].
+    """Parts of the times (B,) [s] until B balls enter the inner box [Natarajan2024, eq. 1].
 
-    The parts sum up to the ball's time of flight. An arm whose plan takes longer than the planning
-    budget starts late.
+    The inner box stands around the arm. The parts add up to a ball's time of flight. An arm whose
+    plan takes longer than the planning budget starts late.
     """
 
     sense: np.ndarray  # until the ball's flight is known
     plan: np.ndarray  # wall time of planning
     wait: np.ndarray  # from the end of planning until the arm starts
     move: np.ndarray  # duration of the plan's motion
-    # From the end of the motion to the planned contact; negative if the arm is late.
+    # From the end of the motion to the planned contact; negative if the motion ends later.
     stand: np.ndarray
     rest: np.ndarray  # from the planned contact until the ball enters the inner box
 
     @property
     def flight(self) -> np.ndarray:
-        """The time until the ball enters the inner box, (B,) [s]."""
+        """The times (B,) [s] until B balls enter the inner box around the arm."""
         return np.sum([getattr(self, field.name) for field in dataclasses.fields(self)], axis=0)
 
 
 @dataclasses.dataclass(frozen=True)
 class BlockFlights(Flights):
-    """The result of a batch of blocks; leaves with a leading axis B."""
+    """The result of a batch of B thrown balls; arrays have the leading axis B."""
 
     flown: Executed
     budget: Budget
@@ -86,25 +86,25 @@ class BlockFlights(Flights):
     contact_pos: np.ndarray  # (B, 3) [m], ball's centre at the contact; NaN without contact
     # (B,) [m], distance of the ball from the shield's centre, in the shield's plane.
     miss: np.ndarray
-    # (B,) bool, whether the ball touched base or links 1 to 3 before the contact.
+    # (B,) bool, whether the ball touched the arm's base or links 1 to 3 before the contact.
     struck: np.ndarray
     clearance: np.ndarray  # (B,) [m], least clearance up to the contact; negative inside
     nearest: np.ndarray  # (B,) str, link and obstacle at the least clearance
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    # (B,) [m], error of the first fit, perpendicular to the flight; NaN if the flight is known.
+    # (B,) [m], error of the first fit to the observed ball; NaN if its flight is known exactly.
     fit_error: np.ndarray
     last_fit_error: np.ndarray  # (B,) [m], error of the last fit of the ball's flight
 
     @property
     def touched(self) -> np.ndarray:
-        """Mask of the arms that touched an obstacle before the contact, (B,) bool."""
+        """Mask (B,) of the B arms that touched an obstacle before the contact with the ball."""
         return self.clearance < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Mask of the balls blocked by an arm that touched nothing, (B,) bool."""
+        """Mask (B,) of the B balls that were blocked by an arm that touched no obstacle before."""
         return self.blocked & ~self.touched
 
 
@@ -117,13 +117,13 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Draw throws of a suite by `pj.block.draw`."""
+    """Draw throws of a suite by `pj.block.draw`; the keywords are options of `pj.block.case`."""
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
 
 
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
-    """Return the courses of arms: motion, start time, and braking after the motion's end.
+    """Return the courses of arms: joint motion, start time, and braking after the motion.
 
     The motion of a plan starts after the delay. An arm without a plan stands still. Joints brake
     with the acceleration limit of the plans.
@@ -152,7 +152,7 @@ def fly_blocks(
     seconds: np.ndarray | None = None,
     decided: Decided | None = None,
 ) -> BlockFlights:
-    """Plan and execute a batch of blocks, and score them.
+    """Plan and simulate a batch of B arms that block thrown balls, and score them.
 
     Args:
         world: a world with an arm.
@@ -164,7 +164,7 @@ def fly_blocks(
             starts late by the excess. With None, planning takes no time.
         plan: plans of the cases; by default plans are made here.
         seconds: (B,) [s], wall times of the passed plans.
-        decided: motions of arms that plan from observations of their balls, used instead of plans;
+        decided: motions that were planned from observations of the balls, used instead of plans;
             their delays must equal the delays of the cases.
 
     Raises:
@@ -225,35 +225,35 @@ def require_arm(world: World, cases: BlockCase) -> None:
     for (path, value), planned in zip(own, jax.tree.leaves(cases.arm), strict=True):
         name = path[-1].name
         same = np.shape(planned)[1:] == np.shape(value)
-        # Each case has its own start angles, so that the home position may differ.
+        # Joint angles at the start are part of each case, so that the field `home` may differ.
         if name != "home" and not (same and np.allclose(planned, value, rtol=1e-5, atol=1e-6)):
             raise ArgumentError(name, "the same in plan and simulated arm", shown="")
 
 
 def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
-    """Return all leaves of cases (B, ...) in float64 by dotted names, as the referee needs them."""
+    """Return the arrays of a batch of cases in float64, by dotted names such as "ball.pos"."""
     return {name: np.asarray(leaf, float) for name, leaf in leaves_by_name(cases).items()}
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
-    """Return when each ball enters the inner box, (B,) [s]; infinite if it never does."""
+    """Return when B balls enter the box around the arm, (B,) [s]; infinite for never."""
     with np.errstate(invalid="ignore"):  # NaN for balls that never rise as high as the box
         begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
 
 
 def ball_places(case: dict[str, np.ndarray], times: np.ndarray) -> np.ndarray:
-    """Return positions (3, B, S) [m] of balls at times (S,) or (B, S) [s]."""
+    """Return positions (3, B, S) [m] of B balls at S times, (S,) or (B, S) [s]."""
     pos, vel = case["ball.pos"].T[..., None], case["ball.vel"].T[..., None]
     fall = np.multiply.outer(FALL, case["gravity"])[..., None]
     return pos + vel * times - 0.5 * fall * times**2
 
 
 def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -> BlockFlights:
-    """Score simulated motions: which balls are blocked, misses, and clearances from obstacles.
+    """Score B simulated motions: which balls are blocked, misses, and obstacle clearances.
 
     A ball is blocked if it reaches the face of the shield from in front, with its centre over the
-    face. This must happen before its centre is in the inner box and before it touches the arm. The
+    face. This must happen before its centre enters the inner box and before it touches the arm. The
     miss is the distance of a blocked ball from the shield's centre. For other balls the miss is
     this distance where the ball crosses the shield's plane; it is NaN if the ball does not cross
     the plane in time. All computations are in float64.
@@ -317,7 +317,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
 def _strikes(
     case: dict[str, np.ndarray], links: Sequence[int], turns: list, places: list, ball: np.ndarray
 ) -> np.ndarray:
-    """Return whether each ball touches the base or links 1 to 3 in each frame, (B, S) bool.
+    """Return whether B balls touch the arm's base or links 1 to 3 in S frames, (B, S) bool.
 
     The wrist is left out, since its capsules protrude through the shield's face, while the real
     links do not.
@@ -337,7 +337,7 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least clearance (B,) [m] over the included frames, and the nearest obstacle.
+    """Return the least clearances (B,) [m] of B arms in included frames; link and obstacle.
 
     The clearance is infinite if no frame is included.
     """

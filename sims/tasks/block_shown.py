@@ -1,4 +1,4 @@
-"""Pictures and tables of blocks: the scene around the arm, the time budget, and the joints."""
+"""Pictures and tables of blocks: the arm's surroundings, times until contact, and joint errors."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ from planner_jax.task.block.scene import FLOOR, Box, paper_scene
 
 _POLE = 3.0  # [m], height of the drawn pole
 _BARS = 32  # greatest number of balls in the picture of the time budget
-# Descriptions of the times in `Budget`, whose sum is the ball's time of flight.
+# Descriptions of the parts of a ball's time of flight, by the names of fields of `Budget`.
 BUDGET = {
     "sense": "until the ball's flight is known",
     "plan": "wall time of planning",
@@ -31,13 +31,13 @@ def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
 
 
 def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    """Return corners (2, 3) [m] of the box around an axis-aligned beam with two ends (2, 3)."""
+    """Return two opposite corners (2, 3) [m] of the box around an axis-aligned beam."""
     across = radius * (ends[0] == ends[1])
     return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return the parts for drawing: both boxes, the beams, the arm's pedestal and the pole."""
+    """Return what is drawn around the arm: two boxes, beams, the arm's pedestal and the pole."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
@@ -55,7 +55,7 @@ def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
 
 
 def budget_table(rows: Any) -> RateTable:
-    """Make the table of the time budget [Natarajan2024, eq. 1] from the rows of a run."""
+    """Make the table of the parts of the flight times [Natarajan2024, eq. 1], in a run's rows."""
     planned = np.asarray(rows["planned"])
     parts = {name: 1e3 * np.asarray(rows[f"time_{name}"])[planned] for name in BUDGET}
     parts["flight, the sum"] = np.sum(list(parts.values()), axis=0)
@@ -69,7 +69,7 @@ def budget_table(rows: Any) -> RateTable:
 
 
 def joint_table(rows: Any) -> RateTable:
-    """Make the table of joint errors and torques, over all arms that had a plan."""
+    """Make the table of each joint's errors and torques, over all arms that had a plan."""
     planned = np.asarray(rows["planned"])
 
     def of(name: str) -> np.ndarray:

@@ -52,7 +52,7 @@ from planner_jax.task.catch.suites import LAUNCH, draw, earliest_throw
 from planner_jax.task.hit.spec import DRAG  # of hits, since [Yu2023catch] reports none
 
 CATCH_WORLD = World(Quadrotor(PAPER_CATCHER), GRAVITY, mouth=LAUNCH)
-# [s], duration of a throw's flight before its first plan: at least 2 m [Yu2023catch, VII-A].
+# [s], flight time of a ball before the plan for it starts: over 2 m of path [Yu2023catch, VII-A].
 SEEN = 0.3
 _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 
@@ -60,7 +60,7 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Raise the thrust in the guesses of `exact` with decisions; return other planners as is."""
+    """Raise the thrust at catches in first guesses of `exact`; return other planners unchanged."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -69,7 +69,7 @@ def _steadier(
 
 @dataclasses.dataclass(frozen=True)
 class Throws(FlightCases):
-    """B flights of N thrown balls each, with NumPy leaves.
+    """B flights of N thrown balls each, in NumPy arrays.
 
     A ball's own time 0 is the start of the plan for this ball.
     """
@@ -92,13 +92,13 @@ def throws(
     drag_error: float = 0.0,
     robot: QuadrotorModel = PAPER_CATCHER,
 ) -> Throws:
-    """Draw flights of balls of the suite `throws`, which fly with quadratic drag.
+    """Draw B flights, each with N balls of the suite `throws`, which fly with quadratic drag.
 
     Args:
         num: B >= 1, number of flights.
         num_balls: N, number of balls per flight, 1 to 3 in the paper.
         seed: >= 0, of the throws and of the signs of the drag's errors.
-        drag: true drag coefficient K_D [1/m].
+        drag: true drag coefficient K_D [1/m] of all balls.
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a net.
     """
@@ -124,16 +124,16 @@ def throws(
 
 
 class CatchFlights(Flights):
-    """The result of a batch of flights with thrown balls; leaves with a leading axis B."""
+    """The result of B flights with N thrown balls each; arrays have the leading axis B."""
 
     @property
     def caught(self) -> np.ndarray:
-        """Mask of the balls that fell into the net, (B, N) bool."""
+        """Mask (B, N) of the balls that fell into the net, N balls in each of B flights."""
         return np.asarray(self.flown.contact.met)
 
     @property
     def success(self) -> np.ndarray:
-        """Mask of the flights that caught all balls, (B,) bool."""
+        """Mask (B,) of the B flights in which all balls were caught."""
         return np.all(self.caught, axis=1)
 
 
@@ -146,18 +146,18 @@ def fly_catches(
     pilot: CatchPilot | None = None,
     plan: CatchPlan | None = None,
 ) -> CatchFlights:
-    """Plan and fly a batch of flights with thrown balls.
+    """Plan and simulate a batch of flights with thrown balls.
 
-    Whenever a ball comes into sight, its catch and the next, awaited catch are planned without an
-    earlier plan as guess (`plan_ahead`). This plan starts where the last catch of an earlier ball
-    will be made. Inside the loop, all remaining catches are then replanned.
+    Whenever a ball comes into sight, its catch and the catch of the next, still unseen ball are
+    planned without an earlier plan as first guess (`plan_ahead`). This plan starts where the last
+    catch of an earlier ball will be made. From then on the loop replans all remaining catches.
 
     Args:
-        loop: world, sensing, rates and gains.
-        cases: the balls.
+        loop: settings of the closed loop: world, sensing and rates.
+        cases: the thrown balls.
         seed: random seed of the noise, >= 0.
         planner: planner of `plan_ahead`, by default `exact` with greedy decisions.
-        pilot: part of the loop that replans between these plans.
+        pilot: part of the loop that replans remaining catches.
         plan: first plan of each flight, for the first ball; by default it is made here.
 
     Raises:
@@ -238,7 +238,7 @@ class CatchFlight(BallFlightTask):
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor, by default the quadrotor of the paper."""
+        """The model of the quadrotor, by default of [Yu2023catch]."""
         return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:
@@ -264,11 +264,11 @@ class CatchFlight(BallFlightTask):
         )
 
     def parameters(self) -> dict[str, Any]:
-        """Return the settings of the closed loop, and the rate of new decisions."""
+        """Return the loop's settings, and the rate [Hz] of new decisions on order and times."""
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """Return the balls' states at the start of their plans; no ball flies back."""
+        """Return each ball's state at the start of the plan for it, and that no ball flies back."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 

@@ -1,4 +1,4 @@
-"""Plans from scratch, without an earlier plan, for a ball that comes into sight and the next."""
+"""Planning without an earlier plan when a ball comes into sight: its catch and the next catch."""
 
 import dataclasses
 import functools
@@ -38,14 +38,14 @@ LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 @functools.partial(jax.jit, static_argnames="loop")
 def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -> CatchCase:
-    """Return the cases for planning the catches of a new ball and of the next ball.
+    """Return the cases for planning the catches of a newly seen ball and of the next ball.
 
     A plan starts at the last catch of an earlier ball, or now if no such catch is left. Times of
     the case count from the start of the plan.
 
     Args:
         loop: settings of the flights' loop.
-        flights: states of the flights, leaves (B, ...).
+        flights: states of B flights of N balls, leaves (B, ...).
         new: (N,) bool, the balls whose catches are to be planned.
         horizon: (B, N) [s] from now, last time at which each ball may be caught.
     """
@@ -83,7 +83,7 @@ def predict_case(loop: Loop, flights: FlightState, new: Array, horizon: Array) -
 
 
 def until_last_catch(flight: FlightState, new: Array) -> Array:
-    """Return the time () [s] until the last planned catch of a ball that is not `new` (N,).
+    """Return the time [s] until the last planned catch of a ball outside the mask `new`.
 
     The time is 0 if no such catch is left.
     """
@@ -93,15 +93,15 @@ def until_last_catch(flight: FlightState, new: Array) -> Array:
 
 @jax.jit
 def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightState:
-    """Return flights (B, ...) whose plans continue with catches of new balls.
+    """Return B flights whose plans continue with catches of newly seen balls.
 
     If an earlier ball is still to be caught, the new plan is appended to the current plan, after
     the last catch of an earlier ball. Otherwise the new plan replaces the current plan from now on.
 
     Args:
         flights: the flights that were passed to `predict_case`.
-        found: plans (B, ...) of the cases that `predict_case` returned.
-        new: (B, N) bool, the balls that `found` catches.
+        found: plans of the B cases that `predict_case` returned.
+        new: (B, N) bool, which of the N balls `found` catches.
     """
 
     def one(flight: FlightState, found: CatchPlan, new: Array) -> FlightState:
@@ -112,14 +112,14 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
         old, number = flight.plan, new.size
         each = found.trajectory.durations.size // number
         used = jnp.sum(old.trajectory.durations.reshape(number, each), axis=1) > 0.0
-        # Number of catches of the old plan that stay, including past catches. The awaited catch
-        # comes last in the old plan, and the found plan replaces it.
+        # Number of catches of the old plan that stay, including past catches. The last catch of
+        # the old plan, of the ball that was not yet seen, is replaced by the found plan.
         num_kept = jnp.sum(used & ~new[old.order])
         place = jnp.arange(number)
         kept = place < num_kept
 
         def behind(old: Array, found: Array) -> Array:
-            """Return rows (N, ...), one per catch: first of the old plan, then of the new plan."""
+            """Join the rows, one per catch: first of the old plan, then of the found plan."""
             rows = jnp.where(kept, 0, place - num_kept)
             shape = (number, *(1,) * (old.ndim - 1))
             return jnp.where(kept.reshape(shape), old, found[rows])
@@ -151,13 +151,13 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 class _EveryAttempt(Driver):
     """A driver that runs all attempts (settings to try) of a planner concurrently."""
 
-    # A time limit of 0 s, so that a call starts no further attempts.
+    # A time limit of 0 s: no attempt is followed by another attempt in the same call.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
 
     def __call__(
         self, planner: Planner, cases: Any, attempts: Sequence[Attempt] | None = None
     ) -> tuple[Any, Any]:
-        """Return the plans of the first attempt."""
+        """Run all attempts concurrently, and return the plans of the first attempt."""
         if planner.kind is not Kind.COMPILED:
             return super().__call__(planner, cases, attempts)
         make = functools.partial(super().__call__, planner, cases)
@@ -231,7 +231,7 @@ def plan_ahead(
 
 
 def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
-    """Return cases whose limits are replaced by `limits` from `bounds`; unchanged with None."""
+    """Replace limits of cases by `limits`, a result of `bounds`; do nothing if it is None."""
     if limits is None:
         return cases
     leaves = {

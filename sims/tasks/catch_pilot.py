@@ -32,12 +32,12 @@ LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greate
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """The pilot that replans catches from the current plan, and with new orders and times."""
+    """The part of the closed loop that replans catches, with the decided or a new order."""
 
     # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
     # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # Greatest relative violation of a limit by a new plan that is flown. The first value is for the
+    # Greatest relative violation of a limit with which a new plan is flown. The first is for the
     # last catch, the second for several remaining catches. A new plan with a greater violation is
     # flown only if the old plan's violation is at least as large. While several catches are left,
     # most of the violation lies in later catches, which will be planned again. Rejecting the new
@@ -51,17 +51,17 @@ class CatchPilot:
     passage = staticmethod(passage)
 
     def times(self, plan: CatchPlan) -> Array:
-        """Return the planned catch times (N,) [s], in the order of the balls."""
+        """Return the planned catch times of N balls, (N,) [s] since the plan's start."""
         return jnp.zeros_like(plan.times).at[plan.order].set(plan.times)
 
     def plan_shapes(self, cases: CatchCase) -> CatchPlan:
-        """Return the shapes of the plans that this pilot's planner makes of cases (B, ...)."""
+        """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`."""
         return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: CatchCase, plan: CatchPlan, outlook: Outlook
     ) -> Replanning[CatchCase, CatchPlan]:
-        """Return the problem of the remaining catches, while `plan` is flown."""
+        """Return the problem of planning the remaining catches of the current plan, `plan`."""
         made = plan.times <= outlook.elapsed
         first = jnp.argsort(made, stable=True)  # indices of catches, the remaining catches first
         order, times = plan.order[first], plan.times[first] - outlook.elapsed
@@ -79,9 +79,9 @@ class CatchPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[CatchCase, CatchPlan]], CatchPlan], ...]:
-        """Two searches: a short round from the current plan, and a search from scratch.
+        """Two searches: a short search from the current plan, and a search from scratch.
 
-        The search from scratch uses a new decision of order and times.
+        The search from scratch uses newly decided order and times of catches.
         """
         from_last = lambda task: self.planner.solve(task, self.planner.rounds[0])  # noqa: E731
         return (from_last, self._decide_again) if self.redecide > 0.0 else (from_last,)
@@ -92,15 +92,15 @@ class CatchPilot:
         outlook: Outlook,
         found: tuple[CatchPlan, ...],
     ) -> tuple[CatchPlan, Array]:
-        """Return the better of the found plans, and whether it is good enough to be flown.
+        """Return one of the found plans, and whether it replaces the current plan.
 
-        A plan from scratch is better if it exceeds the limits less, or if it is feasible at a
-        clearly lower cost.
+        A plan from scratch is returned if it exceeds the limits less than the other plan, or if it
+        is feasible at a clearly lower cost.
         """
         plan, left = found[0], asked.case
         if self.redecide > 0.0:
             fresh = found[1]
-            # [s], time since a new decision was last due.
+            # [s], time since the last multiple of the period of decisions.
             since = jnp.mod(outlook.time + _INSTANT, 1.0 / self.redecide)
             take = (since < 2.0 * _INSTANT) & (fresh.times[0] >= self.planner.shortest)
             take &= is_worth_flying(fresh, plan)
@@ -119,12 +119,12 @@ class CatchPilot:
 
 
 def is_worth_flying(fresh: CatchPlan, warm: CatchPlan) -> Array:
-    """Return whether a plan from scratch is preferred to a warm-started plan, () bool."""
+    """Return whether the plan `fresh`, from scratch, is preferred to the warm-started plan."""
     return jnp.isfinite(fresh.cost) & is_better(fresh, warm, tolerance=_KEPT, share=_CHEAPER)
 
 
 def tables(balls: BallState, drag: Array, horizon: Array, gravity: Array) -> PathTable:
-    """Predict trajectories with quadratic drag of balls (N, ...) up to horizons (N,) [s]."""
+    """Predict the paths of N balls with quadratic drag, up to times `horizon` (N,) [s]."""
     predict = functools.partial(predict_path, num_nodes=_TABLE_NODES)
     horizon = jnp.maximum(horizon, 0.1)
     return jax.vmap(predict, in_axes=(0, 0, 0, None))(balls, horizon, drag, gravity)

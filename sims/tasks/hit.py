@@ -47,7 +47,7 @@ from planner_jax.task.hit.replan import ReplanHit
 from planner_jax.task.hit.spec import REAL_SCENARIOS
 from planner_jax.task.hit.suites import DEPTH, SERVE_HEIGHT, generate_serves, to_cases
 
-# [s], duration of a serve's flight before its first plan: at least 2 m [Yu2023catch, VII-A].
+# [s], flight time of a serve before its first plan starts: over 2 m of path [Yu2023catch, VII-A].
 SEEN = 0.25
 _AFTER = 0.1  # [s], simulated time after the last planned impact
 _LONGEST = 1.9  # [s], duration of the longest flight of a serve
@@ -58,7 +58,7 @@ _LINE, _THIN = 0.03, 0.002  # [m], width and height of the court's lines
 
 
 def court_parts() -> list[Part]:
-    """Return the court of [Yu2023bat] as flat boxes: its dead zone and the lines of both halves."""
+    """Return the court of [Yu2023bat] as flat boxes: its lines, and the dead zone at the net."""
     length, width = court.HALF_LENGTH, court.HALF_WIDTH
     lines = [((0.0, -width), (0.0, width))]  # the first line is at the net
     for side in (-1.0, 1.0):
@@ -83,17 +83,17 @@ HIT_WORLD = World(
     Quadrotor(PAPER_HITTER),
     GRAVITY,
     scenery=tuple(court_parts()),
-    # Serves start anywhere in a region; the machine is drawn in the middle of the far region.
+    # Serves start at random points of a region; the machine is drawn in the far region's centre.
     mouth=(0.5 * (court.NEAR_LINE + DEPTH), 0.0, SERVE_HEIGHT),
 )
 
 
 def smooth_planner() -> ExactHit:
-    """Return `ExactHit` with a first search of 60 iterations, and drag after the impact.
+    """Return an `ExactHit` whose first search has 60 iterations, with drag after the impact.
 
-    The limits of a plan do not include angular acceleration. After few iterations one plan of 150
-    satisfies the limits but needs more torque than the rotors have, and the ball lands up to 30 cm
-    off. A longer search ends with a smoother plan, which avoids this.
+    The limits of a plan do not include angular acceleration. After few iterations, one plan of 150
+    satisfies the limits but needs more torque than the rotors have, so that the ball misses its
+    target by up to 30 cm. A longer search ends with a smoother plan, which avoids this.
     """
     planner = ExactHit(drag_after_impact=True)
     solver = LbfgsConfig(max_steps=60, tolerance=1e-5, patience=6)
@@ -102,12 +102,12 @@ def smooth_planner() -> ExactHit:
 
 @dataclasses.dataclass(frozen=True)
 class HitPilot:
-    """The pilot that replans a hit from the current plan, called by the loop every period."""
+    """The part of the closed loop that replans a hit from the current plan, every period."""
 
     planner: ReplanHit = ReplanHit(ExactHit(drag_after_impact=True))
     # [s], least time to an impact at which the hit is replanned, since the racket must settle.
     shortest: float = 0.3
-    # Greatest relative violation of a limit by a new plan that is flown.
+    # Greatest relative violation of a limit at which a new plan is flown.
     excess: float = 0.1
     passage = staticmethod(passage)
 
@@ -116,13 +116,13 @@ class HitPilot:
         return plan.stroke.time[None]
 
     def plan_shapes(self, cases: HitCase) -> HitPlan:
-        """Return the shapes of the plans that this pilot's planner makes of cases (B, ...)."""
+        """Return the shapes of the plans of a batch of cases, as `jax.ShapeDtypeStruct`."""
         return shapes_of_plans(self.planner.planner, cases)
 
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """Return the problem with the predicted ball and robot state, while `plan` is flown."""
+        """Return the problem for the predicted ball and robot; `plan` is the current plan."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
@@ -131,13 +131,13 @@ class HitPilot:
 
     @property
     def searches(self) -> tuple[Callable[[Replanning[HitCase, HitPlan]], HitPlan], ...]:
-        """The only search: a short round of the planner from the current plan."""
+        """The only search: a short search of the planner from the current plan."""
         return (lambda task: self.planner.solve(task, self.planner.rounds[0]),)
 
     def choose(
         self, asked: Replanning[HitCase, HitPlan], outlook: Outlook, found: tuple[HitPlan, ...]
     ) -> tuple[HitPlan, Array]:
-        """Return the plan that was found, and whether it is good enough to be flown."""
+        """Return the found plan, and whether it replaces the current plan."""
         (plan,) = found
         left = asked.previous.stroke.time - outlook.elapsed
         good = outlook.present[0] & (left >= self.shortest)
@@ -145,7 +145,7 @@ class HitPilot:
 
 
 def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> HitCase:
-    """Return a case with another ball (leaves (1, 3)), drag (1,) and state of the robot."""
+    """Return the case with another ball, drag coefficient and state of the robot."""
     ball = jax.tree.map(lambda leaf: leaf[0], balls)
     return dataclasses.replace(case, ball=ball, drag=drag[0], head_state=head)
 
@@ -186,14 +186,14 @@ def volleys(
 
 @dataclasses.dataclass(frozen=True)
 class HitFlights(Flights):
-    """The result of a batch of serves; leaves with a leading axis B, one ball (N = 1)."""
+    """The result of a batch of B serves with one ball each; arrays have the leading axis B."""
 
     landing: np.ndarray  # (B, 3) [m], landing point of the returned ball; NaN without a contact
     miss: np.ndarray  # (B,) [m], landing point's distance from the target; inf without a contact
 
     @property
     def success(self) -> np.ndarray:
-        """Mask of the balls that landed near the target, (B,) bool."""
+        """Mask (B,) of the B balls that landed within 0.5 m of the target."""
         return self.miss <= _NEAR
 
 
@@ -205,7 +205,7 @@ def reflect_ball(contact: Contact, restitution: Array) -> BallState:
 
 @functools.partial(jax.jit, static_argnames="loop")
 def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
-    """Return the cases with estimated instead of true balls, at the end of the planning period."""
+    """Return cases with estimated instead of true balls, predicted for the plan's start."""
 
     def one(flight: FlightState, case: HitCase) -> HitCase:
         balls = predict_balls(loop, flight.earlier, loop.period)
@@ -215,7 +215,7 @@ def _predict_cases(loop: Loop, flights: FlightState, truth: HitCase) -> HitCase:
 
 
 def _reflect_balls(contact: Contact, truth: HitCase) -> BallState:
-    """Return balls just after their impacts, NumPy leaves (B, 3); NaN for balls not met."""
+    """Return B balls just after their impacts, arrays (B, 3); NaN for balls that were missed."""
     one = jax.tree.map(lambda leaf: leaf[:, 0], contact)
     balls = jax.device_get(jax.vmap(reflect_ball)(one, truth.restitution))
     return jax.tree.map(lambda leaf: np.where(np.asarray(one.met)[:, None], leaf, np.nan), balls)
@@ -230,18 +230,18 @@ def fly_hits(
     pilot: HitPilot | None = None,
     plan: HitPlan | None = None,
 ) -> HitFlights:
-    """Plan and fly a batch of serves.
+    """Plan and simulate a batch of flights, each with one served ball.
 
     Args:
-        loop: world, sensing, rates and gains.
+        loop: settings of the closed loop: world, sensing and rates.
         cases: the serves.
         seed: random seed of the noise, >= 0.
         planner: planner of the first plan, by default `smooth_planner()`.
-        pilot: part of the loop that replans after the first plan.
+        pilot: part of the loop that replans after the first plan starts.
         plan: first plan of each flight; by default it is made here.
 
     Raises:
-        ValueError: a world or plan does not match the cases.
+        ValueError: the world or a plan does not match the cases.
     """
     planner, pilot = planner or smooth_planner(), pilot or HitPilot()
     truth = cases.cases
@@ -261,8 +261,8 @@ def fly_hits(
     first = jax.block_until_ready(plan_all(planner, known)) if plan is None else plan
     planning = time.perf_counter() - clock
     require_plan(first, HitPlan, known.head_state)
-    # The plan is copied through the host. Otherwise the arrays of the first period would be
-    # committed to a device and those of later periods not, and the programs would compile twice.
+    # The plan is copied through the host. Otherwise its arrays would be committed to a device, the
+    # arrays of later plans would not, and JAX would compile the programs twice.
     begun = jax.tree.map(jnp.asarray, jax.device_get(first))
     flight = dataclasses.replace(flight, plan=begun, began=flight.time, present=flight.launched)
     periods = loop.num_periods(_LONGEST - SEEN + _AFTER)
@@ -295,7 +295,7 @@ class HitFlight(BallFlightTask):
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor, by default the quadrotor of the paper."""
+        """The model of the quadrotor, by default of [Yu2023bat]."""
         return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:
@@ -330,7 +330,7 @@ class HitFlight(BallFlightTask):
         return self.settings.suite
 
     def counts(self, rows: Any) -> dict[str, int]:
-        """Return how many balls were hit, and how many landed within 1 m of the target."""
+        """Return the number of hit balls, and the number that landed within 1 m of the target."""
         miss, met = np.asarray(rows["miss"]), np.asarray(rows["met"])
         return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
 

@@ -57,7 +57,7 @@ _POINTS = 9  # number of points of a predicted path in a recording
 
 @dataclasses.dataclass(frozen=True)
 class Meetings(FlightCases):
-    """B interceptions and their observations, with NumPy leaves."""
+    """B cases of interceptions, with observations of targets and obstacles, in NumPy arrays."""
 
     cases: InterceptCase  # the true cases
     times: np.ndarray  # (B, L) [s], times of the observations
@@ -113,23 +113,23 @@ def meetings(
 def predict_scene(
     loop: DriveLoop, meetings: Meetings, now: Array, *, known_target: bool, predict_movers: bool
 ) -> tuple[TurningPath, Obstacles]:
-    """Predict targets and moving obstacles; times of the predictions count from `now`.
+    """Predict targets and moving obstacles of B cases; predicted times count from `now`.
 
-    Predicted movers are enlarged by `_CAUTION` standard deviations of their position.
+    Predicted obstacles are enlarged by two standard deviations of their position.
 
     Args:
         loop: settings of the loop, with the sensing.
         meetings: leaves (B, ...).
         now: () [s], time since the start of the first plan.
         known_target: whether the targets' paths are known (static).
-        predict_movers: whether movers are predicted from observations (static).
+        predict_movers: whether moving obstacles are predicted from observations (static).
     """
     sensing = loop.sensing
     noise = max(sensing.target_std, _LEAST_STD)
 
     def one(meeting: Meetings) -> tuple[TurningPath, Obstacles]:
         case = meeting.cases
-        # Observations before the start have all arrived; later ones arrive one latency late.
+        # Observations before the start have all arrived; later observations arrive late.
         shown = (meeting.times <= 0.0) | (meeting.times + sensing.latency <= now + 1e-4)
         times, weights = meeting.times - now, shown.astype(now.dtype)
         if known_target:
@@ -144,7 +144,7 @@ def predict_scene(
             return target, dataclasses.replace(movers, centre=centre)
         fit = lambda seen: fit_polynomial(times, seen, 1, weights).at(0.0 * now)  # noqa: E731
         state = jax.vmap(fit, in_axes=1)(meeting.movers)
-        # Standard deviation of a fitted line's position now, from the noise of an observation.
+        # Standard deviation of a fitted line's current position, from the noise of observations.
         number = jnp.sum(weights)
         middle = jnp.sum(weights * times) / number
         spread = jnp.sum(weights * (times - middle) ** 2)
@@ -168,7 +168,7 @@ def remaining(
     speed: Array,
     curvature: Array,
 ) -> InterceptCase:
-    """Return the cases (B, ...) that remain after a part of their drive.
+    """Return the cases of B drives that remain to be planned after a part of the drives.
 
     Args:
         cases: the cases at their start.
@@ -193,7 +193,7 @@ def remaining(
 
 @dataclasses.dataclass(frozen=True)
 class Driven:
-    """The result of a batch of drives, on the host; leaves with a leading axis B."""
+    """The result of a batch of B drives, on the host; arrays have the leading axis B."""
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
     poses: np.ndarray  # (B, S, 3), x, y [m] of the rear axle's centre and heading [rad]
@@ -207,7 +207,7 @@ class Driven:
 
 @dataclasses.dataclass(frozen=True)
 class InterceptFlights(Flights):
-    """The result of a batch of interceptions; leaves with a leading axis B."""
+    """The result of a batch of B interceptions; arrays have the leading axis B."""
 
     flown: Driven
     miss: np.ndarray  # (B,) [m], distance from the body's centre to the true target at the end
@@ -217,12 +217,12 @@ class InterceptFlights(Flights):
 
     @property
     def touched(self) -> np.ndarray:
-        """Mask of the cars that touched an obstacle, (B,) bool."""
+        """Mask (B,) of the B cars that touched an obstacle."""
         return np.minimum(self.wall_clearance, self.mover_clearance) < -TOUCH
 
     @property
     def success(self) -> np.ndarray:
-        """Mask of the cars that met their target and touched nothing, (B,) bool."""
+        """Mask (B,) of the B cars that came within 0.3 m of the target and touched no obstacle."""
         return (self.miss <= SUCCESS) & ~self.touched
 
 
@@ -237,7 +237,7 @@ def fly_intercepts(
     known_target: bool = False,
     predict_movers: bool = False,
 ) -> InterceptFlights:
-    """Plan and drive a batch of interceptions, with replanning at a rate.
+    """Plan and simulate a batch of interceptions, with replanning at a rate.
 
     A new plan starts at the car's estimated pose. It replaces the old plan if it satisfies every
     limit.
@@ -250,7 +250,7 @@ def fly_intercepts(
         planner: planner of all plans, by default `spacetime`.
         plan: first plan of each drive; by default it is made here.
         known_target: whether the targets' paths are known instead of predicted.
-        predict_movers: whether movers are predicted from observations instead of known.
+        predict_movers: whether moving obstacles are predicted from observations instead of known.
 
     Raises:
         ValueError: `replan` does not divide the rate of the frames, or the cases' car is not the
@@ -300,7 +300,7 @@ def plan_again(
     Args:
         loop: settings of the drives' loop.
         planner: planner of the remaining cases.
-        drive: states of the drives, leaves (B, ...).
+        drive: states of the B drives, leaves (B, ...).
         begun: the cases of the current plans, at the start of those plans.
         target: predicted paths of the targets, with times that count from now.
         movers: predicted moving obstacles at their current positions.
@@ -329,7 +329,7 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Return drives and cases in which found plans replace old plans where `good` (B,)."""
+    """Return drives and cases; `found` replaces the old plan of drives in the mask `good`."""
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -340,7 +340,7 @@ def _replace_plans(
 
 @jax.jit
 def _sample_paths(path: TurningPath, span: Array) -> Array:
-    """Return M equally spaced points (B, M, 2) [m] of each path from now to a time (B,) [s]."""
+    """Return equally spaced points of paths from now to a time `span` [s], (paths, points, 2)."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
@@ -377,7 +377,7 @@ def score(
     """Score drives against the true targets and obstacles in float64: misses and clearances.
 
     Args:
-        cases: the true cases, leaves (B, ...).
+        cases: the true cases of B drives, leaves (B, ...).
         first: the first plans.
         flown: the drives.
         planning_seconds: wall time of planning.
@@ -415,7 +415,7 @@ def score(
 
 
 def _group(obstacles: Obstacles) -> dict[str, np.ndarray]:
-    """Convert obstacles to the arrays that the referee's `clearances` takes; zero if absent."""
+    """Return obstacles as arrays for the referee's `clearances`; absent obstacles become zero."""
     present = np.asarray(obstacles.present)
     leaves = {name: np.asarray(getattr(obstacles, name), float) for name in ("centre", "velocity")}
     leaves["corners"] = np.asarray(obstacles.corners, float)

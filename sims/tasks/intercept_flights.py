@@ -1,4 +1,4 @@
-"""Runs of interceptions by `planner-jax fly intercept`: rows, recordings and findings."""
+"""Runs of `planner-jax fly intercept`: the table of results, recordings and report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -79,7 +79,7 @@ class InterceptFlight(FlightTask):
         return DriveLoop(self.world(), self.settings.sensing)
 
     def parameters(self) -> dict[str, Any]:
-        """Return the settings of the closed loop as plain values for the manifest."""
+        """Return the settings of the closed loop as plain values for the run's manifest."""
         return dataclasses.asdict(self.loop())
 
     def cases(self) -> Meetings:
@@ -95,7 +95,7 @@ class InterceptFlight(FlightTask):
         )
 
     def fly(self, cases: Meetings, record: bool) -> InterceptFlights:
-        """Plan and drive some interceptions; the result always includes a record."""
+        """Plan and simulate some interceptions; the result always includes all motions."""
         settings = self.settings
         return fly_intercepts(
             self.loop(),
@@ -110,7 +110,7 @@ class InterceptFlight(FlightTask):
     def recording(
         self, cases: Meetings, flights: InterceptFlights, lanes: Sequence[int] | np.ndarray
     ) -> Recording:
-        """Return the recording of some of the drives, as in `FlightTask`."""
+        """Return a recording of the drives whose indices in the batch are `lanes`."""
         some, flown = cases[np.asarray(lanes)], flights.flown
         kept = np.arange(0, flown.times.size, _KEPT)
         times = np.tile(flown.times[kept], (len(some), 1))
@@ -172,7 +172,7 @@ class InterceptFlight(FlightTask):
         return found
 
     def reachable(self, index: int) -> Sequence[tuple[float, np.ndarray]]:
-        """Return the cells that a drive's car could reach, for each time layer of the planner."""
+        """Return times [s], each with the P points (P, 2) [m] where the car could be then."""
         return reach_layers(jax.tree.map(jnp.asarray, self._case(index)))
 
     def _case(self, index: int) -> InterceptCase:
@@ -181,7 +181,7 @@ class InterceptFlight(FlightTask):
         return jax.tree.map(lambda leaf: np.asarray(leaf)[0], one)
 
     def counts(self, rows: Any) -> dict[str, Any]:
-        """Return numbers of meetings and contacts, and the saturation of drive and steering."""
+        """Return numbers for the summary: meetings, contacts, and times of saturated actuators."""
         miss = np.asarray(rows["miss"])
         wall, mover = (np.asarray(rows[f"{name}_clearance"]) < -TOUCH for name in ("wall", "mover"))
         return {
@@ -196,7 +196,7 @@ class InterceptFlight(FlightTask):
         }
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return sentences about misses, contacts and saturation of the drives."""
+        """Return sentences for the report: shares of misses, contacts and saturated actuators."""
         number = summary["num"]
         near, success, far = (
             percent(summary[f"within_{width:g}_m"], number) for width in (NEAR, SUCCESS, FAR)
@@ -216,13 +216,13 @@ def _get_drives(batch: Any) -> Driven:
 
 
 def _add_height(points: np.ndarray, height: float) -> np.ndarray:
-    """Return points of the plane (..., 2) as points (..., 3) [m] at a height [m]."""
+    """Append a height [m] to points (..., 2) [m] of the plane; NaN points get a height of NaN."""
     high = np.where(np.isfinite(points[..., :1]), height, np.nan)
     return np.concatenate([points, high], axis=-1)
 
 
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
-    """Return where the car of one case could be: times [s] and positions (P, 2) [m] of cells."""
+    """Return times [s], each with the P cells, as points (P, 2) [m], where the car could be."""
     search = SEARCHES["given"][0]
     found = jax.device_get(
         jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)

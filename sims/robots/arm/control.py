@@ -26,7 +26,7 @@ class Gains:
 
 @struct.dataclass
 class Course:
-    """A motion of the joints, its start time, and how the joints brake after its end."""
+    """A motion of six joints with its start time, and how the joints brake after its end."""
 
     motion: PiecewisePolynomial  # (M, D + 1, 6) [rad]
     begin: Array  # () [s], start time of the motion
@@ -53,8 +53,8 @@ class JointReference:
 def reference_at(course: Course, time: Array) -> JointReference:
     """Return the planned state of the joints at a time () [s] of a course.
 
-    Before the start each joint moves at its initial rate, which is mostly zero. After the end each
-    joint brakes at a constant deceleration, and then stands still.
+    Before the motion starts, each joint moves at its initial rate, which is mostly zero. After the
+    motion's end each joint brakes at a constant deceleration, and then stands still.
     """
     motion = course.motion
     elapsed, end = time - course.begin, total_duration(motion)
@@ -75,7 +75,7 @@ def reference_at(course: Course, time: Array) -> JointReference:
 def control(
     state: JointState, reference: JointReference, arm: Arm, gains: Gains, gravity: float
 ) -> Array:
-    """Return commanded torques (6,) [N m]; `arm` is the controller's model of the arm."""
+    """Return the commanded joint torques (6,) [N m]; `arm` is the controller's arm model."""
     angle_error, rate_error = reference.angles - state.angles, reference.rates - state.rates
     wanted = (
         reference.accelerations

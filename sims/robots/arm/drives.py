@@ -8,9 +8,9 @@ import dataclasses
 from planner_jax.core.errors import ArgumentError
 
 # [N m], torque limits of the six joints of an IRB 1600-6/1.2. They are an assumption, since its
-# maker publishes no torques. Plans with the greatest accelerations of all regimes, 60 rad/s^2, need
-# hardly more in joints 1 to 3. The wrist never needs these torques, because neither the motors'
-# rotors nor the shield have a mass in the model.
+# maker publishes no torques. Plans with accelerations up to 60 rad/s^2, the greatest limit of
+# the block task, need hardly more in joints 1 to 3. The wrist never needs its torques, because
+# neither the motors' rotors nor the shield have a mass in the model.
 TORQUES = (700.0, 700.0, 250.0, 10.0, 5.0, 2.0)
 
 
@@ -41,6 +41,6 @@ class Drives:
 
 
 IDEAL = Drives()  # drives and encoders without errors; only the torques are limited
-# Standard deviations of measured angles [rad] and rates [rad/s]. Both presets are assumptions:
+# Presets of the standard deviations of measured angles [rad] and rates [rad/s], all assumptions:
 # "fine" is an encoder of 16 bits per turn behind a gear, "coarse" a joint with play in its gear.
 ENCODERS = {"none": (0.0, 0.0), "fine": (1e-4, 0.01), "coarse": (1e-3, 0.1)}

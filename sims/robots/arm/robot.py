@@ -44,7 +44,7 @@ def _arm(xml: str) -> Any:
 
 
 def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
-    """Return one arm as a batch of one, with the leaf names of the referee's kinematics."""
+    """Return one arm as a batch of one, in arrays that the referee's kinematics accepts."""
     names = ("origin", "turn", "axis", "shield_centre")
     return {f"arm.{name}": np.asarray(getattr(arm, name), float)[None] for name in names}
 
@@ -71,7 +71,7 @@ class ShieldArm:
         return _arm(self.xml)
 
     def mjcf(self) -> tuple[str, str]:
-        """Return MJCF of the links with capsules and shield, and of one motor per joint."""
+        """Return two texts in MJCF, MuJoCo's format: the links with the shield, and the motors."""
         arm = self.arm
         solids = {k: [] for k in range(-1, 6)}
         for link, ends, radius in zip(
@@ -118,7 +118,7 @@ class ShieldArm:
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command as joint torques (6,) [N m], and zero extra forces."""
+        """Return the command unchanged, as joint torques (6,) [N m], and zero extra forces."""
         return command, jnp.zeros_like(command)
 
     def state(self, physics: Physics) -> JointState:
@@ -137,10 +137,11 @@ class ShieldArm:
         return JointState(angles=state.angles + errors[0], rates=state.rates + errors[1])
 
     def references(self, plan: Course, times: Array, world: World) -> JointReference:
-        """Return the references of the joints at times (K,) [s]; leaves (K, ...).
+        """Return the references (planned joint states) at K times (K,) [s]; leaves (K, ...).
 
-        MuJoCo's stored rates belong to half a step before the angles, and a torque acts until one
-        step later. The references are shifted by these times.
+        MuJoCo's stored rates belong to half a step before the angles, and a torque acts during the
+        next step. Reference rates are shifted by half a step back, accelerations by half a step
+        ahead.
         """
         half = 0.5 * world.timestep
 
@@ -154,7 +155,7 @@ class ShieldArm:
     def command(
         self, state: JointState, reference: JointReference, world: World, mass_error: Any = 0.0
     ) -> Array:
-        """Return torques (6,) [N m] of a controller whose masses have a relative error."""
+        """Return the torques (6,) [N m] of the controller, whose masses have a relative error."""
         dtype = state.angles.dtype
         arm = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), self.arm)
         factor = 1.0 + mass_error
@@ -183,7 +184,7 @@ class ShieldArm:
         ]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return positions [m] and quaternions, w x y z, of base, links and shield at a pose."""
+        """Return positions [m] and quaternions w x y z of base, links and shield at a pose."""
         turns, places = links_of(lanes_of(self.arm), np.reshape(pose, (6, 1, 1)))
         base = np.array([0.0, 0.0, self.base_height])
         found = [(base, np.array([1.0, 0.0, 0.0, 0.0]))]

@@ -2,8 +2,8 @@
 
 Lateral feedback is a linear-quadratic regulator over distance instead of time. Per metre, the
 lateral error e and the heading error psi obey e' = psi and psi' = (extra curvature). The gains
-minimise the integral of (e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2 over distance.
-These gains do not depend on the speed, so that the feedback per second grows with the speed.
+minimise the integral over distance of (e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2,
+with the weights `reach`, `turn` and `bend` of `Gains`. They do not depend on the speed.
 """
 
 import dataclasses
@@ -19,7 +19,7 @@ from planner_jax.sims.robots.car.vehicle import Vehicle
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """Weights of the lateral regulator, and gains along the path; static under jit."""
+    """Gains of the car's tracking control, across and along the path; static under `jax.jit`."""
 
     reach: float = 0.05  # [m], lateral error that adds 1 to the regulator's cost
     turn: float = 0.15  # [rad], heading error that adds 1 to the regulator's cost
@@ -45,7 +45,7 @@ class CarState:
 
 @struct.dataclass
 class Reference:
-    """The planned motion of the car at one instant, with inputs advanced by the lags."""
+    """The planned state of the car at one instant, with inputs planned for one lag later."""
 
     pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
@@ -56,7 +56,7 @@ class Reference:
 
 
 def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
-    """Return the plan at a time () [s] since its start, with inputs advanced by the actuator lags.
+    """Return the planned state at a time [s] since the plan's start, with inputs of one lag later.
 
     A first-order lag delays a ramp by exactly its time constant. Inputs that are taken from one lag
     ahead therefore arrive in time, as long as they change slowly.
@@ -77,7 +77,7 @@ def reference_at(plan: CarPlan, time: Array, vehicle: Vehicle) -> Reference:
 
 
 def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gains) -> Array:
-    """Return the command (2,): drive force [N] and steering angle [rad], for one reference."""
+    """Return drive force [N] and steering angle [rad], (2,), that track a planned state."""
     cos, sin = jnp.cos(reference.heading), jnp.sin(reference.heading)
     away = state.pose[:2] - reference.pos
     along, across = cos * away[0] + sin * away[1], cos * away[1] - sin * away[0]
@@ -87,8 +87,8 @@ def control(state: CarState, reference: Reference, vehicle: Vehicle, gains: Gain
     curvature = reference.curvature - per_place * across - per_heading * off
     speed_error = reference.speed - state.speed
     wanted = reference.acceleration - gains.place * along + gains.speed * speed_error
-    # Rotation adds to the effective mass: at curvature k the mass is m + turning k^2, since the
-    # kinetic energy is (m + turning k^2) v^2 / 2.
+    # Rotation adds to the effective mass. With mass m, speed v, path curvature k, and yaw inertia I
+    # about the rear axle, the kinetic energy is (m + I k^2) v^2 / 2.
     turning = vehicle.yaw_inertia + vehicle.mass * vehicle.mass_ahead**2
     bent = jnp.tan(state.steering) / vehicle.wheelbase
     mass = vehicle.mass + turning * bent**2

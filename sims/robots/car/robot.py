@@ -40,7 +40,7 @@ class Car:
     noise_shape: ClassVar[tuple[int, ...]] = (3,)
 
     def mjcf(self) -> tuple[str, str]:
-        """Return MJCF of the body with its wheels, and of the actuators of drive and steering."""
+        """Return two MJCF texts: the body with wheels, and the actuators of drive and steering."""
         vehicle = self.vehicle
         middle = 0.5 * vehicle.length - vehicle.rear_overhang
         body = np.array([0.5 * vehicle.length, 0.5 * vehicle.width, 0.5 * _HEIGHT])
@@ -77,7 +77,7 @@ class Car:
         return np.array([(x, y, vehicle.wheel_radius) for x, y in ends])
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at standstill with the rear axle at (3,) [m] and the heading along x."""
+        """Return the state at standstill with the rear axle at `place` (3,) [m] and heading 0."""
         none = jnp.zeros(3, place.dtype)
         return none.at[:2].set(place[:2]), none, none[:2]
 
@@ -135,7 +135,7 @@ class Car:
         )
 
     def sense(self, state: CarState, noise: Array, stds: Any) -> CarState:
-        """Return the car's state with errors in the pose.
+        """Return the car's estimated state: the true state plus random errors in the pose.
 
         Args:
             state: the true state.
@@ -146,7 +146,7 @@ class Car:
         return dataclasses.replace(state, pose=state.pose + errors)
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """Return the references at times (K,) [s] since the start of a plan; leaves (K, ...)."""
+        """Return the references (planned states) at K times [s] since the start of a plan."""
         return jax.vmap(lambda time: reference_at(plan, time, self.vehicle))(times)
 
     def command(self, state: CarState, reference: Reference, world: World) -> Array:
@@ -154,7 +154,7 @@ class Car:
         return control(state, reference, self.vehicle, self.gains)
 
     def shapes(self) -> list[Shape]:
-        """Return the part for drawing: the body as a box, with its wheels."""
+        """Return the only part for drawing: the body as a box, with its wheels."""
         vehicle = self.vehicle
         low, high = -vehicle.rear_overhang, vehicle.length - vehicle.rear_overhang
         half = 0.5 * vehicle.width
@@ -170,14 +170,14 @@ class Car:
         return [Shape([*wheels, *corners, bottom, top], [], tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and quaternion, w x y z, of the only shape at a pose (3,)."""
+        """Return position [m] and quaternion w x y z of the only drawn shape at a pose (3,)."""
         half = 0.5 * pose[2]
         return [
             (np.append(pose[:2], 0.0), np.array([np.cos(half), 0.0, 0.0, np.sin(half)])),
         ]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
-        """Return the rear axle's centre on the ground, (..., 3) [m], at poses (..., 3)."""
+        """Return the points (..., 3) [m] on the ground below the rear axle, at poses (..., 3)."""
         return np.concatenate([poses[..., :2], 0.0 * poses[..., :1]], axis=-1)
 
     def find_held_ball(self, pose: np.ndarray) -> np.ndarray:

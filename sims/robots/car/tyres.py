@@ -20,10 +20,10 @@ def tyre_forces(
 ) -> Array:
     """Return generalised forces (3,) [N, N, N m] of both axles on the rear axle's centre.
 
-    The unknowns are the lateral forces f of the axles. Let M be the mass matrix, F all other
-    forces, and J the rows that map a velocity to the axles' lateral velocities. The velocity after
-    a step of length h is v_after = v + h M^-1 (F + J' f). A tyre of stiffness c at speed u exerts
-    f = -(c / u) J v_after.
+    The unknowns are the lateral forces f of the axles. Let v be the velocity, M the mass matrix, F
+    the sum of other forces, and J the matrix that maps a velocity to the axles' lateral velocities.
+    After a step of length h, v_after = v + h M^-1 (F + J' f). A tyre of stiffness c at speed u
+    exerts f = -(c / u) J v_after.
 
     Args:
         vehicle: the car with its tyres.
@@ -35,7 +35,7 @@ def tyre_forces(
     """
     dtype, b = vel.dtype, vehicle.mass_ahead
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    # In the body frame M couples lateral motion and yaw by its only off-diagonal entries, m b.
+    # The mass matrix in the body frame; b is the distance of the centre of mass from the rear axle.
     coupling, turning = vehicle.mass * b, vehicle.yaw_inertia + vehicle.mass * b**2
     determinant = vehicle.mass * turning - coupling**2
     inverse = np.array(

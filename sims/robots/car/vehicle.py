@@ -14,7 +14,7 @@ GRAVITY = 9.81  # [m/s^2]
 
 @dataclasses.dataclass(frozen=True)
 class Tyres:
-    """Lateral forces of both axles, proportional to the slip angle up to the friction limit.
+    """Parameters of the tyres: lateral force is proportional to slip angle, up to a limit.
 
     The numbers are assumptions for hard rubber on a smooth floor.
     """

@@ -1,8 +1,8 @@
 """Cascaded SE(3) control by differential flatness and the Hopf fibration.
 
 The cascade follows [Yu2023bat, Section VI-C] and [Yu2023catch, Section VII-A]. Feedback of position
-and velocity, with the plan's acceleration and jerk as feedforward, gives the desired thrust. At
-zero heading, thrust and jerk determine the desired attitude and body rate [Watterson2020]. The
+and velocity, with the plan's acceleration and jerk as feedforward, gives the desired thrust. With
+the heading zero, thrust and jerk determine the desired attitude and body rate [Watterson2020]. The
 attitude error corrects the body rate. The error of the body rate gives a torque. Feedforward
 commands are taken from ahead in time, to compensate the rotors' lag.
 
@@ -25,7 +25,7 @@ from planner_jax.sims.robots.quadrotor.reference import Reference
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """All gains of the controller's cascade; static under jit.
+    """All gains of the quadrotor's cascaded controller; static under `jax.jit`.
 
     With a rotor lag of 20 ms the loops are not well separated: a velocity gain that damps the
     position loop alone excites the attitude. With these gains every mode of the cascade has a
@@ -39,8 +39,8 @@ class Gains:
     rate: float = 32.0  # [1/s], angular acceleration per body rate error
     share: float = 0.3  # greatest feedback acceleration, as a fraction of the plan's thrust
     correction: float = 10.0  # [rad/s], greatest body rate that corrects an attitude error
-    # Greatest increase of a rotor's thrust in favour of a torque, divided by the rotor's greatest
-    # thrust. The value is 1 N for the quadrotors of the papers.
+    # Greatest increase of a rotor's thrust that serves to produce a torque, divided by the rotor's
+    # greatest thrust. The value is 1 N for the quadrotors of the papers.
     spare: float = 1.0 / 11.8
 
 
@@ -70,11 +70,11 @@ def rotation_error(R: Array, R_wanted: Array) -> Array:
 def control(
     state: RobotState, reference: Reference, model: QuadrotorModel, gains: Gains, world: World
 ) -> Array:
-    """Return rotor thrusts (4,) [N] that track a reference; pure, for one quadrotor.
+    """Return rotor thrusts (4,) [N] that track a planned state, for one quadrotor.
 
     Args:
         state: estimated state of the quadrotor.
-        reference: the reference to track.
+        reference: the planned state, with additions that compensate rotor lag.
         model: parameters of the quadrotor.
         gains: gains of the cascade.
         world: gravity and time step.

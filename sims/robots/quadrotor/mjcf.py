@@ -15,7 +15,7 @@ _SKEW = 0.02  # greatest allowed (product of inertia) / (greatest moment of iner
 
 
 def describe_mjcf(path: Path) -> dict[str, Value]:
-    """Read the quadrotor of an MJCF file; return it in the fields of a YAML file, in SI units.
+    """Read a quadrotor from an MJCF file; return it as the fields of a YAML robot file.
 
     Mass and inertia are the sums of all bodies below the only free joint, about their centre of
     mass. A rotor is an actuator on a site whose `gear` has a force along z and a torque about z.
@@ -106,7 +106,10 @@ def _rotor(
 
 
 def _rotors(path: Path, rotors: list[dict[str, Value]]) -> dict[str, Value]:
-    """Return the YAML field `rotors`: counter-clockwise, first a rotor of positive drag torque."""
+    """Return the field `rotors` of a robot file, with the rotors in counter-clockwise order.
+
+    The first rotor is one whose drag torque is positive.
+    """
     rotors = sorted(rotors, key=lambda rotor: np.arctan2(*rotor["place"][::-1]) % 6.28)
     if rotors[0]["ratio"] < 0.0:
         rotors = [*rotors[1:], rotors[0]]

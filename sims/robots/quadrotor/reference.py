@@ -34,13 +34,13 @@ class Reference:
 def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
     """Return the trajectory with one more piece, which brakes to standstill after its end.
 
-    The piece is the polynomial of degree 7 from the last state to standstill. Its end point is
-    where a constant deceleration would stop, but at a height of at least half a metre.
+    The piece is the polynomial of degree 7 from the last state to standstill. It ends where a
+    constant deceleration would stop the quadrotor, but at least half a metre above the ground.
     """
     coeffs = trajectory.coeffs
     missing = 8 - coeffs.shape[1]
     coeffs = jnp.pad(coeffs, ((0, 0), (0, missing), (0, 0)))
-    # The pieces of the trajectory for absent balls come last and have zero duration.
+    # Pieces for balls that are absent come last and have zero duration.
     last = jnp.max(jnp.where(trajectory.durations > 0.0, jnp.arange(coeffs.shape[0]), 0))
     piece = PiecewisePolynomial(coeffs[last][None], trajectory.durations[last][None])
     unit = jnp.asarray([_BRAKING**k for k in range(8)], coeffs.dtype)[:, None]
@@ -69,14 +69,14 @@ def with_rest(trajectory: PiecewisePolynomial) -> PiecewisePolynomial:
 def reference_at(
     trajectory: PiecewisePolynomial, time: Array, lag: float, world: World
 ) -> Reference:
-    """Return the plan at a time () [s], with additions that compensate a rotor lag [s]."""
+    """Return the planned motion at a time, with command additions that compensate rotor lag."""
     gravity = jnp.asarray(world.gravity, time.dtype)
     order = lambda k, at: evaluate(trajectory, at, k)  # noqa: E731
     pos, vel, acc, jerk = (order(k, time) for k in range(4))
     step = 2.0 * world.timestep
-    # A command changes the thrust in the next step. The force of this step acts around the start of
-    # the step, because MuJoCo's Euler integrator is a leapfrog. During the step the thrust changes
-    # too, on average by half of its change. Commands are therefore taken from half a step ahead.
+    # MuJoCo's Euler integrator is a leapfrog: a step's force acts around the start of the step. A
+    # command changes the thrust gradually during the step, on average by half of the change.
+    # Commands are therefore taken from the plan half a step ahead.
     ahead = time + 0.5 * world.timestep
 
     def flat(at: Array) -> tuple[Array, Array]:
@@ -85,7 +85,7 @@ def reference_at(
         return size, flat_attitude(acc_then, order(3, at), gravity)[1]
 
     (less, before), (size, rate), (more, after) = (flat(ahead + k * step) for k in (-1, 0, 1))
-    # The inverse of a first-order lag is the value plus `lag` times its rate of change.
+    # To invert a first-order lag, `lag` times the rate of change is added to the desired value.
     growth = (more - less) / (2.0 * step)
     angular_acc = (after - before) / (2.0 * step)
     angular_jerk = (after - 2.0 * rate + before) / step**2

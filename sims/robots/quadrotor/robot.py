@@ -41,7 +41,7 @@ class Quadrotor:
         return self.model.tool
 
     def mjcf(self) -> tuple[str, str]:
-        """Return MJCF of the body with rotors and tool, and of the motors."""
+        """Return two texts in MJCF, MuJoCo's format: the body with rotors and tool, and motors."""
         model, rotors = self.model, self.model.rotors
         discs = "".join(
             f'<site name="rotor{i}" pos="{xml_numbers(*place)}"/>'
@@ -82,7 +82,7 @@ class Quadrotor:
         return plate + ring
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return `qpos`, `qvel` and `act` of a hover at (3,) [m], with rotors at steady thrust."""
+        """Return `qpos`, `qvel` and `act` (rotor thrusts) of a hover at `place` (3,) [m]."""
         upright = jnp.array([1.0, 0.0, 0.0, 0.0], place.dtype)
         lift = self.model.mass * gravity * self.model.rotors.shares
         return (
@@ -92,7 +92,7 @@ class Quadrotor:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the command as rotor thrusts (4,) [N], and zero extra forces."""
+        """Return the command unchanged, as rotor thrusts (4,) [N], and zero extra forces."""
         return command, jnp.zeros(self.num_vel, command.dtype)
 
     def state(self, physics: Physics) -> RobotState:
@@ -101,7 +101,7 @@ class Quadrotor:
         return RobotState(pos=qpos[:3], vel=qvel[:3], quat_wxyz=qpos[3:7], rate=qvel[3:6])
 
     def sense(self, state: RobotState, noise: Array, stds: tuple[float, ...]) -> RobotState:
-        """Return the quadrotor's state with errors of some standard deviations.
+        """Return the quadrotor's estimated state: the true state plus random errors.
 
         Args:
             state: the true state.
@@ -128,17 +128,17 @@ class Quadrotor:
     def head_state(self, plan: Any, time: Array) -> Array:
         """Return planned position, velocity, acceleration and jerk (4, 3) at a time () [s].
 
-        Times count from the start of the plan. After the end of the braking piece the state stays
-        at standstill.
+        Times count from the start of the plan. After the plan's end the quadrotor brakes, and
+        then hovers.
         """
         path = with_rest(plan.trajectory)
         time = jnp.minimum(time, total_duration(path))
         return jnp.stack([evaluate(path, time, k) for k in range(4)])
 
     def references(self, plan: Any, times: Array, world: World) -> Reference:
-        """Return the references at times (K,) [s] since the start of a plan; leaves (K, ...).
+        """Return the references (planned states) at K times [s] since the start of a plan.
 
-        Later times than the end of the braking piece are replaced by a time just before it.
+        A braking piece follows the plan; later times are replaced by a time just before its end.
         """
         path = with_rest(plan.trajectory)
         lag = self.model.rotors.lag
@@ -146,11 +146,11 @@ class Quadrotor:
         return jax.vmap(lambda time: reference_at(path, time, lag, world))(times)
 
     def command(self, state: RobotState, reference: Reference, world: World) -> Array:
-        """Return the rotor thrusts (4,) [N] that track a reference."""
+        """Return the rotor thrusts (4,) [N] that track a reference (a planned state)."""
         return control(state, reference, self.model, self.gains, world)
 
     def shapes(self) -> list[Shape]:
-        """Return the only part for drawing: arms, stick, rotors and tool."""
+        """Return the only part for drawing: the frame with its arms, rotors, and the tool."""
         rotors = self.model.rotors
         arms, top = rotors.positions, np.array([0.0, 0.0, self.tool.height])
         discs = [(arm, rotors.radius) for arm in arms] + [(top, self.tool.radius)]
@@ -159,7 +159,7 @@ class Quadrotor:
         return [Shape(lines, discs, tool=True)]
 
     def places(self, pose: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return position [m] and quaternion, w x y z, of the only shape at a pose (7,)."""
+        """Return position [m] and quaternion w x y z of the only drawn shape at a pose (7,)."""
         return [(pose[:3], pose[3:7])]
 
     def place(self, poses: np.ndarray) -> np.ndarray:
