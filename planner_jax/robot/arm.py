@@ -56,16 +56,16 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return a regime of the IRB 1600-6/1.2; `factor` scales the joint speeds of its data sheet."""
+    """Return limits for the arm IRB 1600-6/1.2: `factor` times the speeds of its data sheet."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     accelerations = np.full(6, acceleration, np.float32)
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
-# Regimes of the IRB 1600-6/1.2. R1: limits in the code of [Natarajan2024]; the motion may end at
-# any velocity. R2: speeds of the data sheet, and 30 rad/s^2 as an assumption, since the data sheet
-# states no accelerations; the motion ends at rest. R3: limits of R1; the motion ends at rest.
+# Joint limits of the arm IRB 1600-6/1.2, and whether a motion must end at rest. R1: limits in the
+# code of [Natarajan2024], any velocity at the end. R2: speeds of the data sheet, and 30 rad/s^2 as
+# an assumption, since the data sheet states no accelerations; at rest. R3: limits of R1; at rest.
 REGIMES = {
     "R1": _regime(2.0, 60.0, ends_at_rest=False),
     "R2": _regime(1.0, 30.0, ends_at_rest=True),
@@ -96,7 +96,7 @@ def _joint_rotations(arm: Arm, angles: Array) -> Array:
     x, y, z = axis[:, 0], axis[:, 1], axis[:, 2]
     none = jnp.zeros_like(x)
     cross = jnp.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(6, 3, 3)
-    # `along` and `across` do not depend on the angles: `vmap` over angles computes them once.
+    # `along` and `across` do not depend on the angles: under `vmap` they are computed only once.
     along = product(turn, axis[:, :, None] * axis[:, None, :])
     across = product(turn, cross)
     cos, sin = jnp.cos(angles)[:, None, None], jnp.sin(angles)[:, None, None]
@@ -141,7 +141,7 @@ def shield_jacobian(arm: Arm, angles: Array) -> Array:
 
 
 def capsules(arm: Arm, angles: Array) -> Array:
-    """Return the ends (C, 2, 3) [m] of the capsules' axes in the base frame, at angles (6,)."""
+    """Return the ends (C, 2, 3) [m] of the axes of C capsules in the base frame, at angles (6,)."""
     rotations, positions = link_frames(arm, angles)
     # Append the base as the last link, since the base has the index -1 in `arm.capsule_link`.
     rotations = jnp.concatenate([rotations, jnp.eye(3, dtype=rotations.dtype)[None]])

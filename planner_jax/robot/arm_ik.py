@@ -1,6 +1,6 @@
 """Inverse kinematics in closed form, for ortho-parallel arms with a spherical wrist.
 
-The method, with the seven lengths a1, a2, b, c1, c2, c3, c4, is from [Brandstoetter2014]. Axis 2 is
+The method is from [Brandstoetter2014], which describes an arm by seven lengths. Axis 2 is
 perpendicular to axis 1, and axis 3 parallel to axis 2. Axes 4, 5 and 6 meet in the wrist centre,
 and axis 5 is perpendicular to axes 4 and 6.
 """
@@ -23,7 +23,7 @@ _MISFIT = 1e-5  # [m] or [rad], largest deviation from the geometry that the clo
 
 @struct.dataclass
 class _Geometry:
-    """Lengths and angles of an arm at joint angles 0, with the names of [Brandstoetter2014].
+    """Lengths and angles of an arm at joint angles 0; a1 to c4 are lengths of [Brandstoetter2014].
 
     The coordinates x, y, z have their origin at joint 1; z is along axis 1 and y along axis 2.
     """

@@ -87,18 +87,18 @@ def pose_at(start: Array, end: Array, speed: Array, curvature: Array, time: Arra
     """Return the pose (3,) of the rear axle's middle at a time () [s] of a plan.
 
     The plan starts at the pose `start` (3,): x [m], y [m] and heading [rad]. Speed and curvature
-    (K + 1,) are the values at equidistant knots from time 0 to `end` () [s].
+    are the values at K + 1 equidistant knots from time 0 to `end` () [s].
     """
     num = speed.shape[0] - 1
     step = end / num
-    # (K,) [s], how long the car has driven on each piece until `time`.
+    # (K,) [s], for how long the car has driven on each of the K pieces until `time`.
     length = jnp.clip(time - step * jnp.arange(num, dtype=speed.dtype), 0.0, step)
     rise = (speed[1:] - speed[:-1]) / step
     bend = (curvature[1:] - curvature[:-1]) / step
     v, c = speed[:-1], curvature[:-1]
 
     def turn(tau: Array) -> Array:
-        """Return the change of heading (K,) [rad] on each piece, `tau` [s] after its start."""
+        """Return changes of heading [rad] on the K pieces, `tau` (K,) [s] after their starts."""
         return tau * (v * c + tau * ((v * bend + rise * c) / 2.0 + tau * rise * bend / 3.0))
 
     whole = turn(length)

@@ -1,8 +1,8 @@
 """A quadrotor: limits, differential flatness [Yu2023bat, eq. 1], bounds on reach, and plans.
 
-The body z axis is along the net thrust  tau = a + g e_3  (per unit mass), where a is the
-acceleration. The heading is zero in the sense of the Hopf fibration [Watterson2020]. Attitude and
-body rate are then functions of tau and the jerk alone.
+The body z axis is along the net thrust per unit mass  tau = a + g e_3 , for the acceleration a, the
+magnitude g of gravity, and the upward unit vector e_3. The heading is zero in the sense of the Hopf
+fibration [Watterson2020]. Attitude and body rate are then functions of tau and the jerk alone.
 """
 
 import dataclasses
@@ -70,12 +70,12 @@ class QuadrotorLimits:
 
 
 def net_thrust(acc: Array, gravity: Array) -> Array:
-    """Return the thrust per unit mass  a + g e_3  [m/s^2], (..., 3)."""
+    """Return the thrust per unit mass (..., 3) [m/s^2]: the acceleration minus gravity's vector."""
     return acc + jnp.broadcast_to(gravity * jnp.array([0.0, 0.0, 1.0], acc.dtype), acc.shape)
 
 
 def body_z(acc: Array, gravity: Array) -> Array:
-    """Return the body z axis: the unit vector (..., 3) along the net thrust, or zero without it."""
+    """Return the body z axis (..., 3): the unit vector along the thrust, or 0 if there is none."""
     thrust = net_thrust(acc, gravity)
     square = jnp.sum(thrust**2, axis=-1, keepdims=True)
     has_thrust = square > 0.0
@@ -85,9 +85,9 @@ def body_z(acc: Array, gravity: Array) -> Array:
 def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Array:
     """Return the squared body rate  |omega|^2  of the Hopf fibration at zero heading [rad^2/s^2].
 
-    |omega|^2 = |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z' is the component of the
-    jerk perpendicular to the thrust, over the magnitude of the thrust. The computation has no
-    square root of the result, so that its gradient is finite wherever the value is.
+    |omega|^2 = |z'|^2 + ((z_y z_x' - z_x z_y') / (1 + z_z))^2 , where z is the body z axis, and its
+    derivative z' is the component of the jerk perpendicular to the thrust, over the magnitude of
+    the thrust. |omega| itself is not computed, since the square root has no gradient at zero.
 
     Args:
         acc: (..., 3) [m/s^2].
@@ -108,14 +108,14 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
     inverse_squared = inverse_size * inverse_size
     along = tx * jx + ty * jy + tz * jz
     tilt_squared = (jx * jx + jy * jy + jz * jz - along * along * inverse_squared) * inverse_squared
-    # The jerk along tau cancels:  z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 .
+    # With thrust tau and jerk j,  z_y z_x' - z_x z_y' = (tau_y j_x - tau_x j_y) / |tau|^2 .
     twist = (ty * jx - tx * jy) * inverse_size
     twist = twist * reciprocal(at_least(size_squared * inverse_size + tz, 1e-2))
     return tilt_squared + twist * twist
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Return the three components (...) of the body rate [rad/s] in the body frame."""
+    """Return the body rate's components (...) [rad/s] in the body frame, at zero heading."""
     tx, ty, az = components(acc)
     tz = az + gravity
     jx, jy, jz = components(jerk)
@@ -124,8 +124,8 @@ def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array,
     along = x * jx + y * jy + z * jz
     dx, dy, dz = ((j - along * n) * inverse_size for j, n in ((jx, x), (jy, y), (jz, z)))
     k = reciprocal(at_least(1.0 + z, 1e-2))
-    # With k = 1 / (1 + z) the body's x axis is (1 - k x^2, -k x y, -x), and its y axis is
-    # (-k x y, 1 - k y^2, -y).
+    # If (x, y, z) is the body's z axis and k = 1 / (1 + z), the body's x axis is
+    # (1 - k x^2, -k x y, -x), and its y axis is (-k x y, 1 - k y^2, -y).
     sway = k * (x * dx + y * dy)
     return -(dy - y * sway - y * dz), dx - x * sway - x * dz, (y * dx - x * dy) * k
 
@@ -192,7 +192,7 @@ def greatest_speed(head_state: Array, limits: QuadrotorLimits) -> Array:
 def beyond_reach(
     positions: Array, times: Array, head_state: Array, limits: QuadrotorLimits, gravity: Array
 ) -> Array:
-    """Return lower bounds (K,) [m] on a quadrotor's distances from positions at given times.
+    """Return lower bounds (K,) [m] on a quadrotor's distances from K positions at K times.
 
     Zero or less means that the position may be reached. At the time t the quadrotor is inside each
     of these spheres, if the limits exist:
@@ -296,7 +296,7 @@ class QuadrotorPlan(Plan):
 
 
 def setpoint_at(leaves: tuple[PiecewisePolynomial, Array], time: Array) -> dict[str, Array]:
-    """Return a plan's setpoint, except `time`, at a time () [s]; `leaves` are path and gravity."""
+    """Return the fields of `QuadrotorSetpoints`, except `time`, of one plan at a time () [s]."""
     path, gravity = leaves
     pos, vel, acc, jerk = (evaluate(path, time, order) for order in range(4))
     return {

@@ -202,8 +202,8 @@ def _require(name: str, value: object, rule: str, holds: Callable[[float], bool]
 # The quadrotor of [Yu2023catch]. Height and radius of the net are from Fig. 6 and the diagonal is
 # from the paper. The limits are this library's, since the paper states none. The papers state
 # neither mass, inertia nor rotors. Assumptions: 0.9 kg of computer, battery and frame within 5 cm
-# of the centre, and 75 g of motor and propeller at the end of each arm. The rotors' greatest thrust
-# is 4 g per unit mass; plans use up to 2.5 g, so that a reserve remains for the controller. As in
+# of the centre, and 75 g of motor and propeller at the end of each arm. The greatest thrust is four
+# times the weight; plans use up to 2.5 times, so that a reserve remains for the controller. As in
 # the papers, plans do not limit the thrusts of single rotors.
 PAPER_CATCHER = QuadrotorModel(
     name="paper-catcher",
@@ -216,7 +216,7 @@ PAPER_CATCHER = QuadrotorModel(
     ),
     source="[Yu2023catch] (Catch Planner); body and rotors assumed",
 )
-# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A], with the body of `PAPER_CATCHER`.
+# The quadrotor of [Yu2023bat, Fig. 2 and Section VI-A]. Body and rotors are of `PAPER_CATCHER`.
 PAPER_HITTER = dataclasses.replace(
     PAPER_CATCHER,
     name="paper-hitter",

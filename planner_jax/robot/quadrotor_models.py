@@ -22,8 +22,8 @@ from planner_jax.robot.quadrotor_model import (
 )
 
 # Crazyflie 2.x. Mass and diagonal are from the manufacturer's data sheet (27 g, and 92 mm between
-# opposite motors). Inertia, drag torque and greatest thrust are from [Foerster2015]. Lag and tool
-# are assumptions. The tool is a net, since a racket would weigh about as much as the robot.
+# opposite motors). Inertia, drag torque and greatest thrust are from [Foerster2015]. The time
+# constant and the net are assumptions; a racket would weigh about as much as the robot.
 CRAZYFLIE = QuadrotorModel(
     name="crazyflie",
     mass=0.027,
@@ -55,9 +55,9 @@ RACER = QuadrotorModel(
 )
 
 # The X500. All numbers but tool and limits are from the models x500_base and x500 of PX4's Gazebo
-# models. Mass and inertia are sums over base and propellers. The greatest thrust is
-# 8.54858e-6 N s^2 x (1000 rad/s)^2. The model has two time constants of the rotors, of which the
-# slower is used. The propellers' mesh has a diameter of 13 inches.
+# models. Mass and inertia are sums over base and propellers. The greatest thrust of a rotor is
+# 8.54858e-6 N s^2 x (1000 rad/s)^2. The model has two time constants of the rotors; the greater one
+# is used. The propellers' mesh has a diameter of 13 inches.
 X500 = QuadrotorModel(
     name="x500",
     mass=2.064,

@@ -1,4 +1,4 @@
-"""Checks and conversions of arguments for the functions `case`, `draw`, `planner` and `judge`."""
+"""Checks and conversions of arguments of every task's `case`, `draw`, `planner` and `judge`."""
 
 import inspect
 import pkgutil
@@ -32,13 +32,13 @@ _DRAWN_BYTES = 1_000  # [B], estimated memory of one case of a suite
 def array_of(
     name: str, value: object, batch: tuple[int, ...], shape: tuple[int, ...], dtype: DTypeLike
 ) -> Array:
-    """Return an argument as a JAX array of shape batch + shape; see `numbers_of` for the errors."""
+    """Return the argument `value` as an array of shape `batch + shape`; errors: `numbers_of`."""
     with np.errstate(over="ignore"):  # a number too large for `dtype` becomes infinite, no warning
         return jnp.asarray(numbers_of(name, value, batch, shape), dtype)
 
 
 def batch_of(name: str, vectors: object, *shape: int) -> tuple[int, ...]:
-    """Return the batch shape: the shape (..., *shape) of numbers without the trailing `shape`."""
+    """Return the batch shape of an argument: its leading axes, before the trailing `shape`."""
     found = shape_of(name, vectors)
     split = len(found) - len(shape)
     if split < 0 or found[split:] != shape:
@@ -55,7 +55,7 @@ def require_draw(num: int, seed: int, first: int) -> None:
 
 
 def make_generators(suite: str, num: int, seed: int, first: int) -> list[np.random.Generator]:
-    """Make a random generator for each of `num` cases from suite, seed and the case's index."""
+    """Make one random generator for each of `num` cases, from suite, seed and the case's index."""
     require_draw(num, seed, first)
     tag = zlib.crc32(suite.encode())
     return [np.random.default_rng([seed, first + k, tag]) for k in range(num)]
@@ -66,7 +66,7 @@ def find_decision(
 ) -> Decision:
     """Return the decision that `decide` names, or `decide` itself if it is a decision.
 
-    A decision is a rule that sets what a case leaves open, such as the order of its targets.
+    A decision is an object that chooses what a case leaves open, such as the order of its targets.
 
     Args:
         names: "module:class" of each decision, by name.
@@ -86,7 +86,7 @@ def find_decision(
 
 
 def require_orders(orders: ArrayLike) -> None:
-    """Raise `ValueError` unless every order (..., N) is a permutation of 0..N-1."""
+    """Raise `ValueError` unless every order (..., N) of N targets is a permutation of 0..N-1."""
     flat = np.asarray(orders).reshape(-1, np.shape(orders)[-1])
     wrong = np.flatnonzero((np.sort(flat, axis=1) != np.arange(flat.shape[1])).any(axis=1))
     if wrong.size:
@@ -104,7 +104,10 @@ def judge_by(
     kinds: tuple[type[Case], type[Plan]],
     settings: dict[str, object],
 ) -> VerdictT:
-    """Return the verdict of a task's referee, after checks of the arguments of `judge`."""
+    """Check the arguments of a task's function `judge`, and return the verdict of its referee.
+
+    `kinds` are the required classes of the cases and of the plans.
+    """
     require_kind("cases", cases, kinds[0])
     require_kind("plans", plans, kinds[1])
     require_settings(referee, settings)

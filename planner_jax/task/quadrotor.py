@@ -50,7 +50,7 @@ ARGUMENTS = {
 
 
 def require_tool(robot: object, kind: str) -> Tool:
-    """Return a robot's racket or net; raise unless the tool is of the kind that a task needs."""
+    """Return a robot's tool; raise unless it is of the required kind, "racket" or "net"."""
     if not isinstance(robot, QuadrotorModel):
         rule = "a QuadrotorModel, such as pj.robot_named('x500') or pj.read_robot('my.yaml')"
         raise ArgumentTypeError("robot", rule, robot)
@@ -62,14 +62,14 @@ def require_tool(robot: object, kind: str) -> Tool:
 
 
 def hover_at(start: object, batch: tuple[int, ...], dtype: DTypeLike) -> Array:
-    """Return states (..., 4, 3) of hover: position `start`, zero velocity, acceleration, jerk."""
+    """Return states (*batch, 4, 3): position `start` [m]; zero velocity, acceleration and jerk."""
     head = np.zeros(batch + (4, 3))
     head[..., 0, :] = numbers_of("start", start, batch, (3,))
     return jnp.asarray(head, dtype)
 
 
 def require_start(cases: PyTree) -> None:
-    """Raise `CaseError` if a quadrotor starts below its `min_height`; traced cases pass."""
+    """Raise `CaseError` if a quadrotor starts below `min_height`; JAX tracers are not checked."""
     heights = cases.head_state[..., 0, 2], cases.limits.min_height
     if any(isinstance(each, Tracer) for each in heights):
         return
@@ -78,7 +78,7 @@ def require_start(cases: PyTree) -> None:
 
 
 def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
-    """Raise unless `robot` is the default `usual`, for suites that define the robot themselves."""
+    """Raise if `robot` is not the default `usual`: suites of other packages define the robot."""
     if robot != usual:
         raise ArgumentError("robot", f"left out with suite {suite!r}, which has its own", shown="")
 
@@ -86,10 +86,10 @@ def require_own_robot(robot: object, usual: QuadrotorModel, suite: str) -> None:
 def limits_of(
     robot: QuadrotorModel, leaf: Callable[..., Array], **given: object
 ) -> QuadrotorLimits:
-    """Return the limits of a case: the arguments that are not None, and else the robot's limits.
+    """Return a case's limits: the values in `given` that are not None, else the robot's limits.
 
-    Without a net, thrust is limited only if `robot.limits.thrust` is not None. The function
-    `leaf(name, value, *shape)` gives a value the batch's shape.
+    A robot with a net has limits of thrust, a robot with a racket only if `robot.limits.thrust` is
+    not None. The function `leaf(name, value, *shape)` broadcasts a value to the batch's shape.
     """
     own = robot.limits
     least, most = own.thrust or (None, None)
@@ -104,7 +104,7 @@ def limits_of(
         "max_thrust": most,
     }
     values = {**known, **{name: value for name, value in given.items() if value is not None}}
-    # If only one bound of the thrust is specified, the other bound is 0 or infinite.
+    # If only one bound of the thrust is specified, the lower one is 0 or the upper one infinite.
     if values["max_thrust"] is None and values["min_thrust"] is not None:
         values["max_thrust"] = np.inf
     if values["min_thrust"] is None and values["max_thrust"] is not None:

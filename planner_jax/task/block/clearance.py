@@ -42,7 +42,7 @@ _SHIELD_LINK = 5
 
 
 class _Poses(NamedTuple):
-    """Positions of the parts of an arm in N poses, base frame."""
+    """Positions of the parts of an arm with C capsules in N poses, in the robot's base frame."""
 
     ends: Array  # (2, 3, C, N) [m], ends of the capsules' axes
     middle: Array  # (3, N) [m], middle of the shield's plate
@@ -63,7 +63,7 @@ class _Pairs(NamedTuple):
 
 
 def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the distances (R, N) [m] of all R pairs of bodies in N poses at angles (N, 6) [rad].
+    """Return the distances (R, N) [m] of R pairs of bodies in N poses at joint angles (N, 6) [rad].
 
     A distance is negative if the bodies overlap. The first `num_of_pole(arm)` rows are the
     distances from the pole.
@@ -73,18 +73,18 @@ def clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
 
 
 def least_clearances(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the least distance (N,) [m] between any two bodies in N poses at angles (N, 6)."""
+    """Return the least distance (N,) [m] of all pairs of bodies in N poses at angles (N, 6)."""
     return jnp.min(clearances(arm, scene, angles), axis=0)
 
 
 def clearances_and_slopes(
     arm: Arm, scene: Scene, angles: Array
 ) -> tuple[Array, Callable[[Array], Array]]:
-    """Return the `clearances` (R, N) [m] at angles (N, 6), and a function for their derivatives.
+    """Return distances (R, N) [m], as `clearances` does, and a function for their derivatives.
 
-    The function takes indices (W,) of poses, and returns the derivatives of the distances at these
-    poses by the joint angles, (R, 6, W) [m/rad]. The derivative by a joint that moves both bodies
-    of a pair as one is zero.
+    The function takes the indices (W,) of W of the N poses, and returns the derivatives of the R
+    distances at these poses by the joint angles, (R, 6, W) [m/rad]. The derivative by a joint that
+    moves both bodies of a pair as one is zero.
     """
     poses = _poses(arm, angles)
     every = _pairs(arm, scene, poses)
@@ -132,7 +132,6 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
     )
 
     def rotate(rotations: Array, vector: Array) -> Array:
-        """Rotate vectors (..., 3) of links to the base frame, (..., 3, N)."""
         x, y, z = (rotations[..., j, :] * vector[..., j, None, None] for j in range(3))
         return x + y + z
 
@@ -157,7 +156,7 @@ def _poses(arm: Arm, angles: Array) -> _Poses:
 
 
 def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
-    """List all pairs of bodies, grouped by their shapes; the pairs with the pole come first."""
+    """List all pairs of bodies that must not touch, by their shapes; pairs with the pole first."""
     link, radius = np.asarray(arm.capsule_link), jnp.asarray(arm.capsule_radius)
     turning, swung, far = (_from_link(arm, first) for first in (1, 2, 3))
     trunk = np.flatnonzero(link == 0)
@@ -172,7 +171,6 @@ def _pairs(arm: Arm, scene: Scene, poses: _Poses) -> list[_Pairs]:
     num_beams = beams.shape[2]
 
     def with_beams(index: np.ndarray) -> Array:
-        """Return the ends (2, 3, K, N) of the axes of some capsules and of all beams."""
         return jnp.concatenate([poses.ends[:, :, index], beams], axis=2)
 
     wrist = jnp.sqrt(jnp.sum((arm.origin[5] + arm.shield_centre) ** 2))

@@ -73,19 +73,18 @@ _GROUP, _WIDTH = 4, 2  # starts in a group, and starts that a GPU refines at the
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: a number of straight motions, then least squares from some starts; static.
-
-    Two cases in three have a straight motion without collision, nearly always among the first.
-    """
+    """An attempt: check some straight motions, then run least squares from some starts."""
 
     starts: int = 8
     straight: int = 48  # number of straight motions
     tries: int = 15  # number of starts from which least squares are tried
     first: int = 0  # index of the first start of least squares
     kept: int = 5  # number of starts that continue after the solver's trial steps
-    # Whether a single case refines each start to its end before the next one, without trial steps.
+    # Whether each start is refined to its end before the next one, if a single case is planned.
+    # Otherwise all starts first take a few trial steps, and only the `kept` best ones continue.
     in_turn: bool = True
-    # The bound `hope` on the cost after the trial lets nearly all successful starts continue.
+    # After the trial steps a start continues only if its cost is below the bound `hope`, which
+    # nearly all successful starts meet.
     solver: LevenbergConfig = LevenbergConfig(
         *(26, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=3, hope=1000.0, fade=0.7
     )
@@ -101,7 +100,7 @@ _BRISK = (Search(tries=0), *_LEAST_SQUARES)
 
 @functools.cache
 def read_learned_starts() -> tuple[np.ndarray, np.ndarray]:
-    """Read the stored starts of least squares: ranks (N,) of end poses, bumps (N, 6) [rad]."""
+    """Read N stored starts: ranks (N,) of end poses by effort, and detours (N, 6) [rad]."""
     starts = json.loads((Path(__file__).parent / "learned_starts.json").read_text())
     ranks = np.array([start["rank"] for start in starts], np.int32)
     return ranks, np.array([start["bump"] for start in starts], np.float32)
@@ -118,9 +117,11 @@ def _trial_cost(tried: LevenbergState, solver: LevenbergConfig) -> Array:
 
 
 def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
-    """Return the indices (num,) of end poses in order of rising effort, with noise for variety.
+    """Return the indices (num,) of the end poses that need the least effort, in rising order.
 
-    A pose whose effort exceeds `most` cannot be reached in time, and is ranked far behind.
+    The effort is the greatest ratio of a joint's rate or acceleration to its limit. Noise is added
+    to it, so that the poses vary. A pose whose effort exceeds `most` cannot be reached in time and
+    is ranked far behind.
     """
     rng = np.random.default_rng(0)
     noise = jnp.asarray(rng.random(poses.effort.shape[0]), poses.effort.dtype)
@@ -131,7 +132,9 @@ def rank_poses(poses: EndPoses, num: int, most: float) -> Array:
 def _lift_to_unknowns(
     lift: Array, drift: Array, grams: Array, pushes: Array, joints: JointTerms
 ) -> tuple[Array, Array]:
-    """Return J^T r (n,) and J^T J (n, n) of all residuals r, by the n = 6 K + 1 unknowns.
+    """Return J^T r and J^T J, where J is the Jacobian of all residuals r by all unknowns.
+
+    The unknowns are K steps of each of the six joints, and the time of contact.
 
     Args:
         lift: (W, K), derivatives of a joint's angle at W samples by its K unknowns.
@@ -190,19 +193,19 @@ class OnlineBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches (attempts), in order."""
+        """The searches for a plan, in the order in which they are tried."""
         return self.searches
 
     def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
-        """Return a search as arguments of the program that all searches share."""
+        """Return a search as arguments of one compiled program, which all searches share."""
         return place_numbers(attempt)
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from the starts.
 
-        One loop takes all turns. A turn checks a straight motion, or makes the solver's trial steps
-        from a start, or refines a start to its end. Starts with trial steps are refined in order of
-        their cost after these steps.
+        Each turn of one loop checks a straight motion, or makes the solver's trial steps from a
+        start, or refines a start to its end. Starts with trial steps are refined in order of their
+        cost after these steps.
         """
         flight, poses, order = self._rank(case)
         model = lambda point: self.model(point, case, flight)  # noqa: E731
@@ -308,7 +311,7 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
-        """Return when a ball can be met, the end poses, and the indices of the first of them."""
+        """Return when a ball can be met, end poses, and the indices of those to try, in order."""
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
         ranks, _ = read_learned_starts()
@@ -321,7 +324,7 @@ class OnlineBlock(Planner):
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
     def _encode_start(self, case: BlockCase, poses: EndPoses, order: Array, k: Array) -> Array:
-        """Return the unknowns (n,) of the k-th learned start: a straight motion with a bump."""
+        """Return the unknowns of the k-th stored start: a straight motion with a bump (detour)."""
         ranks, bumps = (jnp.asarray(each) for each in read_learned_starts())
         k = jnp.minimum(k, len(ranks) - 1)
         point = self.encode_straight(case, poses, order[ranks[k]])
@@ -331,12 +334,12 @@ class OnlineBlock(Planner):
     def refine(
         self, case: BlockCase, flight: Flight, start: Array, solver: LevenbergConfig
     ) -> BlockPlan:
-        """Return the plan that least squares find from a start (n,)."""
+        """Return the plan that least squares find from the unknowns `start`."""
         end = least_squares(lambda point: self.model(point, case, flight), start, solver)
         return self.finish(case, flight, end.point, end.steps)
 
     def encode_straight(self, case: BlockCase, poses: EndPoses, index: Array) -> Array:
-        """Return the unknowns (n,) of the straight motion to the end pose with this index."""
+        """Return the unknowns of the straight motion to the end pose with this index."""
         time = poses.time[index]
         duration = jnp.maximum(time - case.delay, 1e-3)
         turned = poses.angles[index] - coast(case, duration, self.pieces)
@@ -345,10 +348,10 @@ class OnlineBlock(Planner):
         return jnp.append(steps.reshape(-1), time)
 
     def decode(self, case: BlockCase, point: Array) -> tuple[Array, Array, Array]:
-        """Split the unknowns (n,) into joint rates and a duration.
+        """Split the unknowns into joint rates and a duration.
 
         Returns:
-            The rates after each piece (K, 6) and at the start (6,), both multiplied by the
+            The rates after each of K pieces (K, 6) and at the start (6,), both multiplied by the
             duration [rad], and the duration () [s].
         """
         steps = point[:-1].reshape(self.pieces, 6)
@@ -357,9 +360,10 @@ class OnlineBlock(Planner):
         return steps.at[-1].set(last), case.rates * duration, duration
 
     def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
-        """Return the cost, a sum of squared residuals, at a point (n,), and its quadratic model.
+        """Return the cost at the unknowns `point`, a sum of squares, and its quadratic model.
 
-        The residuals are contact, joint limits, distances below their margins, and effort.
+        The residuals are the errors of the contact, excesses over joint limits, distances below
+        their margins, and joint accelerations.
         """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype
@@ -405,13 +409,14 @@ class OnlineBlock(Planner):
         )
 
     def finish(self, case: BlockCase, flight: Flight, point: Array, steps: Array) -> BlockPlan:
-        """Return the plan of the unknowns (n,), with the limits checked at `checked` samples.
+        """Return the plan of the unknowns `point`, with the limits checked at `checked` samples.
 
         `steps` is the number of steps of least squares that led to the unknowns.
         """
         moves, first, duration = self.decode(case, point)
         joints = joint_terms(case, moves, first, duration, self.weights, 1.0 - self.slack).excess
-        # The start replaces the sample next to it: with one more, a GPU would be slower by a third.
+        # The start is checked instead of the first sample after it, because one sample more would
+        # make a GPU a third slower.
         shares = (0.0, *(np.arange(min(2, self.checked), self.checked + 1) / self.checked))
         angles = angles_at(case.angles, first, moves, shares)
         gaps = least_clearances(case.arm, case.scene, angles)

@@ -51,15 +51,15 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all speed profiles (P, K) of `motion.profiles`, and which end at rest, (P,) bool."""
+    """Return all P speed profiles of `motion.profiles`, (P, K), and which end at rest, (P,)."""
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 
 
 def profile_peaks(pieces: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the greatest rates and accelerations (P,) of all profiles, and which end at rest.
+    """Return the greatest rate and acceleration of each of P speed profiles, and which end at rest.
 
-    Rates are in rad/s and accelerations in rad/s^2, if a profile turns a joint by 1 rad in 1 s.
+    Rates are in rad/s and accelerations in rad/s^2, for profiles that turn a joint by 1 rad in 1 s.
     """
     shapes, rests = all_profiles(pieces)
     rises = np.diff(shapes, axis=1, prepend=0.0) * pieces
@@ -72,9 +72,9 @@ def end_poses(
     """Return the eight arm poses that meet the ball at each of `points` points between the boxes.
 
     The eight poses are the branches of the inverse kinematics. Joint 6 keeps its angle, because it
-    only turns the shield in its own plane. The straight motion to a pose has `pieces` pieces and
-    the speed profile of least effort. With `quickest`, motions that end at rest have the profile
-    of least time.
+    only turns the shield in its own plane. A straight motion of `pieces` pieces leads to each pose.
+    Its speed profile is the one that stays farthest below the joints' limits; with `quickest`,
+    motions that end at rest have the profile that can be executed in the least time.
     """
     share = (np.arange(points) + 0.5) / points
     time = flight.earliest + share * (flight.latest - flight.earliest)

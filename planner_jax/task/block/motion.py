@@ -20,7 +20,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 @dataclasses.dataclass(frozen=True)
 class Weights:
-    """Weights of the residuals of least squares; static."""
+    """Weights of the residuals of least squares."""
 
     meeting: float = 100.0  # [1/m], of the ball's distances from the shield's plane and middle
     tilt: float = 30.0  # [1/rad], of the shield's tilt against the ball's path
@@ -33,7 +33,8 @@ class Weights:
 def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Return weights of a motion's parameters whose weighted sum is the angle turned so far.
 
-    The angle is evaluated at N times, which are `shares` in [0, 1] of the duration.
+    The motion has K = `pieces` pieces. The angle is evaluated at N times, which are `shares` in
+    [0, 1] of the duration.
 
     Returns:
         first: (N,), weights of the initial rate multiplied by the duration.
@@ -61,9 +62,9 @@ def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...
 
 
 class JointTerms(NamedTuple):
-    """Cost r . r of the joints' limits and effort, and its derivatives for each joint.
+    """Sum of squares of residuals r: excesses over joint limits, and accelerations; derivatives.
 
-    J is the Jacobian of the residuals r by the K steps of the joint and the time of contact.
+    J is the Jacobian of a joint's residuals by its K steps and the time of contact.
     """
 
     cost: Array  # (), r . r, summed over the joints
@@ -94,7 +95,7 @@ def joint_terms(
     def row(
         value: Array, by_steps: Array, by_time: Array, slope: float | Array
     ) -> tuple[Array, Array]:
-        """Return residuals (6, K) and their derivatives (6, K, K + 1), with the joints first."""
+        """Return residuals (6, K) and derivatives (6, K, K + 1) of six joints, with K pieces."""
         slopes = jnp.concatenate([by_steps, by_time.T[:, :, None]], axis=2)
         return value.T, slopes * jnp.broadcast_to(slope, value.shape).T[:, :, None]
 
@@ -133,7 +134,7 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return steps (K, 6) of a detour: joints turn by `height` (6,) [rad] and back, as sin^2."""
+    """Return steps (K, 6) of a detour: angles rise by `height` (6,) [rad] and fall, as sin^2."""
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 
@@ -192,7 +193,7 @@ def append_braking(case: BlockCase, motion: PiecewisePolynomial) -> PiecewisePol
 
 @functools.cache
 def profiles(pieces: int, ends_at_rest: bool) -> np.ndarray:
-    """Return the steps (P, K) of P speed profiles, each of which turns a joint by 1 rad from rest.
+    """Return P speed profiles, each of which turns a joint by 1 rad from rest, as steps (P, K).
 
     The rate rises linearly, is then constant and, if the motion ends at rest, falls linearly. The
     ramps last 1 to K / 2 pieces, or 1 to K pieces if the motion need not end at rest.

@@ -38,7 +38,7 @@ def make_empty_plan(case: BlockCase, pieces: int) -> BlockPlan:
 
 
 def explain_status(poses: EndPoses, status: Array) -> Array:
-    """Return the status () int32 of a plan: OUT_OF_REACH if it is unsolved for want of an end pose.
+    """Return a plan's status () int32: OUT_OF_REACH if it is unsolved and no end pose exists.
 
     There is no end pose if the ball does not enter both boxes, or the shield reaches it nowhere.
     """
@@ -47,7 +47,7 @@ def explain_status(poses: EndPoses, status: Array) -> Array:
 
 
 def mark_blocked(case: BlockCase, status: Array) -> Array:
-    """Return the status () of a plan: BLOCKED if it is unsolved and the arm starts in contact."""
+    """Return a plan's status (): BLOCKED if it is unsolved and the arm starts in a collision."""
 
     def check() -> Array:
         is_blocked = case.clearances(case.angles[None])[0] < 0.0

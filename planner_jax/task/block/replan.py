@@ -34,7 +34,7 @@ _SHORTEST = 0.02  # [s] least duration of a start, for previous motions that hav
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """An attempt of least squares from the remainder of the previous motion; static."""
+    """An attempt of least squares that starts from the remainder of the previous motion."""
 
     solver: LevenbergConfig = LevenbergConfig(*(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0)
 
@@ -55,7 +55,7 @@ class WarmBlock(Planner):
         return planner.refine(case, flight_of(case), self.encode_remainder(task), attempt.solver)
 
     def encode_remainder(self, task: Replanning) -> Array:
-        """Return the unknowns (n,) of the remainder of the previous motion until the contact.
+        """Return the unknowns that describe the remainder of the previous motion until contact.
 
         The contact is moved to the time at which the newly estimated ball is nearest to the
         previous position of contact.

@@ -13,9 +13,10 @@ INNER_HALF, INNER_HEIGHT = 0.4, 1.35  # [m], half side and height of the protect
 OUTER_HALF, OUTER_HEIGHT = 1.0, 1.85  # [m], half side and height of the box where balls are met
 POLE, POLE_RADIUS = (0.806, 0.0), 0.05  # [m], x and y of a vertical pole, and its radius
 FLOOR = -0.4826  # [m], height of the floor
-RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half side and beam length of a square round the pedestal
-# [m], height of the beams, and radius of the capsule around a beam of 0.025 x 0.076 m.
-RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401
+# Four horizontal beams form a square around the robot's pedestal. Each beam is modelled as a
+# capsule that encloses its cross-section of 0.025 m x 0.076 m.
+RIG_HALF, RIG_LENGTH = 0.559, 1.09  # [m], half the side of the square, and length of a beam
+RIG_HEIGHT, RIG_RADIUS = -0.08, 0.0401  # [m], height of the beams' axes, and radius of a capsule
 
 
 @struct.dataclass

@@ -35,11 +35,11 @@ def planner(
 
     Args:
         name: one of these names, or the name of a planner of another package.
-        decide: how the order and first times of the catches are found. "best" plans the orders with
-            the best estimates and selects the plan with the earliest last catch. "greedy" always
-            catches next the target that can be caught first. "given" uses order and times in the
-            cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is a network of
-            yours. A decision with settings, such as `Best(finalists=3)`, is also accepted.
+        decide: how the order and first times of the catches are found. "best" plans the orders that
+            are estimated to end first, and selects the plan with the earliest last catch. "greedy"
+            always catches next the target that can be caught first. "given" uses order and times in
+            the cases. "policy" and "policy:rush6" are trained networks, "policy:FILE" is a network
+            of yours. An object is also accepted: `Best(finalists=3)` plans only three orders.
         recovery: as in `pj.hit.planner`.
         effort: as in `pj.hit.planner`.
         **options: fields of the planner's dataclass, for example `rounds`.
@@ -80,7 +80,7 @@ def judge(cases: CatchCase, plans: CatchPlan, **settings: object) -> CatchVerdic
 def _states_by_class(
     targets: TargetPath, order: np.ndarray, times: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of the targets `order` (B, N) at `times` (B, N)."""
+    """Return positions and velocities (B, N, 3) of N targets of B cases, each at its own time."""
     lanes = np.arange(len(order))[:, None]
     with jax.enable_x64(True):
         ordered = jax.tree.map(lambda leaf: _double(leaf)[lanes, order], targets)

@@ -137,10 +137,10 @@ def case(
 ) -> CatchCase:
     """Make one case with N targets to catch, or a batch, by default for the robot of [Yu2023catch].
 
-    The paper states no limits of the robot. The defaults are |v| <= 5 m/s, |omega| <= 5 rad/s,
-    thrust from 0.3 g to 2.5 g, height >= 0.25 m and theta_safe = 30 degrees. `order` is
-    0, 1, ..., N - 1, and `times` are equally spaced up to the first target's horizon; the decision
-    of the planner replaces both.
+    The paper states no limits of the robot. The defaults are a speed of 5 m/s, a body rate of
+    5 rad/s, thrust from 0.3 to 2.5 times the weight, height >= 0.25 m, and theta_safe = 30 degrees.
+    `order` is 0, 1, ..., N - 1, and `times` are equally spaced up to the first target's horizon;
+    the decision of the planner replaces both.
 
     The arguments that are not in this list, and the errors, are as in `pj.hit.case`.
 

@@ -1,4 +1,4 @@
-"""Functions of all catch planners: order of targets, attitudes of the net, targets out of reach."""
+"""Functions that all catch planners use: order of targets, axes of the net, targets too far."""
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,8 @@ from planner_jax.ball.target import BallPath, HarmonicPath, TargetPath, state_at
 from planner_jax.robot.quadrotor import beyond_reach, greatest_speed
 from planner_jax.task.catch.case import CatchCase
 
-# [m/s], added to the upward reversed velocity, so that the net is upright for a target at rest.
+# [m/s], added to the vertical component of a target's reversed velocity, so that the net is upright
+# for a target at rest.
 _RESTING = 1e-3
 _TIMES = 32  # number of times up to the horizon at which `is_too_far` evaluates its bound
 _SLACK = 0.02  # [m], in `is_too_far`, far more than the errors of catches that the referee accepts
@@ -45,7 +46,7 @@ def targets_at(targets: TargetPath, times: Array) -> BallState:
 
 
 def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
-    """Return cosines (N,) between net's axis and reversed velocities, and which targets move."""
+    """Return cosines (N,) of angles from the net's axis to -vel of N targets, and which move."""
     speed_squared = jnp.sum(vel**2, axis=1)
     moving = speed_squared > 1e-12
     speed = jnp.sqrt(jnp.where(moving, speed_squared, 1.0))
@@ -53,7 +54,7 @@ def facing_cosine(axis: Array, vel: Array) -> tuple[Array, Array]:
 
 
 def nearest_upright(vel: Array, lean: Array) -> Array:
-    """Return the axes (N, 3) of the net that are nearest to upright and still face the targets.
+    """Return the axes (N, 3) of the net that are nearest to upright and still face N targets.
 
     An axis faces a target if its angle from the reversed velocity -vel (N, 3) is at most `lean` ()
     [rad], from 0 to pi / 2. Rising targets are treated as if they flew level.
@@ -77,7 +78,7 @@ def is_too_far(context: CatchContext) -> Array:
     catch is within half a step of such a time, so the distances that target and quadrotor can move
     in half a step are added.
 
-    The result is also false for optional targets, for targets that are neither `BallPath` nor
+    The result is false for optional targets, for targets that are neither `BallPath` nor
     `HarmonicPath`, and if a number is not finite.
     """
     case, targets = context.case, context.targets

@@ -1,7 +1,8 @@
-"""Decisions on the order and the times of catches, by the estimate of the module `estimate`.
+"""Decisions on the order and the times of catches, which the module `estimate` estimates.
 
-If targets are optional, a decision also selects which targets to catch. Every order is then also
-proposed with fewer catches, and the plan that catches most targets is selected.
+A decision proposes orders, and the planner plans each of them. If targets are optional, a decision
+also selects which targets to catch: it proposes every order also with fewer catches, and the plan
+that catches most targets is selected.
 """
 
 import dataclasses
@@ -29,10 +30,11 @@ _WORD = 24  # number of targets in each integer of the bit set of caught targets
 
 
 def closest_approach(cases: CatchCase) -> Array:
-    """Return by how much the net misses each target at least, (N,) or (B, N) [m].
+    """Return a lower bound on the distance by which the net misses each of N targets, [m].
 
-    This lower bound, zero if the target may be within reach, assumes the greatest speed in any
-    direction. It is evaluated at 64 times up to the target's horizon.
+    The result is (N,), or (B, N) for a batch of B cases; it is zero if the target may be within
+    reach. The quadrotor is assumed to fly at its greatest speed in any direction. The bound is
+    evaluated at 64 times up to the target's horizon.
     """
     return _closest_approach(cases) if cases.batch_shape == () else _closest_approaches(cases)
 
@@ -54,10 +56,11 @@ _closest_approaches = jax.jit(jax.vmap(_closest_approach))
 
 
 def in_several_lengths(case: CatchCase, choices: CatchChoice) -> CatchChoice:
-    """Return choices (K, N) unchanged, or choices (K * LENGTHS, N) if targets are optional.
+    """Return K choices unchanged, or `LENGTHS` variants of each choice if targets are optional.
 
-    Each choice is then also proposed without its last catch, without its last two catches and so
-    on, because the estimate is least certain for the last catches.
+    The variants of a choice catch all its targets, all but the last, all but the last two and so
+    on, because the estimate is least certain for the last catches. Leaves have the shape (K, N) or
+    (K * LENGTHS, N), for N targets.
     """
     if not case.optional:
         return choices
@@ -86,11 +89,12 @@ class _Partial:
 
 
 def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
-    """Search for the orders of one case that catch most targets, earliest; leaves (W, N).
+    """Search for W orders of one case that catch most targets, and catch them early.
 
-    It is a beam search of width W. After each catch the W sequences of catches with the best ranks
-    continue. Among sequences with the same targets and the same last target only the best
-    continues. If fewer than W orders are found, the first order is repeated.
+    It is a beam search of width W = `width`. After each catch the W sequences of catches with the
+    least ranks continue. The rank is the estimated time plus 10 s for each metre that the quadrotor
+    lacks. Among sequences with the same targets and the same last target only the best continues.
+    If fewer than W orders are found, the first order is repeated. Leaves are (W, N), N targets.
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -152,7 +156,10 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
 
 
 def _choice(position: Array, times: Array) -> CatchChoice:
-    """Return the choice that catches N targets at positions (N,) of a sequence, at times (N,)."""
+    """Return the choice for N targets with indices `position` (N,) in a sequence of catches.
+
+    Targets that are not caught have the index N. `times` (N,) [s] are the times of the catches.
+    """
     num = position.size
     order = jnp.argsort(position, stable=True)
     taken = position < num
@@ -165,7 +172,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
     """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
 
-    T_p are the decided times of the catches, T_o the times in the optimised plans.
+    T_p are the times of catches that were decided before planning, T_o those in the B plans.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)
@@ -197,12 +204,12 @@ class CatchDecision:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(CatchDecision):
-    """Decision that proposes the orders with the best estimates; all of them are then planned.
+    """Decision that proposes the orders with the least ranks; all of them are then planned.
 
-    The estimate of an order is the time of its last catch plus 10 s for each metre of shortfall,
-    the distance by which the quadrotor would miss its targets. All N! orders of up to six targets
-    are estimated. For more (at most 100) or optional targets, a beam search may miss the best
-    order. The plan with the earliest last catch is selected.
+    The rank of an order is the estimated time of its last catch plus 10 s for each metre by which
+    the quadrotor would miss its targets. All orders of up to six targets are ranked. For more (at
+    most 100) or optional targets, a beam search ranks only some orders and may miss the best one.
+    The plan with the earliest last catch is selected.
     """
 
     finalists: int = 6  # number of orders that are planned
@@ -214,7 +221,7 @@ class Best(CatchDecision):
             raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the F orders of one case with the best estimates, best first, leaves (F, N)."""
+        """Return the best orders of one case, best first; leaves have a row for each order."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)
@@ -232,7 +239,7 @@ class Greedy(CatchDecision):
     """Decision that always catches next the target with the earliest estimated catch."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the greedy order of one case, leaves (1, N); (LENGTHS, N) for optional targets."""
+        """Return the greedy order of one case, and variants with fewer catches if these may be."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
@@ -265,5 +272,5 @@ class Given(CatchDecision):
         require_orders(cases.order)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the order and times stored in one case as the only proposal, leaves (1, N)."""
+        """Return order and times of N targets stored in one case as the only proposal, (1, N)."""
         return CatchChoice(order=case.order[None], times=case.times[None], taken=case.present[None])

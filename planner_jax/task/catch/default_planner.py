@@ -40,10 +40,10 @@ _FEATURE_TIMES = (-0.1, 0.1)  # [s] times of the ball that the network sees, aft
 _RIM = 0.9  # greatest distance of a catch from the net's centre, relative to the net's radius
 _LEARNED_SIZE = 2.0  # greatest norm of a learned catch point's variables: 0.89 of `_RIM`
 _ENCODED_RIM = 0.99  # greatest distance of a catch point made by `encode`, relative to `_RIM`
-# Starting points, best first. Column 1 is a factor on the decided times. Columns 2 and 3 are the
-# velocity, relative to the mean velocity of the segment, at catches before the last one and at the
-# last one. Columns 4 and 5 are the thrust at these catches: -1 is the least, 0 hover, 1 the
-# greatest thrust. Optimal plans sink through their catches and brake at the last one.
+# Starting points, the most successful first. Column 1 is a factor on the decided times of the
+# catches. Columns 2 and 3 are the velocity at catches before the last one and at the last one,
+# relative to the mean velocity since the previous catch. Columns 4 and 5 are the thrust at these
+# catches: -1 is the least, 0 hover, 1 the greatest thrust.
 _GUESSES = np.array(
     [
         (1.0, 0.5, 0.8, -5.0 / 7.0, 0.1),
@@ -62,7 +62,8 @@ _ROUNDS = (
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
 _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # used after a network
-# With several targets this search precedes Newton's method; `_FIRST` ends too far from the optimum.
+# With several targets this search runs before Newton's method, because the short search of `_FIRST`
+# would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
 # If more than `_FEW` targets must all be caught, the first two rounds are longer.
@@ -77,14 +78,15 @@ _LEAN = 0.95  # angle between net and ball in a guess, as a fraction of the grea
 class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     """A planner of minimum-snap catches whose decision variables put the ball into the net.
 
-    Each of N segments has 3 (M - 1) + 12 variables in units of `scale`: whitened waypoint offsets,
-    log duration, catch point in the net, and velocity, acceleration and jerk at the catch. The
-    acceleration determines the net's axis z_d. The quadrotor's position at the catch is the ball's
-    position minus the net's height along z_d and minus the catch point's offset inside the hoop.
+    A segment of M polynomial pieces leads to each catch. It has 3 (M - 1) + 12 variables in units
+    of `scale`: offsets of its waypoints from the smoothest trajectory, logarithm of its duration,
+    catch point in the net, and velocity, acceleration and jerk at the catch. The acceleration
+    determines the net's axis. The quadrotor's position at the catch is the ball's position minus
+    the net's height along this axis and minus the catch point's offset inside the hoop.
 
     The cost is time_weight * total time + energy_weight * integral |snap|^2, plus the integral of
-    the smoothed hinges of the limits [Yu2023catch, eqs 26-28] and extras, plus catch_weight * the
-    hinges of the angle [Yu2023catch, eq. 25] and of the horizon.
+    smooth one-sided penalties on the limits [Yu2023catch, eqs 26-28] and of the user's extra terms,
+    plus catch_weight * penalties on the net's angle [Yu2023catch, eq. 25] and on late catches.
     """
 
     case_type = CatchCase
@@ -94,25 +96,26 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     proportions: tuple[float, ...] = _PROPORTIONS  # relative durations of the pieces
     catch_weight: float = 0.3  # [s] weight of the penalties at a catch
     rounds: tuple[Round, ...] = _ROUNDS
-    # Thrust at catches before the last one in the first guess, from -1 to 1 as in `_GUESSES`. Near
-    # -1 catches are earliest; larger values leave a margin for feedback control in flight.
+    # Thrust at catches before the last one in the first guess: -1 is the least, 0 hover, 1 the
+    # greatest thrust. Near -1 catches are earliest; larger values leave a margin for feedback
+    # control in flight.
     lift: float = _GUESSES[0, 3].item()
     learned: bool = True  # whether a network improves the first guess of a single catch
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the penalties at a catch."""
+        """Weight [s] of the penalties on the net's angle at a catch, and on a catch too late."""
         return self.catch_weight
 
     def active(self, context: CatchContext) -> Array:
-        """Return which catches, in their order, belong to targets that are present, (N,) bool."""
+        """Return which of N catches, in their order, are of targets that exist, (N,) bool."""
         return context.active
 
     def start_network(self, case: CatchCase) -> StartNetwork | None:
-        """Return the network for the first guess of a single catch, or None.
+        """Return the network that predicts the first guess; None if there is no such network.
 
-        It exists for one target, usual sizes and `lift`, and no obstacles: around obstacles the
-        side on which a search starts decides on which side it ends.
+        It exists for one target, the default pieces, scale and `lift`, and no obstacles: around
+        obstacles the side on which a search starts decides on which side it ends.
         """
         is_usual = self.proportions == _PROPORTIONS and self.lift == _GUESSES[0, 3]
         is_usual &= case.num_targets == 1 and not case.extras
@@ -121,7 +124,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return load_network(self.package, "exact-6")
 
     def start_features(self, context: CatchContext) -> Array:
-        """Return the inputs of the network, (F,): states of ball and quadrotor, and the limits."""
+        """Return the network's inputs, a vector: states of ball and quadrotor, and the limits."""
         case, net = context.case, context.case.net
         head, limits, time = case.head_state, case.limits, context.times[0]
         balls = [targets_at(context.targets, context.times[:1] + late) for late in _FEATURE_TIMES]
@@ -150,14 +153,14 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
-        """Return the end variables that the first rows of `guess_table` describe, (num, N, 12)."""
+        """Return the 12 variables of each of N catches for `num` guesses, (num, N, 12)."""
         rows = _GUESSES[:num].copy()
         rows[0, 3] = self.lift
         rows = jnp.asarray(rows, context.times.dtype)
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return a round as run-time numbers, adapted to how near its starting point is."""
+        """Return a round as arguments of a compiled program, with iterations as its start needs."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:
@@ -165,13 +168,14 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.rounds == _ROUNDS and cases.num_targets > _FEW and not cases.optional
 
     def _for_start(self, attempt: Round, case: CatchCase) -> Round:
-        """Return a round with as many iterations as its start's distance to the optimum needs."""
+        """Return a round with the number of iterations that its starting point needs."""
         if self.starts_long(case) and attempt in _ROUNDS[:2]:
             is_first = attempt == _FIRST
             steps = _STEPS_A_TARGET * case.num_targets if is_first else _OF_MANY.max_steps
             return Round(starts=1, solver=dataclasses.replace(_OF_MANY, max_steps=steps))
         if attempt.stages == (Stage(_FIRST.solver),) and case.num_targets > 1:
-            # Far from the optimum a small gain of one iteration does not show convergence.
+            # With several targets the search starts far from the optimum, where a small gain in one
+            # iteration does not prove convergence: the tolerance must be smaller.
             slow = min(attempt.solver.tolerance, _CHAIN_TOLERANCE)
             solver = dataclasses.replace(attempt.solver, tolerance=slow)
             return dataclasses.replace(attempt, stages=(_LONG_CHAIN,), solver=solver)
@@ -179,7 +183,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return _FROM_LEARNED if is_near else attempt
 
     def limit_learned(self, point: Array) -> Array:
-        """Limit the catch points in a learned starting point (n,), so that searches can move them.
+        """Limit the catch points in a predicted starting point, so that searches can move them.
 
         Catches are earliest with catch points at the hoop's rim. There the variables of a catch
         point grow without bound while the point hardly moves, and a re-plan could not move it back.
@@ -191,7 +195,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return self.join(offsets, natural)
 
     def _guess(self, context: CatchContext, guess: Array) -> Array:
-        """Return the end variables (N, 12) that one row of `guess_table` describes."""
+        """Return the 12 variables of each of N catches for one row of `guess_table`, (N, 12)."""
         case = context.case
         factor, *of_catches = guess
         begin = jnp.zeros_like(context.times[:1])
@@ -217,9 +221,9 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         )
 
     def meet(self, natural: Array, context: CatchContext) -> ChainEnds:
-        """Return the catches that the end variables (N, 12) describe, as ends of the segments.
+        """Return the N catches that their 12 variables each describe, as ends of the segments.
 
-        The excess (2, N) has two rows: the net's angle, and the time after the horizon.
+        The excess (2, N) has two rows: excess of the net's angle, and of the time over the horizon.
         """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
@@ -238,7 +242,8 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         excess = (jnp.cos(angle) - facing) / (angle * jnp.sin(angle))
         excess = jnp.where(moving, excess, -1.0)
         tail_states = jnp.stack([pos, natural[:, 3:6], acc, natural[:, 9:12]], axis=1)
-        # Subtract the tolerance of feasible plans, so that no catch is later than the horizon.
+        # Feasible plans may exceed a limit by the tolerance. It is added here, so that no catch is
+        # later than the horizon.
         late = times / context.horizon - 1.0 + FEASIBILITY_TOLERANCE
         return ChainEnds(
             durations=durations,
@@ -251,11 +256,11 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
     def encode(
         self, context: CatchContext, durations: Array, tail_states: Array, offsets: Array
     ) -> Array:
-        """Return the point (n,) that describes given catches: the inverse of `decode`.
+        """Return the decision variables that describe N given catches: the inverse of `decode`.
 
         Balls off the net's plane are projected onto it, and balls outside of the hoop onto its rim.
-        Segments have durations (N,) [s], states of the quadrotor at the catches (N, 4, 3), and
-        whitened waypoint offsets (N, M - 1, 3).
+        The N segments have durations (N,) [s], end states (N, 4, 3) of the quadrotor, and M pieces
+        with offsets (N, M - 1, 3) of the waypoints.
         """
         case, net = context.case, context.case.net
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -265,7 +270,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         across = jnp.stack(jax.vmap(tangent_basis)(axis), axis=1)  # (N, 2, 3)
         share = jnp.sum(across * miss[:, None], axis=2) / (_RIM * net.radius)
         squared = jnp.sum(share**2, axis=1, keepdims=True)
-        # Even nearer to the rim, the catch point would hardly move with its variables.
+        # Keep the catch point off the rim, where it would hardly move with its variables.
         share *= jnp.minimum(1.0, _ENCODED_RIM / jnp.sqrt(jnp.maximum(squared, 1e-12)))
         place = share / jnp.sqrt(1.0 - jnp.sum(share**2, axis=1, keepdims=True))
         natural = jnp.concatenate(

@@ -24,7 +24,8 @@ INSTANT = 0.05  # [s], least time between two catches
 _ACCELERATION = 7.0  # [m/s^2], of the point that models the quadrotor
 _TURNING = 0.2  # [s], time to tilt before the point starts to move
 _STEEPEST = 0.2  # greatest sine of a target's angle of ascent at a catch
-# [m], greatest shortfall of a tried optional target: plans reach farther than the estimate.
+# [m], greatest estimated lack of distance at which an optional target is still tried, because plans
+# reach farther than the estimate.
 _MARGIN = 0.8
 
 
@@ -38,7 +39,7 @@ class Timetable:
 
 
 def sample_targets(case: CatchCase) -> tuple[Array, BallState, Array]:
-    """Return times (N, K) [s] up to N horizons, with the targets' states (N, 3, K) and speeds."""
+    """Sample N targets at K times: times (N, K) [s], states (N, 3, K), speeds (N, K) [m/s]."""
     shares = jnp.asarray(np.arange(1, GRID + 1) / GRID, case.gravity.dtype)
     times = case.horizon[:, None] * shares[None]
     along = lambda target, at: over_lanes(functools.partial(state_at, target))(at)  # noqa: E731
@@ -54,7 +55,7 @@ def timetable(case: CatchCase) -> Timetable:
 
 
 def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, Array]:
-    """Return the positions (N, 3, K) for catching N targets, and penalties; see `Timetable`."""
+    """Return quadrotor's positions (N, 3, K) at catches of N targets at K times, and penalties."""
     net, limits = case.net, case.limits
     from_below = jnp.maximum(states.vel[:, 2] / speed - _STEEPEST, 0.0)
     places = states.pos - net.height * jnp.asarray([[[0.0], [0.0], [1.0]]], states.pos.dtype)
@@ -97,7 +98,7 @@ def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """Return the sum () [m] of the shortfalls of a choice at its times; see `arrival`."""
+    """Return the sum () [m] of distances that the quadrotor lacks at the catches of a choice."""
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
     states = jax.tree.map(lambda leaf: leaf[..., None], targets_at(targets, times))
@@ -110,9 +111,10 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
 
 
 def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice, Array]:
-    """Return an order (N,) with its earliest times of catches, and the sum () [m] of shortfalls.
+    """Return an order of N targets with its earliest times of catches, and the shortfall () [m].
 
-    Absent targets are moved to the end of the order. See `arrival` for the shortfall.
+    The shortfall is the sum of the distances that the quadrotor lacks. Absent targets are moved to
+    the end of the order.
     """
     order = order[jnp.argsort(~case.present[order], stable=True)]
 
@@ -157,7 +159,7 @@ def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
 
 
 def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
-    """Return which targets may be caught next, (N,) bool, by their shortfalls (N,) [m]."""
+    """Return which of N targets may be caught next, by the distances `shortfalls` [m] it lacks."""
     return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
 
 

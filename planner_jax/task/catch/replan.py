@@ -47,7 +47,7 @@ class ReplanContext:
 
     catch: CatchContext
     task: Replanning
-    start: Array  # (n,), the previous plan, fitted to the new targets
+    start: Array  # (n,), decision variables of the previous plan, fitted to the new targets
     keep: Array  # () bool, whether the previous plan is returned because too little time is left
 
 
@@ -129,7 +129,7 @@ class ReplanCatch(OptimisedPlanner):
         return Replanning(case=left, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the context of the remaining catches, and the previous plan as a start."""
+        """Return the data of the remaining catches, and a starting point from the previous plan."""
         context = self.planner.prepare(task.case)
         left = _segments(task)[1][0]
         return ReplanContext(
@@ -140,7 +140,7 @@ class ReplanCatch(OptimisedPlanner):
         )
 
     def _start(self, task: Replanning, context: CatchContext) -> Array:
-        """Return the starting point (n,): the rest of the previous plan, fitted to new targets."""
+        """Return a starting point: the previous plan's remainder, fitted to the new targets."""
         planner, net = self.planner, task.case.net
         trajectory = task.previous.trajectory
         segments, times = _segments(task)
@@ -173,18 +173,18 @@ class ReplanCatch(OptimisedPlanner):
         return planner.encode(context, durations, tails, offsets)
 
     def guesses(self, context: ReplanContext, num: int) -> Array:
-        """Return the previous plan, followed by guesses of the planner from scratch, (num, n)."""
+        """Return `num` starting points: the previous plan, then the planner's own guesses."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return the planner's objective; it is constant where the previous plan is returned."""
+        """Return cost and violation; constant if the previous plan is going to be returned."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan at a point, or the remainder of the previous plan."""
+        """Return the plan of decision variables, or, with `keep`, the previous plan's remainder."""
         plan = self.planner.decode(point, context.catch)
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan
@@ -192,7 +192,7 @@ class ReplanCatch(OptimisedPlanner):
 
 
 def _states(coeffs: Array, time: Numbers) -> Array:
-    """Evaluate K polynomial pieces (K, D + 1, 3) at times (K,) in them; return states (K, 4, 3)."""
+    """Return states (K, 4, 3) of K polynomial pieces, each at its time (K,) [s] since its start."""
     factors, powers = state_basis(coeffs.shape[1])
     basis = time[:, None, None] ** jnp.asarray(powers, time.dtype)[None]
     basis *= jnp.asarray(factors, time.dtype)[None]
@@ -200,14 +200,14 @@ def _states(coeffs: Array, time: Numbers) -> Array:
 
 
 def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
-    """Return the states (K, 4, 3), position to jerk, of a trajectory at times (K,) [s]."""
+    """Return the states (K, 4, 3), position to jerk, of a trajectory at K times (K,) [s]."""
     ends = jnp.cumsum(trajectory.durations)
     piece = jnp.sum(times[:, None] >= ends[None, :-1], axis=1)
     return _states(trajectory.coeffs[piece], times - (ends - trajectory.durations)[piece])
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
-    """Return the previous plan's segment (N,) to each remaining catch, and the times (N,) [s]."""
+    """Return index of segment and time [s] of each remaining catch of the previous plan, (N,)."""
     times = task.previous.times
     num_past = jnp.sum(times <= task.elapsed)
     segments = jnp.minimum(num_past + np.arange(times.size), times.size - 1)
@@ -217,8 +217,8 @@ def _segments(task: Replanning) -> tuple[Array, Array]:
 def _remainder(task: Replanning, context: CatchContext) -> CatchPlan:
     """Return the remainder of the previous plan in the same number of pieces.
 
-    The remainder of the current piece is split into equal parts: one takes the place of the piece
-    itself, and the others take the places of the earlier pieces of its segment.
+    The remainder of the current piece is split into equal parts, which replace the piece itself and
+    the earlier pieces of its segment.
     """
     previous, num = task.previous, context.times.size
     segments, times = _segments(task)

@@ -37,7 +37,7 @@ _PARALLEL = SUITES["hexagon6"].horizon  # [s], latest time of a catch of targets
 
 @dataclasses.dataclass(frozen=True)
 class _Throw:
-    """Distribution of a thrown ball; the table of the module's docstring lists the values."""
+    """Ranges from which a thrown ball is drawn."""
 
     land: tuple[float, float] = (1.0, 0.4)  # [m], half sides of the landing rectangle
     flight: tuple[float, float] = (1.4, 1.78)  # [s], from the launch to the ground
@@ -119,17 +119,14 @@ def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
 
 
 def _module(array: PyTree) -> ModuleType:
-    """Return the module `jax.numpy` for a JAX array, and `numpy` for a NumPy array."""
     return jnp if isinstance(array, jax.Array) else np
 
 
 def _between(uniform: PyTree, low: float, high: float) -> PyTree:
-    """Map uniform random numbers of [0, 1) to the interval from `low` to `high`."""
     return low + uniform * (high - low)
 
 
 def _unit(angle: PyTree) -> PyTree:
-    """Return horizontal unit vectors (..., 3) at angles (...) [rad]."""
     xp = _module(angle)
     return xp.stack([xp.cos(angle), xp.sin(angle), xp.zeros_like(angle)], axis=-1)
 
@@ -138,7 +135,7 @@ def _unit(angle: PyTree) -> PyTree:
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Return thrown balls, from three random numbers each, and when they fall to `CATCH_HEIGHT`."""
+    """Make thrown balls from three random numbers each, and the times of latest catches [s]."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -149,7 +146,7 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return positions and velocities (B, 3) of thrown balls at time 0, and horizons (B,) [s]."""
+    """Return positions and velocities of B thrown balls at time 0, and their latest catches [s]."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -160,7 +157,7 @@ def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
     share, _ = _fly(xp.zeros_like(land), xp.ones_like(land), flight, throw.drag, gravity=0.0)
     delay = np.full(len(land), throw.delay)
     pos, vel = _fly(launch, (land - without) / share, delay, throw.drag)
-    # Bisection for the horizon: at `early` the ball has not yet fallen below `CATCH_HEIGHT`.
+    # Bisection for the latest time of a catch, at which the ball falls below `CATCH_HEIGHT`.
     rise = xp.maximum(vel[:, 2], 0.0) / GRAVITY
     early, late = xp.minimum(0.5 * rise, flight - delay), flight - delay
     for _ in range(_BISECTIONS):
@@ -187,7 +184,7 @@ def earliest_throw(name: str) -> tuple[BallState, float]:
 
 
 def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree, PyTree]:
-    """Return positions and velocities of balls after a time, linear drag [Yu2023catch, eq. 9]."""
+    """Return balls' positions and velocities after a time; drag is linear [Yu2023catch, eq. 9]."""
     xp, t = _module(vel), time[:, None]
     pull = np.array([0.0, 0.0, -gravity])
     if drag == 0.0:
@@ -202,14 +199,14 @@ def _fly(pos, vel, time, drag: float, gravity: float = GRAVITY) -> tuple[PyTree,
 
 
 def _lines(pos: PyTree, vel: PyTree) -> BallPath:
-    """Return targets with positions `pos` (B, N, 3) at time 0 and constant velocities `vel`."""
+    """Return N targets for each of B cases, with positions `pos` at time 0 and constant `vel`."""
     ball = BallState(pos=pos, vel=vel)
     drag, gravity = host_leaf(np.zeros(pos.shape)), host_leaf(np.zeros(pos.shape[:2]))
     return BallPath(ball, drag=drag, gravity=gravity)
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
-    """Return two oscillating targets, from nine random numbers each, and their horizons [s]."""
+    """Make two oscillating targets from nine random numbers each, and times of latest catches."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
@@ -222,7 +219,7 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Return three targets along a triangle's sides, from seven random numbers, and horizons."""
+    """Make three targets along a triangle's sides from seven random numbers, and latest times."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
@@ -233,7 +230,7 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Return parallel targets on a regular polygon, from eight random numbers, and horizons."""
+    """Make parallel targets on a regular polygon from eight random numbers, and latest times."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -248,14 +245,18 @@ def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
 def _rush(
     uniform: PyTree, *, of: Callable, num: int, first: float, after: float, spread: float
 ) -> tuple[BallPath, PyTree]:
-    """Return targets of the function `of`, with horizons from two more random numbers for each."""
+    """Make `num` targets by the function `of`, each with a random deadline for its catch [s].
+
+    In a random order of the targets the deadlines are `first`, `first` + `after` and so on, each
+    changed by up to `spread` / 2.
+    """
     xp, own = _module(uniform), uniform[:, : -2 * num]
     order = xp.argsort(uniform[:, -2 * num : -num], axis=1)
     return of(own)[0], first + after * order + spread * (uniform[:, -num:] - 0.5)
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Return `num` sinking balls, from six random numbers each, and their horizons [s]."""
+    """Make `num` sinking balls from six random numbers each, and times of latest catches [s]."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])

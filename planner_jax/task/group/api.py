@@ -21,10 +21,10 @@ def planner(
 
     Args:
         name: `spacetime`, or a planner of another package.
-        decide: how to find the order. "best" plans the orders with the best estimates and selects
-            the plan that ends first. "greedy" always meets next the target with the earliest
-            estimated meeting. "given" uses the orders in the cases. A decision with settings, such
-            as `Best(finalists=3)`, is also accepted.
+        decide: how to find the order. "best" plans the orders that are estimated to end first, and
+            selects the plan that ends first. "greedy" always meets next the target with the
+            earliest estimated meeting. "given" uses the orders in the cases. An object is also
+            accepted: `Best(finalists=3)` plans only three orders.
         **options: fields of the planner's dataclass.
 
     Returns:
@@ -38,7 +38,7 @@ def planner(
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
-    """Judge plans of groups: the referee `referee_groups` checks the drive to every target.
+    """Judge plans of groups: an independent check, the referee, of the drive to every target.
 
     Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
     `referee_intercepts`, which judges each drive as one interception.

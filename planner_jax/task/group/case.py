@@ -68,11 +68,11 @@ class InterceptGroup:
         return np.shape(self.present)[-1]
 
     def with_choice(self, choice: GroupChoice) -> "InterceptGroup":
-        """Return the case, or the batch, with its order of targets replaced by a choice's order."""
+        """Return the case, or the batch, with the order of targets that `choice` holds."""
         return dataclasses.replace(self, order=choice.order)
 
     def leg(self, target: Array, begin: Array, car: CarState) -> InterceptCase:
-        """Return the case of the drive to a target, from the state `car` at `begin` () [s]."""
+        """Return the case of the drive to one target, from the state `car` at time `begin` [s]."""
         shared = self.shared
         path = jax.tree.map(lambda leaf: leaf[target], shared.target)
         movers = shared.movers
@@ -82,7 +82,7 @@ class InterceptGroup:
             speed=car.speed,
             curvature=car.curvature,
             target=LaterPath(path=path, begin=begin),
-            # [s], at least 1 ms, because the time of a case must be positive.
+            # Remaining time [s]: at least 1 ms, because the time of a case must be positive.
             time=jnp.maximum(shared.time - begin, 1e-3),
             movers=dataclasses.replace(movers, centre=movers.centre + begin * movers.velocity),
         )

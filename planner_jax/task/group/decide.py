@@ -1,8 +1,8 @@
 """Decisions about the order in which a car meets the targets of a group.
 
-Orders are ranked by the estimated time of their last meeting. The estimate ignores obstacles: the
-car turns towards the next meeting point and then drives straight to it. Motions are planned only
-for the orders of the best ranks.
+Orders are ranked by the estimated time of their last meeting; meetings for which the car would be
+too late add to the rank. The estimate ignores obstacles: the car turns towards the next meeting
+point and then drives straight to it. Motions are planned only for the orders of least rank.
 """
 
 import dataclasses
@@ -45,7 +45,7 @@ def _start(group: InterceptGroup) -> _Meeting:
 
 
 def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
-    """Return times (K,) [s] up to the case's time, and positions (N, K, 2) [m] of the targets."""
+    """Return K times (K,) [s] up to the case's time, and the N targets' positions (N, K, 2) [m]."""
     shares = jnp.asarray(np.arange(1, _GRID + 1) / _GRID, group.shared.time.dtype)
     times = group.shared.time * shares
     of_one = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
@@ -55,14 +55,15 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the car's earliest meeting with the target `target` after the meeting `last`."""
+    """Estimate the earliest meeting with one target after the meeting `last`, from `_timetable`."""
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]
     distance = jnp.sqrt(jnp.maximum(jnp.sum(away**2, axis=1), 1e-12))
     heading = jnp.arctan2(away[:, 1], away[:, 0])
     turn = jnp.abs((heading - last.heading + np.pi) % (2.0 * np.pi) - np.pi)
-    # The turn rate v kappa is greatest if the limits of kappa and of v^2 kappa are both reached.
+    # With speed v and curvature kappa, the turn rate v kappa is greatest where the curvature and
+    # the lateral acceleration v^2 kappa both reach their limits.
     rate = _TURNING * jnp.sqrt(limits.curvature * limits.lateral_acceleration)
     duration = distance / (_PACE * limits.speed) + turn / rate
     lack = last.time + duration - times
@@ -76,7 +77,7 @@ def _next(
 
 
 def _rank(group: InterceptGroup, table: tuple[Array, Array], order: Array) -> Array:
-    """Return the rank () [s] of an order (N,): time of the last meeting plus 10 times its delay."""
+    """Return the rank () [s] of an order (N,) of N targets: last meeting time plus 10 * delay."""
 
     def advance(last: _Meeting, target: Array) -> tuple[_Meeting, None]:
         return _select(group.present[target], _next(group, table, last, target), last), None
@@ -95,7 +96,7 @@ MOST_PERMUTED = 8  # greatest number N of targets for which all N! orders are es
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(Decision):
-    """Decision that proposes the orders whose last meeting is estimated to be earliest.
+    """Decision on the order of targets that proposes those estimated to end earliest.
 
     All N! orders of the N <= 8 targets are estimated. The planner plans each of the best orders,
     the finalists, and selects the plan whose last meeting is earliest.
@@ -107,7 +108,7 @@ class Best(Decision):
         require_settings(self)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the F orders of one group with the best estimates, best first, leaves (F, N)."""
+        """Return the F = `finalists` best orders of a group's N targets, best first, (F, N)."""
         num = case.num_targets
         if num > MOST_PERMUTED:
             rule = f"at most {MOST_PERMUTED}, because all orders are evaluated"
@@ -123,7 +124,8 @@ class Best(Decision):
         is_proposed = is_last & ~jnp.any(falls, axis=1)
         ranking = jnp.argsort(jnp.where(is_proposed, rank, jnp.inf))
         chosen = ranking[: min(self.finalists, len(orders))]
-        # Repeat the best order if there are fewer than F; `GroupIntercept` plans equal legs once.
+        # If there are fewer orders than `finalists`, the best one fills the remaining rows. This
+        # takes no time, because `GroupIntercept` plans equal drives only once.
         chosen = jnp.where(is_proposed[chosen], chosen, chosen[0])
         return GroupChoice(order=orders[chosen])
 
@@ -134,7 +136,7 @@ class Greedy(Decision):
     """Decision that always meets next the target with the earliest estimated meeting."""
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the greedy order of one group as the only proposal, leaves (1, N)."""
+        """Return the greedy order of a group's N targets as the only proposal, (1, N)."""
         table, num = _timetable(case), case.num_targets
         last, is_open, order = _start(case), jnp.ones(num, bool), []
         for _ in range(num):
@@ -159,6 +161,6 @@ class Given(Decision):
         require_orders(cases.order)
 
     def propose(self, case: InterceptGroup) -> GroupChoice:
-        """Return the order stored in one case as the only proposal, leaves (1, N)."""
+        """Return the order of N targets stored in one case as the only proposal, (1, N)."""
         present_first = jnp.argsort(~case.present[case.order], stable=True)
         return GroupChoice(order=case.order[present_first][None])

@@ -1,8 +1,8 @@
 """The default planner of groups of targets: it plans leg after leg, each as early as possible.
 
-A leg is an interception that starts at the end of the previous leg, with targets and moving
-obstacles moved to that time. `SpacetimeIntercept` plans it as early as possible. If the car cannot
-drive the early paths of the reach set, it plans the leg with the least effort instead. The first
+A leg is the drive to one target. It starts at the end of the previous leg, with targets and moving
+obstacles moved to that time. `SpacetimeIntercept` plans each leg such that the meeting is as early
+as possible. If this fails, it plans the leg with the least squared acceleration instead. The first
 legs of all groups of a batch, in all their proposed orders, are planned together, then all second
 legs, and so on.
 """
@@ -24,21 +24,21 @@ from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.default_planner import SpacetimeIntercept
 from planner_jax.task.intercept.plan import InterceptPlan
 
-# A leg has fewer paths than an interception of a single target, because there are many legs.
+# Search for a leg from 12 random paths, instead of 32 for a single target: there are many legs.
 _EARLY = dataclasses.replace(SpacetimeIntercept("early").attempts[0], paths=12)
 
 
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class GroupIntercept(Planner):
-    """Composite planner of groups of targets whose order is decided.
+    """Planner of groups of targets with a decided order; other planners plan the drives (legs).
 
     To save computing time, every leg ends as early as possible, even if that delays the next leg.
     """
 
     case_type: ClassVar[type] = InterceptGroup
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
-    # Only one search, because the other searches of this planner take long.
+    # Plans every leg, with one search only, because the further searches of this planner take long.
     planner: SpacetimeIntercept = SpacetimeIntercept("early", searches=(_EARLY,))
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
@@ -68,7 +68,7 @@ class GroupIntercept(Planner):
         return jax.device_get(_join(cases, begins, legs))
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
-        """Plan the legs where `needed` (B,) is true; the plans of other legs have no meaning."""
+        """Plan those of B legs (drives) for which `needed` is true, (B,); ignore other results."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
@@ -89,10 +89,7 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return whether the planner `patient` may solve a leg that has this status.
-
-    This includes legs without a path: `patient` tries other end times and sizes of the body.
-    """
+    """Return whether the planner `patient` may still solve a leg that has this status."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 
@@ -100,10 +97,10 @@ def _is_open(status: Array) -> Array:
 def _make_legs(
     cases: InterceptGroup, k: Array | int, begin: Array, car: CarState, solved: Array
 ) -> tuple[InterceptCase, Array]:
-    """Return the legs to the k-th targets of the orders, and whether each leg is needed, (B,).
+    """Return the drives (legs) of B groups to their k-th targets, and which are needed, (B,) bool.
 
-    The legs start at the times `begin` (B,) [s] in the states `car`. `solved` (B,) bool is true if
-    all previous legs are solved.
+    The legs start at the times `begin` (B,) [s] in the states `car`. A leg is needed if its target
+    exists and all previous legs are solved: `solved` (B,) bool.
     """
 
     def of_one(case: InterceptGroup, begin: Array, car: CarState) -> tuple[InterceptCase, Array]:
@@ -116,7 +113,7 @@ def _make_legs(
 
 @jax.jit
 def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -> InterceptPlan:
-    """Replace the plans (B, ...) of legs that are not needed by plans that take no time."""
+    """Replace the plans of those of B legs that are not needed by plans that take no time."""
     num = plans.speed.shape[1]
     zero = jnp.zeros_like(plans.time)
     empty = InterceptPlan(
@@ -141,7 +138,7 @@ def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -
 def _advance(
     plans: InterceptPlan, begin: Array, solved: Array, needed: Array
 ) -> tuple[CarState, Array, Array]:
-    """Return the cars' states and times (B,) [s] after their legs, and whether all are solved."""
+    """Return B cars' states and times [s] after a leg, and whether all legs so far are solved."""
 
     def end(plan: InterceptPlan) -> CarState:
         duration = jnp.where(plan.time > 0.0, plan.time, 1.0)
@@ -153,7 +150,7 @@ def _advance(
 
 @jax.jit
 def _join(cases: InterceptGroup, begins: Array, legs: InterceptPlan) -> GroupPlan:
-    """Join legs (N, B, ...), which start at the times `begins` (N, B) [s], to plans of groups."""
+    """Join the N legs of B groups, which start at the times `begins` (N, B) [s], to B plans."""
     begins, legs = jax.tree.map(lambda leaf: jnp.moveaxis(leaf, 0, 1), (begins, legs))
     # The status of a plan is the status of its first unsolved leg.
     first = jnp.argmax(~is_solved(legs.status), axis=1)

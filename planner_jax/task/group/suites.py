@@ -1,4 +1,4 @@
-"""Named, seeded suites of groups: several targets for one car among walls and movers.
+"""Seeded random cases of groups: several targets for one car among walls and moving obstacles.
 
 `docs/suites.md` states how they are drawn. World frame in the plane, SI units.
 """
@@ -60,7 +60,7 @@ def draw(
 def _draw_target(
     suite: str, randoms: list[np.random.Generator], draws: dict[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Draw one more target for each of B cases, again until no cause of rejection applies to it."""
+    """Draw one more target for each of B cases, until no rule of `first_cause` rejects it."""
     spec, pending = SUITES[suite], np.arange(len(randoms))
     turning = np.array([random.random() < 0.5 for random in randoms])
     targets = {name: np.zeros_like(draws[name]) for name in _TARGET}

@@ -33,8 +33,9 @@ def draw(
 
     Args:
         num: number of cases, >= 1.
-        suite: name of a family of random cases: "court" (default), a real scenario of [Yu2023bat],
-            "S.1" to "S.6", or a suite of another package.
+        suite: name of a family of random cases: "court" (default) has serves from the whole court,
+            "S.1" to "S.6" have serves as in the real experiments of [Yu2023bat]. Suites of other
+            packages are also accepted.
         seed: seed of the suite, >= 0. Case k of a suite and seed is always the same case.
         first: index k of the first case of the batch, >= 0.
         start: (3,) [m], hover position of the quadrotor; or "uniform": random in its half court.
@@ -69,7 +70,7 @@ def planner(
 
     * `exact`: recommended; every plan satisfies the equations of contact, impact and landing.
     * `bat`: the planner of [Yu2023bat], which optimises impact and trajectory together.
-    * `bat-lite`: `bat` without the transition point before the impact.
+    * `bat-lite`: `bat` without the state before the impact at which the swing starts.
     * `juggle`: the baseline of [Yu2023bat]: a motion primitive to a fixed impact, not optimised.
 
     Args:
@@ -104,7 +105,8 @@ def judge(cases: HitCase, plans: HitPlan, **settings: object) -> HitVerdict:
     Args:
         cases: one case, or a batch.
         plans: one plan for each case.
-        **settings: settings of `referee_hits`, such as `drag_after_impact` and `tolerance`.
+        **settings: settings of `referee_hits`, such as `drag_after_impact`: whether the returned
+            ball has drag.
 
     Returns:
         A verdict with the batch shape of the cases: whether each plan is a `success`, the reason

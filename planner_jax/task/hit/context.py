@@ -1,4 +1,4 @@
-"""Functions of all hit planners: tables of balls, limits of the impact, balls out of reach."""
+"""Functions that all hit planners use: ball's path, limits at the impact, balls out of reach."""
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,13 +25,13 @@ class HitContext:
 
 
 def prepare_hit(case: HitCase, num_nodes: int) -> HitContext:
-    """Tabulate the incoming ball's flight up to 1.1 times the duration of its drag-free flight."""
+    """Tabulate the incoming ball's flight, for 1.1 times the duration of a flight without drag."""
     fall, _ = drag_free_fall_time(case.ball, jnp.zeros_like(case.drag), case.gravity)
     horizon = lax.stop_gradient(1.1 * fall)
     path = predict_path(case.ball, horizon, case.drag, case.gravity, num_nodes=num_nodes)
     node = jnp.maximum(jnp.sum(path.pos[1:, 2] > 0.0), 1)
-    # After the table's last time at which the ball is above the ground, the ball is assumed to sink
-    # at the constant speed that it has then.
+    # Landing time: after the last tabulated time at which the ball is above the ground, its rate
+    # of descent is assumed to be constant.
     sinking = jnp.maximum(-path.vel[node, 2], 0.1)
     landing = (node - 1).astype(sinking.dtype) * path.resolution + path.pos[node, 2] / sinking
     return HitContext(case=case, path=path, landing_time=lax.stop_gradient(landing))
@@ -49,10 +49,10 @@ class Impact:
 def is_too_far(context: HitContext) -> Array:
     """Return true only if the quadrotor provably cannot hit the ball at any time, () bool.
 
-    At an impact the quadrotor is at the racket's height from the ball and above its least height,
-    and the ball is between ground and greatest apex. This is tested at the times of the ball's
-    table, with the distances that ball and quadrotor can move in half a step added. The result is
-    also false if a number is not finite.
+    At an impact the distance between quadrotor and ball is the racket's height, the quadrotor is
+    above its least height, and the ball is between the ground and the greatest allowed apex. These
+    conditions are tested at the times of the ball's table, with a margin for the distances that
+    ball and quadrotor can move in half a time step. If a number is not finite, the result is false.
     """
     case, path = context.case, context.path
     limits, ball = case.limits, case.ball
@@ -82,5 +82,5 @@ def apex_excess(apex: Array, min_apex: Array, max_apex: Array) -> Array:
 
 
 def hitting_speed_excess(vel: Array, limit: Array) -> Array:
-    """Return the excess v_j^2 / v_max,j^2 - 1, (3,), for each world axis j [Yu2023bat, eq. 24]."""
+    """Return v_j^2 / v_max,j^2 - 1, (3,), for velocity v and world axis j [Yu2023bat, eq. 24]."""
     return (vel * reciprocal(limit)) ** 2 - 1.0

@@ -47,7 +47,7 @@ SCENARIOS = _scenario_names()
 
 
 def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
-    """Return bounds (4, 2, 2) [m] of the regions; axes: region, |x| or y, lower or upper bound."""
+    """Return lower and upper bounds of |x| and y for the regions, (4, 2, 2) [m]; |x| <= `depth`."""
     near, far = (DEAD_ZONE, NEAR_LINE), (NEAR_LINE, depth)
     whole, middle = (DEAD_ZONE, depth), (-LANE_LINE, LANE_LINE)
     left, right = (LANE_LINE, HALF_WIDTH), (-HALF_WIDTH, -LANE_LINE)
@@ -55,7 +55,7 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Return serve, landing and target region (..., 3), 1 to 4, of scenario indices (...)."""
+    """Return serve, landing and target region (..., 3), 1 to 4 (N, F, L, R), of scenarios (...)."""
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 
@@ -69,7 +69,7 @@ def target_of(scenario) -> np.ndarray:
 
 
 def _acceleration(velocity: np.ndarray, drag: np.ndarray, gravity: np.ndarray) -> np.ndarray:
-    """Return the ball's acceleration g - K_D |v| v, (3, ...) [m/s^2] [Yu2023bat, eq. 2]."""
+    """Return a ball's acceleration (3, ...) [m/s^2] by gravity and drag [Yu2023bat, eq. 2]."""
     x, y, z = velocity
     acceleration = -drag * np.sqrt(x * x + y * y + z * z) * velocity
     acceleration[2] -= gravity
@@ -94,7 +94,7 @@ def _components_first(vectors: ArrayLike) -> np.ndarray:
 
 
 def fly(position, velocity, duration, drag, gravity, *, num_steps: int = _FLIGHT_STEPS):
-    """Return position and velocity (..., 3) of balls after a flight with quadratic drag."""
+    """Return balls' positions [m] and velocities (..., 3) after `duration` [s], quadratic drag."""
     step = np.asarray(duration, float) / num_steps
     drag, gravity = np.asarray(drag, float), np.asarray(gravity, float)
     position, velocity = np.asarray(position, float), np.asarray(velocity, float)
@@ -115,7 +115,7 @@ def landing(position, velocity, drag, gravity):
     Args:
         position: (..., 3) [m], with z > 0.
         velocity: (..., 3) [m/s].
-        drag: (...) K_D [1/m], >= 0.
+        drag: (...) [1/m], coefficient of quadratic drag, >= 0.
         gravity: (...) [m/s^2], magnitude, > 0.
 
     Returns:
@@ -149,7 +149,7 @@ def landing(position, velocity, drag, gravity):
 
 
 def check_cases(cases: HitCase) -> None:
-    """Raise `CaseError` unless all cases are valid and their balls land at x < 0."""
+    """Raise `CaseError` unless all cases are valid and their balls land in the half x < 0."""
     require_sound(cases)
     batch, ball = cases.batch_shape, cases.ball
     position, velocity = np.asarray(ball.pos, float), np.asarray(ball.vel, float)

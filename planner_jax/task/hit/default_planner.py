@@ -1,8 +1,10 @@
 """The `exact` hit planner: its decision variables satisfy contact, impact and landing exactly.
 
 Every plan meets the ball and returns it to the target; only inequalities are treated by penalties.
-As in [Yu2023bat, eqs 11-12] the impact determines the racket's normal and its speed along the
-normal. The choice of variables avoids the singular divisions of [Yu2023bat, eqs 13-14].
+As in [Yu2023bat, eqs 11-12] the ball's velocities before and after the impact determine the
+racket's normal and its speed along the normal. In [Yu2023bat, eqs 13-14] components of velocity and
+thrust are variables, and the others follow from divisions that may be by zero. Here the flight time
+after the impact is a variable instead, which avoids these divisions.
 """
 
 import dataclasses
@@ -41,9 +43,9 @@ if TYPE_CHECKING:
 
 _PROPORTIONS = (0.2, 0.5) + (1.0,) * 10
 _FEATURE_TIMES = (0.5, 0.75, 0.95)  # times of the ball that the network sees / landing time
-# Settings of searches for any feasible plan, whatever its cost. A search with the waypoints'
-# velocities as variables needs a starting point near a feasible one. If limits are active along the
-# whole trajectory, the margin is only as large as peaks between the nodes require.
+# Settings of searches for any plan that keeps the limits, whatever its cost. Searches in which the
+# waypoints' velocities are variables need a starting point that nearly keeps the limits. `margin`
+# is the relative distance from a limit at which penalties start; it must cover peaks between nodes.
 _ANY_FEASIBLE = (("energy_weight", 1e-11), ("margin", 0.01), ("nodes", 8))
 _FROM_GUESSES = (*_ANY_FEASIBLE, ("learned", False))
 WITH_VELOCITIES = (*_ANY_FEASIBLE, ("velocities", True))
@@ -56,8 +58,8 @@ _SMALL_MARGIN = (
 )
 _VELOCITY_SCALE = 2.0  # unit of the offsets of velocities; measured units range from 0.6 to 7
 _PASSING = 0.9  # greatest speed at the ball in a guess, as a fraction of the speed limit
-# Starting points, best first. Columns: impact time / landing time, flight time after the impact
-# [s], thrust / g. The first row suits easy cases; the others hit earlier, flatter or harder.
+# Starting points, the most successful first. Columns: time of the impact / time at which the ball
+# would land without a hit; flight time after the impact [s]; thrust per unit mass / gravity.
 _GUESSES = np.array(
     [
         (0.92, 1.7, 1.2),
@@ -80,10 +82,11 @@ def _hard(steps: int) -> LbfgsConfig:
     return LbfgsConfig(max_steps=steps, memory=12, tolerance=1e-6, patience=5)
 
 
-# The first two rounds solve easy cases. The later rounds search for any feasible plan, with hardly
-# any energy in the cost. Rounds 3 and 4 start at a network's point; round 4 is longer and only for
-# violations below 0.1. Rounds 5 and 6 start at all rows of `_GUESSES` and continue the best of
-# these starts; round 6 is only for violations below 0.04.
+# A round is an attempt to solve the cases that are unsolved so far. The first two rounds solve easy
+# cases. Later rounds search for any plan that keeps the limits: the energy has hardly any weight.
+# Rounds 3 and 4 start at a point that a network predicts. Rounds 5 and 6 start at all rows of
+# `_GUESSES` and continue the best of these starts. Rounds 4 and 6 take only cases whose greatest
+# relative excess over a limit is below `within`.
 _ROUNDS = (
     Round(1, LbfgsConfig(max_steps=3)),
     Round(1, LbfgsConfig(max_steps=60)),
@@ -109,7 +112,8 @@ _ROUNDS = (
 class ExactHit(ChainPlanner[HitCase, HitPlan]):
     """A planner of minimum-snap hits whose decision variables satisfy the equations of the impact.
 
-    The n = 3 (M - 1) + 8 variables, in units of `scale`, are the whitened waypoint offsets; the
+    The trajectory has M polynomial pieces and M - 1 waypoints. The 3 (M - 1) + 8 decision
+    variables, in units of `scale`, are the waypoints' offsets from the smoothest trajectory; the
     logarithms of the impact time, of the ball's flight time after the impact and of the thrust at
     the impact; two velocities of the racket across its normal; and the jerk at the impact. With
     `velocities` the velocities at the waypoints are 3 (M - 1) further variables after the offsets.
@@ -118,9 +122,9 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     reaches the target. The ball's velocities determine the racket's normal and its speed along the
     normal [Yu2023bat, eqs 11-12]. The other variables then determine the racket's state.
 
-    The cost is energy_weight * integral |snap|^2, plus the integral of the smoothed hinges of the
-    limits [Yu2023bat, eq. 18a] and extras, plus impact_weight * the hinges of apex and hitting
-    speed [Yu2023bat, eqs 21 and 24].
+    The cost is energy_weight * integral |snap|^2, plus the integral of smooth one-sided penalties
+    on the limits [Yu2023bat, eq. 18a] and of the user's extra terms, plus impact_weight * penalties
+    on apex and hitting speed [Yu2023bat, eqs 21 and 24].
     """
 
     case_type = HitCase
@@ -128,8 +132,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     num_end_variables = 8
     guess_table = _GUESSES
     decode_nodes = (16, 16)
-    # Relative durations of the pieces. The first are short, because a hovering quadrotor must start
-    # to turn at once, and its jerk is continuous.
+    # Relative durations of the pieces. The first pieces are short, so that a hovering quadrotor can
+    # start to turn at once although its jerk is continuous.
     proportions: tuple[float, ...] = _PROPORTIONS
     nodes: int = 4  # intervals of each piece at whose ends penalties are evaluated
     time_weight: float = 0.0
@@ -147,12 +151,12 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
 
     @property
     def end_weight(self) -> float:
-        """Weight [s] of the penalties at the impact."""
+        """Weight [s] of the penalties on the returned ball's apex and on the hitting speed."""
         return self.impact_weight
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant linear maps from boundary states and offsets to the trajectory."""
+        """Constant matrices that map end states and waypoint offsets to the trajectory."""
         return proportional_minco(4, self.proportions, self.velocities)
 
     @property
@@ -166,18 +170,18 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return 3 * (self.num_pieces - 1)
 
     def _fit_scale(self, scale: tuple[float, ...]) -> tuple[float, ...]:
-        """Return units of all variables; missing units of waypoint velocities are inserted."""
+        """Return `scale`, with units of the waypoint velocities inserted if these are missing."""
         places = self._num_places
         if not self.velocities or len(scale) != places + self.num_end_variables:
             return scale
         return scale[:places] + (_VELOCITY_SCALE,) * places + scale[places:]
 
     def start_network(self, case: HitCase) -> StartNetwork | None:
-        """Return the network for the first guess; None for unusual sizes or cases with extras.
+        """Return the network that predicts the first guess; None if there is no such network.
 
-        The network without velocities was trained for feasible points of little energy, the network
-        with velocities for limits that are active along the whole trajectory. With obstacles there
-        is no network: the side on which a search starts decides on which side it ends.
+        Networks exist for the default pieces and scales, one without and one with waypoint
+        velocities as variables. There is none for cases with the user's extra terms, such as
+        obstacles: the side on which a search starts decides on which side it ends.
         """
         is_usual = self.proportions == _PROPORTIONS and not case.extras
         if not self.learned or not is_usual:
@@ -187,7 +191,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return load_network(self.package, "exact-12" + "-supple" * self.velocities)
 
     def start_features(self, context: HitContext) -> Array:
-        """Return the inputs of the network, (F,): ball, target, state of the quadrotor, limits."""
+        """Return the network's inputs, a vector: ball, target, state of the quadrotor, limits."""
         case, landing = context.case, context.landing_time
         head, limits, stroke = case.head_state, case.limits, case.hit_limits
         balls = [target_at(context.path, share * landing) for share in _FEATURE_TIMES]
@@ -222,7 +226,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:
-        """Return the end variables that the first rows of `guess_table` describe, (num, 1, 8)."""
+        """Return the 8 variables of the impact for the first `num` rows of `guess_table`."""
         fraction, flight_time, thrust = jnp.asarray(_GUESSES[:num], context.landing_time.dtype).T
         times = jnp.stack(
             [
@@ -241,8 +245,8 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
     def _set_passing_speed(self, natural: Array, context: HitContext) -> Array:
         """Return a guess (8,) in which the racket's velocity across its normal is set.
 
-        A constant acceleration from the start to the impact would reach this velocity. Its length
-        is at most `_PASSING` times the speed limit.
+        The velocity is the final velocity of a motion from the start to the impact at constant
+        acceleration. Its magnitude is limited to `_PASSING` times the speed limit.
         """
         impact, case = self.impact(natural, context), context.case
         start, time = case.head_state, impact.stroke.time
@@ -253,14 +257,14 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return natural.at[3:5].set(jnp.stack([jnp.sum(vel * each) for each in across]))
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point (n,) of a search without velocities by adding zero velocity offsets."""
+        """Convert a point of a search without waypoint velocities: insert zero velocity offsets."""
         if self.velocities == cast(ExactHit, before).velocities:
             return point
         places, own = point[: self._num_places], point[self._num_places :]
         return jnp.concatenate([places, jnp.zeros_like(places), own])
 
     def meet(self, natural: Array, context: HitContext) -> ChainEnds:
-        """Return the impact that the end variables (1, 8) describe, as the end of the segment.
+        """Return the impact that its 8 variables (1, 8) describe, as the end of the trajectory.
 
         The excess (5,) is `apex_excess` (2,) followed by `hitting_speed_excess`.
         """
@@ -280,10 +284,10 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return jnp.concatenate([excess[:2], Measure.ABOVE.relative(excess[2:])])
 
     def impact(self, natural: Array, context: HitContext) -> Impact:
-        """Return the impact that the end variables (8,) describe.
+        """Return the impact that its 8 variables describe.
 
         The variables are the logarithms of the impact time, of the ball's flight time after the
-        impact and of the thrust, two speeds of the racket across its normal, and the jerk.
+        impact and of the thrust, two speeds of the racket across its normal, and the jerk (3,).
         """
         case = context.case
         time, flight_time, thrust = jnp.exp(natural[0]), jnp.exp(natural[1]), jnp.exp(natural[2])

@@ -35,7 +35,7 @@ class ReplanHitContext:
     """The context of the remaining hit, and the starting point made from the previous plan."""
 
     hit: HitContext
-    start: Array  # (n,), the previous plan's impact as a point of the search
+    start: Array  # (n,), values of the n decision variables for the previous plan's impact
 
 
 @jax.tree_util.register_static
@@ -82,11 +82,11 @@ class ReplanHit(OptimisedPlanner):
         return Replanning(case=now, previous=previous, elapsed=elapsed)
 
     def prepare(self, task: Replanning) -> ReplanHitContext:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Return the context of the remaining hit, and the previous impact as a starting point."""
+        """Return the data of the remaining hit, and a starting point from the previous impact."""
         return ReplanHitContext(hit=self.planner.prepare(task.case), start=self._start(task))
 
     def _start(self, task: Replanning) -> Array:
-        """Return the point (n,) of the previous plan's impact, with zero waypoint offsets."""
+        """Return the n decision variables for the previous impact, with zero waypoint offsets."""
         planner, stroke = self.planner, task.previous.stroke
         path = task.previous.trajectory
         vel, acc, jerk = (evaluate(path, total_duration(path), order) for order in (1, 2, 3))
@@ -104,16 +104,16 @@ class ReplanHit(OptimisedPlanner):
         return planner.join(jnp.zeros((1, planner.num_offsets // 3, 3), sizes.dtype), natural[None])
 
     def guesses(self, context: ReplanHitContext, num: int) -> Array:
-        """Return the previous impact as the first start, then guesses of the planner, (num, n)."""
+        """Return `num` starting points: the previous plan's impact, then the planner's guesses."""
         first = context.start[None]
         if num == 1:
             return first
         return jnp.concatenate([first, self.planner.guesses(context.hit, num - 1)])
 
     def objective(self, point: Array, context: ReplanHitContext) -> Evaluation:
-        """Return the objective of the inner planner at a point (n,)."""
+        """Return cost and violation of `planner` for n decision variables, (n,)."""
         return self.planner.objective(point, context.hit)
 
     def decode(self, point: Array, context: ReplanHitContext) -> HitPlan:
-        """Return the plan of the inner planner at a point (n,)."""
+        """Return the plan of `planner` for n decision variables, (n,)."""
         return self.planner.decode(point, context.hit)

@@ -8,8 +8,9 @@ DRAG = 0.0616
 # quadrotor at the line between the near and the far region.
 START = (-3.0, 0.0, 1.5)
 
-# The six scenarios of the real experiments of [Yu2023bat, Section VI-C] as names in
-# `court.SCENARIOS`: an assumption, because the paper describes them only in words.
+# The six scenarios of the real experiments of [Yu2023bat, Section VI-C] as names of serve, landing
+# and target region (N near, F far, L left, R right), for example "FNL". The names are an
+# assumption, because the paper describes the scenarios only in words.
 REAL_SCENARIOS = {
     "S.1": ("FNN", "FFN"),  # serves from different distances
     "S.2": ("FFF", "LFF"),  # serves from different directions

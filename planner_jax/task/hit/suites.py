@@ -88,8 +88,8 @@ def generate_serves(
 
     Serves come in groups that contain each scenario once, in random order. Serve k of a seed and a
     list of scenarios is always the same serve. The distribution is at the top of this module.
-    Landing point p and vertical speed are drawn uniformly; to make the horizontal velocity v
-    uniform instead, a draw is accepted with a probability proportional to |dv / dp|.
+    Landing point p and vertical speed are drawn uniformly. But the horizontal velocity v shall be
+    uniform: a draw is accepted with a probability proportional to the determinant |dv / dp|.
 
     The `scenarios` are names in court.SCENARIOS, by default all. See `pj.hit.draw` for the other
     arguments and the errors.
@@ -115,13 +115,12 @@ def generate_serves(
 
 
 def _random(seed: int, stream: int, block: int) -> np.random.Generator:
-    """Return a random generator that is independent of the generators of other arguments."""
     sequence = np.random.SeedSequence(seed, spawn_key=(stream, block))
     return np.random.Generator(np.random.Philox(sequence))
 
 
 def _draw_block(chosen: np.ndarray, seed: int, block: int):
-    """Draw the serves of a block, _ROUNDS of each scenario: scenario (N,), pos and vel (N, 3)."""
+    """Draw N serves, `_ROUNDS` of each scenario: scenarios (N,), positions, velocities (N, 3)."""
     random = _random(seed, _SERVE_STREAM, block)
     scenario = random.permuted(np.tile(chosen, (_ROUNDS, 1)), axis=1).ravel()
     states = np.zeros((2, len(scenario), 3))
@@ -134,7 +133,7 @@ def _draw_block(chosen: np.ndarray, seed: int, block: int):
 
 
 def _draw(scenario: np.ndarray, random: np.random.Generator):
-    """Draw position and velocity (2, N, 3) of serves, and whether each is accepted, (N,) bool."""
+    """Draw positions and velocities (2, N, 3) of N serves, and which are accepted, (N,) bool."""
     regions = court.scenario_regions(scenario)
     bounds = court.region_bounds(DEPTH)
     uniform = random.random((len(scenario), 6))
@@ -185,7 +184,10 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return serves' speeds [m/s] for landing distances [m], derivatives [1/s] and times [s]."""
+    """Return horizontal speeds [m/s] of serves that land at a distance [m], by vertical speed.
+
+    The other results are the derivatives of the speeds by distance [1/s], and flight times [s].
+    """
     drag_free_time = (rise + np.sqrt(rise**2 + 2.0 * GRAVITY * SERVE_HEIGHT)) / GRAVITY
     speed = distance / drag_free_time * (1.0 + 0.5 * DRAG * distance)
     position = np.array([0.0, 0.0, SERVE_HEIGHT])
@@ -217,7 +219,7 @@ def advance(serves: Serves, delay: float) -> Serves:
 
 
 def uniform_starts(index: np.ndarray, seed: int) -> np.ndarray:
-    """Return random hover positions (N, 3) [m], x < -0.5 m, from serves' indices and a seed."""
+    """Return random hover positions (N, 3) [m] for the indices (N,) of N serves and a seed."""
     starts = np.empty((len(index), 3))
     for block in np.unique(index // _STARTS):
         rows = index // _STARTS == block

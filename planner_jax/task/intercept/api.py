@@ -89,7 +89,7 @@ def observe(
 
 @jax.jit
 def _positions_at(paths: PlanePath, times: Array) -> Array:
-    """Return the positions (B, L, 2) [m] of B targets at times (L,) [s]."""
+    """Return the positions (B, L, 2) [m] of B targets at L times (L,) [s]."""
     return jax.vmap(lambda path: jax.vmap(lambda time: path.at(time).pos)(times))(paths)
 
 
@@ -104,7 +104,7 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
       obstacles, and selects the best plan.
     * `paper`: the planner of [Qu2022]: one path by Hybrid A*, smoothed, then the speed along it. It
       runs on the host and needs the extra `baselines`.
-    * `em`: the best path of `lattice`, with the speed optimisation of the EM planner.
+    * `em`: the best path of `lattice`, with the speed optimisation of the EM planner [Fan2018].
     * `constant`: the best path of `lattice` at constant speed; ignores moving obstacles.
 
     Arguments and errors are as for `pj.hit.planner`. The options are the fields of the planner's
@@ -114,7 +114,7 @@ def planner(name: str = "spacetime", **options: object) -> Planner[InterceptCase
 
 
 def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> InterceptVerdict:
-    """Judge one plan, or a batch of plans, by a check that is independent of the planners.
+    """Judge one plan, or a batch, by the referee, a check that is independent of the planners.
 
     The referee computes the positions of targets of the classes `TurningPath`, `PolynomialPath` and
     `LaterPath` itself. For other classes it calls the target's method `at` in float64.
@@ -136,7 +136,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the referee's setting for targets whose class a user wrote, and {} for others."""
+    """Return the referee's setting for targets whose class a user wrote; {} for known classes."""
     while isinstance(target, LaterPath):
         target = target.path
     is_known = type(target) in (TurningPath, PolynomialPath)

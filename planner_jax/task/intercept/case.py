@@ -134,10 +134,10 @@ def case(
         start: (3,) x, y of the rear axle's middle [m], and heading [rad], at time 0.
         initial_speed: [m/s], speed at time 0.
         initial_curvature: [1/m], curvature of the rear axle's path at time 0.
-        walls: static obstacles: convex polygons, (V, 2) [m] each, which all cases share; or
-            `Obstacles` with the batch's axes on every leaf.
+        walls: static obstacles: convex polygons with V corners (V, 2) [m], which all cases share;
+            or `Obstacles` with the batch's axes on every leaf.
         movers: moving obstacles at time 0, as polygons or `Obstacles`, like the walls.
-        mover_velocities: (2,) or (N, 2) [m/s], of the polygons in `movers`.
+        mover_velocities: (2,) or (N, 2) [m/s], of the N polygons in `movers`.
         tolerance: [m], greatest distance of the body's middle from the target at the meeting.
         end_heading: [rad], heading of the car at the meeting; by default any heading.
         heading_tolerance: [rad], greatest deviation from `end_heading`.

@@ -1,13 +1,14 @@
 """The default planner of interceptions: a reach set in space and time, then least squares.
 
 [Qu2022] plans a path among the walls, and then a speed along it among the moving obstacles. If such
-an obstacle stays on the path, no speed avoids it. Here path and speed are planned together. A reach
-set of cells (`plane.reach`) contains where the car can be at which time. Random paths through the
-set are the starts of Levenberg-Marquardt on speed and curvature at knots (`problem`), in 3 stages:
+an obstacle stays on the path, no speed avoids it. Here path and speed are planned together. The
+reach set (`plane.reach`) holds the cells of the map in which the car can be at each time. Random
+paths of cells through the set are starting points of Levenberg-Marquardt (`problem`). The unknowns
+are the car's speed and curvature at equally spaced times. There are three stages:
 
-1. follow the positions of the cells, since speeds and turns alone would drift through walls;
-2. meet every limit;
-3. once every limit holds, reduce the effort, or meet the target earlier.
+1. follow the positions of the cells;
+2. keep every limit;
+3. once every limit holds, reduce the squared acceleration, or meet the target earlier.
 """
 
 import dataclasses
@@ -62,8 +63,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     `meet` selects the time of the meeting: "given" is the time of the case, "early" is as early as
     possible before it, and "least" is the time until then that needs the least effort, which is the
-    integral of the squared acceleration. A plan's cost is its time [s] for "early", else its effort
-    [m^2/s^3].
+    integral of the squared acceleration. A plan's cost is the meeting time [s] if `meet` is
+    "early", and else the effort [m^2/s^3].
     """
 
     case_type: ClassVar[type] = InterceptCase
@@ -72,8 +73,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     pieces: int = 32  # number of pieces of speed and curvature
     samples: int = 3  # samples of each piece at which least squares check obstacles
     checked: int = 10  # samples of each piece at which the finished plan is checked
-    # Whether all paths of a search are tried and the best plan is selected. If the meeting time is
-    # free, this is always so.
+    # Whether all paths of a search are tried and the best plan is selected, instead of the first
+    # solved plan. If `meet` is not "given", all paths are always tried.
     tries_all: bool = False
     searches: tuple[Search, ...] | None = None  # by default `SEARCHES[meet]`
 
@@ -86,7 +87,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches, in the order in which they are tried."""
+        """The searches for a plan, in the order in which they are tried."""
         return self.searches or SEARCHES[self.meet]
 
     @property
@@ -114,7 +115,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         cases: InterceptCase,
         plan_of: Callable[[Planner, InterceptCase], InterceptPlan] | None = None,
     ) -> tuple[SmoothIntercept, StartedCase]:
-        """Plan the cases, by `plan_of` or the first attempt; apply `smooth_near` to the plans."""
+        """Plan the cases by `plan_of`, or else by the first search; then call `smooth_near`."""
         if plan_of is None:
             plans = self.solve(lax.stop_gradient(cases), self.attempts[0])
         else:
@@ -148,16 +149,16 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch: try all paths together, select the best of each case."""
         attempt = self._load(attempt)
-        # All cases compute as many time layers as the case that needs most, to stay in step.
+        # `layers` is the number of times of the reach set. It is equal for all cases of the batch.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self._solve_all_paths(case, attempt, layers))(cases)
 
     def _solve_all_paths(
         self, case: InterceptCase, attempt: Search, layers: Array
     ) -> InterceptPlan:
-        """Try all paths of one case together, and run the last stage for the best path alone.
+        """Try all paths of one case together; the last stage then refines only the best plan.
 
-        With `tries_all` the last stage runs for all paths.
+        With `tries_all` the last stage refines the plans of all paths.
         """
         problem = self.problem
         found = search_reach(case, attempt, is_time_free=problem.is_time_free, layers=layers)
@@ -177,7 +178,7 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
         return self._explain(case, attempt, found, plan)
 
     def load_attempt(self, attempt: Search, cases: InterceptCase) -> LoadedSearch:
-        """Return a search as arguments of the program that all searches share."""
+        """Return a search as arguments of one compiled program, which all searches share."""
         return self._load(attempt)
 
     def _load(self, attempt: Search) -> LoadedSearch:
@@ -191,8 +192,8 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     ) -> Guess:
         """Draw a random path of cells that meets the target, and return the guess along it.
 
-        The path ends at the case's time, at one of the first time layers that meet the target
-        ("early"), or at any layer that meets it ("least").
+        The path ends at the case's time if `meet` is "given", at one of the two earliest times at
+        which the car can meet the target if "early", and at any such time if "least".
         """
         layer = found.grid.num
         if self.problem.is_time_free:
@@ -206,17 +207,17 @@ class SpacetimeIntercept(Planner[InterceptCase, InterceptPlan]):
     def _explain(
         self, case: InterceptCase, attempt: LoadedSearch, found: Reachability, plan: InterceptPlan
     ) -> InterceptPlan:
-        """Set the status of an unsolved plan to the reason why the case has no plan."""
+        """Set the status of an unsolved plan to the reason why it is unsolved."""
         reason = plan.status
         reason = jnp.where(found.is_reached | ~attempt.is_last, reason, Status.NO_PATH)
         return explain(case, reason, plan, is_time_free=self.problem.is_time_free)
 
 
 def quick(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` with fewer paths and steps, for meetings at the case's time."""
+    """Make a `SpacetimeIntercept` that is fast: it tries fewer paths, with fewer steps each."""
     return SpacetimeIntercept(**{"searches": QUICK, **fields})
 
 
 def best(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` with more paths and steps, for the plan of least effort."""
+    """Make a `SpacetimeIntercept` that tries more paths, for a least squared acceleration."""
     return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

@@ -1,8 +1,8 @@
 """Car motions given by speed and curvature at knots, and derivatives of costs by these unknowns.
 
-Speed and curvature are linear in time between equally spaced knots. The heading, the integral of
-their product, is then a cubic polynomial on each piece between two knots. The position is computed
-by Simpson's rule. The unknowns are the speeds at the knots 1..K, the curvatures at the knots 1..K,
+Speed and curvature are linear in time between the equally spaced knots 0 to K. The heading, the
+integral of their product, is then a cubic polynomial on each piece between two knots. The position
+is computed by Simpson's rule. The unknowns are the speeds and the curvatures at the knots 1 to K,
 and the end time if it is free. Speed and curvature at knot 0 are known from the car's state.
 
 A change of the values at a knot deforms the motion only on the two pieces beside the knot. All
@@ -32,17 +32,18 @@ class Motion:
     heading: Array  # (K, S) [rad]
     direction: Array  # (K, S, 2), cosine and sine of the heading
     time: Array  # (K, S) [s]
-    # Derivatives of x, y, heading and time of each sample by 8 variables: the five variables of its
-    # own piece, and the three components of a twist of all earlier pieces.
+    # Derivatives of x, y, heading and time of each sample by 8 variables: speed and curvature at
+    # both ends of its piece, the end time of the motion, and the three components of a twist (rigid
+    # displacement in the plane) of all earlier pieces.
     slope: Array  # (K, S, 4, 8)
-    # Derivatives of the later pieces' twist (rigid displacement) by the piece's last values.
+    # Derivatives of the later pieces' twist by speed and curvature at the piece's end.
     right: Array  # (K, 2, 3)
     left: Array  # (K, 2, 3), the same derivatives by speed and curvature at the piece's start
 
 
 @struct.dataclass
 class Quadratic:
-    """Half the gradient and half the Hessian of a cost, by a motion's samples and variables."""
+    """Half the gradient and half the Hessian of a cost, for K pieces with S samples each."""
 
     push: Array  # (K, S, 4), half gradient by x, y, heading and time of every sample
     stiffness: Array  # (K, S, 4, 4), half Hessian by x, y, heading and time of every sample
@@ -137,8 +138,8 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
     after = jnp.stack(  # twists of later pieces by the five variables of a piece, (5, K, 3)
         [last[:, 0] + last[:, 2] * end_y, last[:, 1] - last[:, 2] * end_x, last[:, 2]], axis=-1
     )
-    # Twists (rigid displacements) of each piece that its variables cause by deforming earlier
-    # pieces: the end time deforms all of them, the values at the piece's start the previous one.
+    # Variables of a piece also deform earlier pieces, and so displace the piece rigidly: the end
+    # time deforms all earlier pieces, the values at the piece's start only the previous piece.
     zero = jnp.zeros((1, 3), dtype)
     before = jnp.stack(
         [
@@ -177,7 +178,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
 def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Array, Array]:
     """Return half the gradient (n,) and half the Hessian (n, n) of a cost by the n unknowns.
 
-    The unknowns are the speeds at the knots 1..K, then the curvatures, then the end time if it is
+    The unknowns are the speeds at the knots 1 to K, then the curvatures, then the end time if it is
     free. The chain rule is applied to `cost`, which has derivatives by the samples of `drive`.
     """
     num, samples = drive.heading.shape
@@ -194,7 +195,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])
 
-    # For each knot, sums over all pieces that move rigidly with it: from the second piece after it.
+    # For each knot, sums over all later pieces that a change at the knot only displaces rigidly.
     later = shift(jnp.cumsum(forms[::-1, 5:], axis=0)[::-1], 2)  # (K, 3, 9)
     lefts, rights = np.array([V_LEFT, C_LEFT]), np.array([V_RIGHT, C_RIGHT])
     twist = drive.right + shift(drive.left, 1)  # (K, 2, 3)
@@ -205,7 +206,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     same = own[:, rights][:, :, rights] + shift(own[:, lefts][:, :, lefts], 1)
 
     def flatten(values: Array) -> Array:
-        """Reorder values (K, 2, ...) of speeds and curvatures to (2 K, ...): first all speeds."""
+        """Reorder values (K, 2, ...) of speed and curvature at K knots: first all speeds."""
         return values.swapaxes(0, 1).reshape(2 * num, *values.shape[2:])
 
     size = 2 * num
@@ -219,7 +220,6 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
         return x + y + turn
 
     def spread(values: Array) -> Array:
-        """Repeat values (K, 2, 2) along the columns of all speeds and of all curvatures, (n, n)."""
         return jnp.repeat(flatten(values), num, axis=1)
 
     lower = jnp.where(

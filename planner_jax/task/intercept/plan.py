@@ -42,10 +42,10 @@ def make_plan(
     """Make a plan from speed and curvature at knots, and check it against every limit of the case.
 
     The cost of the plan is the integral of the squared acceleration [m^2/s^3] [Qu2022, eq. 8a].
-    Speed [m/s] and curvature [1/m], (K + 1,) each, are the values at equally spaced knots from time
-    0 to `time` () [s]. On each piece between two knots the distance from obstacles is checked at
-    `samples` positions, and the lateral acceleration at `points` positions. Both numbers are
-    static. `steps` () int32 is the number of iterations that the plan reports.
+    Speed [m/s] and curvature [1/m] are the values at K + 1 equally spaced knots from time 0 to
+    `time` () [s]. On each piece between two knots the distance from obstacles is checked at
+    `samples` positions, and the lateral acceleration at `points` positions. `steps` () int32 is the
+    number of iterations that the plan reports.
     """
     drive = motion(case.start, time, speed, curvature, samples)
     _, violation = limit_terms(case, time, speed, curvature, Weights(), points)
@@ -84,11 +84,12 @@ def make_straight_plan(case: InterceptCase, pieces: int) -> InterceptPlan:
 def explain(
     case: InterceptCase, reason: Array, plan: InterceptPlan, *, is_time_free: bool = False
 ) -> InterceptPlan:
-    """Return a plan; if it is unsolved, its status is replaced by the reason.
+    """Return a plan; if it is unsolved, its status is replaced by the reason why it is unsolved.
 
-    The new status is BLOCKED if the start overlaps an obstacle, or the meeting does and its time is
-    fixed; NON_FINITE if a number of the case is NaN; and else `reason` () int32. `is_time_free` is
-    true if the target may be met before the case's time.
+    The reason is NON_FINITE if a number of the case is NaN. Else it is BLOCKED if the car overlaps
+    an obstacle at the start, or if the meeting time is fixed and the target is then too close to an
+    obstacle or off the map. Else it is the status `reason` () int32. `is_time_free` is true if the
+    planner may choose an earlier meeting time than the time of the case.
     """
     is_start_blocked, is_goal_blocked = is_blocked(case)
     blocked = is_start_blocked if is_time_free else is_start_blocked | is_goal_blocked

@@ -1,6 +1,7 @@
 """The least-squares problem of an interception: cost, stages of its solution, and derivatives.
 
-The unknowns are speed and curvature at the knots 1..K, and the time of the meeting if it is free.
+The unknowns are speed and curvature at K equally spaced times (knots) after the start, and the time
+of the meeting if it is free.
 The cost is a sum of squares (`terms`): the effort, which is the integral of the squared
 acceleration; the distance from the target at the end; and one-sided penalties (hinges) on limits
 and on distances from obstacles.
@@ -42,13 +43,14 @@ from planner_jax.task.intercept.terms import (
 
 _SOONEST = 0.01  # earliest time of a meeting, divided by the case's time
 
-# Weights of the cost in each stage: follow the path of cells; meet all limits; reduce the effort.
+# Weights of the cost in the three stages: follow the path of cells, keep all limits, and reduce the
+# effort, which is the integral of the squared acceleration.
 _FOLLOWING = Weights(follow=10.0, obstacle=0.0, early=0.0)
 _KEEPING = Weights()
 _SETTLING = Weights(effort=10.0)
 _HURRYING = Weights(early=1000.0)  # of the last stage if the meeting shall be as early as possible
 # Weight of the meeting time when the cost is differentiated. It is small beside the weight of the
-# limits, so that the minimum exceeds no limit: the penalties start before a limit is reached.
+# limits, whose penalties start before a limit is reached: the minimum then exceeds no limit.
 _EARLY = 30.0
 
 
@@ -65,15 +67,15 @@ class Stage:
 
 @struct.dataclass
 class Guess:
-    """A starting point of least squares, and the positions that its first stage follows."""
+    """A starting point of least squares, and K positions that their first stage follows."""
 
-    point: Array  # (n,), unknowns
+    point: Array  # (n,), the n unknowns
     positions: Array  # (K, 2) [m], rear axle's middle at the knots 1..K, on a path of cells
 
 
 @dataclasses.dataclass(frozen=True)
 class MotionProblem:
-    """The least-squares problem of `SpacetimeIntercept`, which describes the fields; static."""
+    """The least-squares problem of `SpacetimeIntercept`, whose fields of equal names it repeats."""
 
     meet: Literal["given", "early", "least"] = "given"
     pieces: int = 32
@@ -91,12 +93,12 @@ class MotionProblem:
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:
-        """Join speed and curvature (..., K) at knots 1..K, and a free time, to unknowns."""
+        """Join speed and curvature (..., K) at the knots 1 to K, and the time if it is free."""
         parts = [speed, curvature, time[..., None]]
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
-        """Return speed and curvature (K + 1,) at all knots, and the meeting time, by unknowns."""
+        """Split the unknowns into speed and curvature (K + 1,) at all knots, and meeting time."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
         time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
         return (
@@ -106,20 +108,20 @@ class MotionProblem:
         )
 
     def decode(self, case: InterceptCase, point: Array, steps: Array) -> InterceptPlan:
-        """Make the plan of unknowns (n,), and check limits at more samples than the cost uses."""
+        """Make the plan of n unknowns; check the limits at more samples than the cost uses."""
         speed, curvature, time = self.unpack(case, point)
         plan = make_plan(case, time, speed, curvature, samples=self.checked, points=12, steps=steps)
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
 
     def guess_at(self, point: Array) -> Guess:
-        """Return a guess with unknowns (n,) for stages that follow no path of cells."""
+        """Return a guess with given unknowns, for stages that follow no path of cells."""
         return Guess(point=point, positions=jnp.zeros((self.pieces, 2), point.dtype))
 
     def guess_along(self, case: InterceptCase, grid: Grid, path: CellPath, layer: Array) -> Guess:
         """Return a guess whose motion follows a path of cells, headings and speeds over time.
 
-        The path has an entry for each of some equally spaced times, the layers of the grid. At the
-        layer with the index `layer` () int32 it meets the target.
+        The path has one cell for each time of the grid, the layers. It meets the target at the
+        layer with the index `layer` () int32.
         """
         width = 2.0 * np.pi / grid.lattice.headings
         pace = case.limits.speed / (grid.lattice.levels - 1)
@@ -140,13 +142,13 @@ class MotionProblem:
 
         speed = interpolate(pace * path.level.astype(grid.cell.dtype), case.speed, at)
         bins = width * path.bin.astype(grid.cell.dtype)
-        # [rad], initial heading of the car in the path's headings, which count from it and are not
-        # wrapped: a multiple of 2 pi.
+        # Headings of the path are relative to the car's initial heading, but may include full
+        # turns. In them the initial heading is the multiple of 2 pi that is nearest to the first.
         straight = jnp.round(bins[0] / (2.0 * np.pi)) * 2.0 * np.pi
         after, before = (interpolate(bins, straight, at + half) for half in (0.5, -0.5))
         rate = (after - before) / grid.step
-        # The car starts with its own turn rate instead of the path's. The turn rates at the knots 1
-        # and 2 are changed to make up for the difference that this causes in all later headings.
+        # The car starts with its own turn rate instead of the path's, which changes all later
+        # headings. The turn rates at the knots 1 and 2 are changed to compensate for this.
         time = steps * grid.step
         knot = time / self.pieces
         first = case.speed * case.curvature
@@ -168,10 +170,10 @@ class MotionProblem:
         positions: Array,
         discs: int = 3,
     ) -> Model:
-        """Return the cost, a sum of squares, at unknowns (n,), and its quadratic model.
+        """Return the cost, a sum of squares, at the n unknowns, and its quadratic model.
 
         `field` has the distances from walls. `positions` (K, 2) [m] are the points that the rear
-        axle should follow at the knots 1..K. A static number of discs covers the car's body.
+        axle should follow at the knots 1 to K. `discs` discs cover the car's body.
         """
         speed, curvature, time = self.unpack(case, point)
         drive = motion(case.start, time, speed, curvature, self.samples)
@@ -210,7 +212,7 @@ class MotionProblem:
         return [Stage(_FOLLOWING, attempt.following), *self.list_last_stages(attempt)]
 
     def list_last_stages(self, attempt: Search | Warm) -> list[Stage]:
-        """Return the last two stages: meet all limits, then reduce the effort or the time."""
+        """Return the last two stages: keep all limits, then reduce acceleration or meeting time."""
         margins = {"margin": attempt.margin, "slack": attempt.slack}
         keeping = Stage(dataclasses.replace(_KEEPING, **margins), attempt.solver.max_steps)
         if self.is_time_free:
@@ -233,7 +235,7 @@ class MotionProblem:
         """Run S stages of least squares, each from the point at which the previous stage ended.
 
         Returns:
-            points: (S, n), unknowns at the end of each stage.
+            points: (S, n), the n unknowns at the end of each stage.
             steps: () int32, number of iterations of all stages together.
         """
 
@@ -265,7 +267,7 @@ class MotionProblem:
         attempt: Search | Warm,
         stages: list[Stage],
     ) -> InterceptPlan:
-        """Run the stages from a guess; return the better of the last two stages' plans."""
+        """Run the stages from a guess; of the last two stages' plans return the better one."""
         points, steps = self.run_stages(case, field, guess, attempt, stages)
         plans = lax.map(lambda point: self.decode(case, point, steps), points[-2:])
         before, after = (jax.tree.map(lambda leaf, k=k: leaf[k], plans) for k in range(2))
@@ -323,14 +325,14 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the unknowns that minimise the cost near the start, as `num` equal rows."""
+        """Return the n unknowns that minimise the cost near the start, as `num` equal rows."""
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
         return jnp.broadcast_to(end.point, (num, *end.point.shape))
 
     def _model(self, point: Array, context: _Context) -> Model:
-        """Return the cost at unknowns (n,) and its quadratic model; see `build_model`."""
+        """Return the cost at the n unknowns and its quadratic model; see `build_model`."""
         problem = self.problem
         weights = dataclasses.replace(problem.weights, early=_EARLY)
         positions = problem.guess_at(point).positions
@@ -348,12 +350,12 @@ class SmoothIntercept(OptimisedPlanner):
         return dataclasses.replace(model, gradient=0.5 * gradient)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Return the cost at unknowns (n,), and the largest relative excess over a limit."""
+        """Return the cost at the n unknowns, and the largest relative excess over a limit."""
         model = self._model(point, context)
         return Evaluation(cost=model.cost, violation=model.violation)
 
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
-        """Return the plan of unknowns (n,)."""
+        """Return the plan that the n unknowns describe."""
         return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
@@ -362,5 +364,5 @@ class SmoothIntercept(OptimisedPlanner):
 
 
 def add_start(case: InterceptCase, point: Array) -> StartedCase:
-    """Add to a case, or a batch, unknowns (n,) or (B, n) from which least squares start."""
+    """Add the n unknowns, (n,) or (B, n), from which least squares start to a case or a batch."""
     return StartedCase(**vars(case), start_point=lax.stop_gradient(point))

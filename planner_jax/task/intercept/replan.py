@@ -48,7 +48,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One attempt from the previous plan, then one search from scratch, to save time."""
+        """The attempts: from the previous plan, then, to save time, only one from scratch."""
         return (self.warm, self.search)
 
     @property
@@ -114,7 +114,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
-        """Return a search as arguments of a program; the warm attempt has a program of its own."""
+        """Return an attempt as arguments of a compiled program; the two kinds have two programs."""
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)

@@ -21,8 +21,8 @@ from planner_jax.plane.distance_field import DistanceField, distance_field
 from planner_jax.task.intercept.case import InterceptCase
 from planner_jax.task.intercept.terms import discs_of, wrap
 
-# Memory of one path, and of one 32-bit word of a reach set. The unit is the memory that a planner
-# with few unknowns needs for one starting point, as for `Attempt.starts`.
+# Memory that a search needs for one path, and for one 32-bit word of a reach set, in units of the
+# memory of one starting point of a planner with few unknowns; used for the field `starts`.
 _PATH_STARTS = 8
 _WORD_STARTS = 1 / 32768
 _PADDED = ("paths", "candidates")
@@ -31,10 +31,7 @@ _FIELD = 128  # number of nodes of the grid of distances from walls, along each 
 
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt at a case: random paths, and least squares from each.
-
-    Searches with the same `solver` rules, `discs` and `lattice` share a compiled program.
-    """
+    """An attempt to plan a case by least squares from random paths through the reach set."""
 
     starts: int = dataclasses.field(init=False, default=1)
     paths: int = 16  # number of paths from which least squares run
@@ -67,7 +64,7 @@ class Search(Attempt):
 )
 @dataclasses.dataclass(frozen=True)
 class LoadedSearch(Search):
-    """A search as arguments of the program that all searches of a planner share."""
+    """A search as arguments of one compiled program, which all searches of a planner share."""
 
     _: dataclasses.KW_ONLY
     noise: cell_paths.PathNoise  # random numbers that select each path
@@ -81,9 +78,9 @@ class LoadedSearch(Search):
 def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) -> LoadedSearch:
     """Return one of a planner's searches as arguments of a compiled program.
 
-    All searches share the program, which tries path after path: the random numbers have leading
-    axes for the largest numbers of paths and of candidates. If the search `is_apart`, it has a
-    program of its own, which tries its paths together, as a GPU does.
+    All searches share the program. Its arrays of random numbers therefore have the sizes of the
+    search with most paths, and most candidates for a path. With `is_apart` the search has a program
+    of its own, with the sizes of this search: a GPU tries all paths at once.
     """
     sizes = (search,) if is_apart else searches
     paths, candidates = (max(getattr(each, name) for each in sizes) for name in _PADDED)
@@ -103,7 +100,7 @@ def load_search(search: Search, searches: tuple[Search, ...], is_apart: bool) ->
 
 @dataclasses.dataclass(frozen=True)
 class Warm(Attempt):
-    """Settings of re-planning: least squares start from the previous plan's remainder; static."""
+    """Settings of re-planning, in which least squares start from the previous plan's remainder."""
 
     solver: LevenbergConfig = LevenbergConfig(8)
     settling: int = 4  # number of steps of the last stage; all fields are as in `Search`
@@ -128,9 +125,9 @@ _NARROW = tuple(
     for seed, girth in ((3, 0.9), (4, 0.75), (6, 0.9))
 )
 BEST = (dataclasses.replace(_GIVEN[0], paths=8, settling=48), *_GIVEN[1:], *_NARROW)
-# First attempt if the time of the meeting is free: least squares run from every path until the cost
-# falls by less than 0.05 % a step, and the best plan is selected. The stage that follows the cells
-# is left out, because it delays the meeting.
+# First search if the meeting shall be as early as possible: least squares run from every path until
+# the cost falls by less than 0.05 % a step, and the best plan is selected. There is no first stage
+# (`following`), because following a path of cells delays the meeting.
 _EARLY = Search(
     32,
     LevenbergConfig(60, tolerance=5e-4),
@@ -167,7 +164,7 @@ class Reachability:
 
 
 def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
-    """Return the grid of a case: cells that cover its map, and layers in time up to its horizon."""
+    """Return the grid of a case: cells that cover its map, at times up to the case's time."""
     return reach.grid_of(lattice, case.start, case.time, case.limits.speed, case.lower, case.upper)
 
 
@@ -182,8 +179,8 @@ def search_reach(
 ) -> Reachability:
     """Compute which cells the car can reach at which times, and when it can meet the target.
 
-    There are `layers` equally spaced times, called layers; by default they extend to the case's
-    time. `is_time_free` is true if the target may be met before the case's time.
+    `layers` is the number of equally spaced times; by default they extend to the case's time.
+    `is_time_free` is true if the target may be met before the case's time.
     """
     grid = make_grid(case, search.lattice)
     field = make_field(case, grid)
@@ -216,7 +213,7 @@ def search_reach(
 def _meeting_cells(
     case: InterceptCase, grid: reach.Grid, found: reach.ReachSet, layer: Array
 ) -> tuple[Array, Array]:
-    """Return the cells around the target at a time (a layer), and which of them are reached."""
+    """Return the cells around the target at time number `layer`, and which the car can reach."""
     goal = case.target.at((layer.astype(grid.step.dtype) + 0.5) * grid.step).pos
     num = grid.lattice.headings
     width = 2.0 * np.pi / num
@@ -232,7 +229,7 @@ def draw_cell_path(
     noise: cell_paths.PathNoise,
     directness: Array | float,
 ) -> cell_paths.CellPath:
-    """Draw a random path of cells to the target, which it meets at a time (a layer) () int32."""
+    """Draw a random path of cells that meets the target at time number `layer` () int32."""
     cells, is_reached = _meeting_cells(case, found.grid, found.reach, layer)
     draw = cell_paths.draw_path
     return draw(found.grid, found.reach, layer, cells, is_reached, noise, directness)

@@ -18,7 +18,7 @@ class Suite:
     num_movers: tuple[int, int]  # least and greatest number of moving obstacles
     mover_speed: tuple[float, float] = (0.1, 0.6)  # [m/s], range of moving obstacles' speeds
     time: float = 10.0  # [s], of the meeting
-    # [s], time from the earliest arrival, by a reach set, to the meeting; None: meeting at `time`.
+    # [s], time from the estimated earliest arrival to the meeting; None: the meeting is at `time`.
     spare: float | None = None
     is_maze: bool = False
     wall_room: tuple[int, int] = (12, 6)  # sizes of the array of walls: polygons, corners of each

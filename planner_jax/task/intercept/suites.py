@@ -107,12 +107,11 @@ def draw_accepted(
 
 
 def _count_numbers(suite: Suite) -> int:
-    """Return how many random numbers one candidate case of a suite takes."""
+    """Return the number of random numbers from which one candidate case of a suite is made."""
     return 7 + suite.wall_room[0] * (2 + _SHAPE) + suite.mover_room[0] * (3 + _SHAPE)
 
 
 def _between(uniform: np.ndarray, low: float | np.ndarray, high: float) -> np.ndarray:
-    """Map uniform random numbers of [0, 1) to the interval from `low` to `high`."""
     return low + uniform * (high - low)
 
 
@@ -122,7 +121,6 @@ def _integer(uniform: np.ndarray, fewest: int, most: int) -> np.ndarray:
 
 
 def _unit(angle: np.ndarray) -> np.ndarray:
-    """Return unit vectors (..., 2) at angles (...) [rad]."""
     return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
@@ -205,7 +203,7 @@ _earliest = jax.jit(earliest_arrival)
 def _polygons(
     uniform: np.ndarray, corners: tuple[int, int], radius: tuple[float, float]
 ) -> np.ndarray:
-    """Make convex polygons (..., 6, 2) [m] with corners on circles from uniform random numbers."""
+    """Make convex polygons (..., 6, 2) [m] whose corners lie on circles, from random numbers."""
     size, num = _between(uniform[..., 0], *radius), _integer(uniform[..., 1], *corners)[..., None]
     index = np.minimum(np.arange(6), num - 1)
     shift = 0.6 * np.take_along_axis(uniform[..., 3:], index, axis=-1)
@@ -225,7 +223,7 @@ def _maze(
     """Return corners (B, 12, 6, 2) [m] of a maze's rectangles, and whether they exist, (B, 12).
 
     The first `count` (B,) walls at the x positions `across` (B, 3) [m] exist. Dead ends lie on the
-    straight line from start to end. Only the first three rows of `uniform` (B, 12, M) are used.
+    straight line from start to end. Of the random numbers `uniform` only `uniform[:, :3]` are used.
     """
     u = np.moveaxis(uniform[:, :3], 2, 0)
     gap, half = _between(u[1], 0.8, SIZE - 0.8), 0.5 * _between(u[2], 0.7, 1.1)
@@ -234,7 +232,7 @@ def _maze(
     slope = (end[:, 1:] - start[:, 1:]) / (end[:, :1] - start[:, :1])
     line = start[:, 1:] + slope * (across - start[:, :1])
     # y position [m] of the dead end: where the straight line crosses the wall, moved as little as
-    # possible so that the arms leave the gap open.
+    # possible so that the dead end does not close the wall's gap.
     below = np.where(gap - half >= 2.0 * outer, np.clip(line, outer, gap - half - outer), np.inf)
     fits = SIZE - gap - half >= 2.0 * outer
     above = np.where(fits, np.clip(line, gap + half + outer, SIZE - outer), np.inf)
@@ -270,7 +268,7 @@ def path_of(draws: Draws, dtype: DTypeLike) -> TurningPath:
 
 
 def cases_of(draws: Draws, dtype: DTypeLike) -> InterceptCase:
-    """Make cases from draws, which are dictionaries of arrays, in a floating-point type."""
+    """Make cases from draws, which are dictionaries of arrays, with leaves of type `dtype`."""
 
     def group(kind: str, velocity: np.ndarray) -> Obstacles:
         present = draws[f"{kind} present"]
@@ -305,14 +303,14 @@ def _displace(angle, speed, rate, time) -> np.ndarray:
 
 
 def _path(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return positions (B, M, 2) [m] of the targets from time 0 to the meeting."""
+    """Return positions (B, M, 2) [m] of B targets at M times from 0 to the meeting."""
     times = np.linspace(0.0, draws["time"], round(suite.time / _STEP) + 1, axis=1)
     angle, speed, rate = (draws[name][:, None] for name in ("angle", "speed", "rate"))
     return draws["pos"][:, None] + _displace(angle, speed, rate, times)
 
 
 def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return whether the targets leave the map before the meeting, (B,) bool."""
+    """Return which of B targets leave the map before the meeting, (B,) bool."""
     from_middle = np.abs(_path(suite, draws) - 0.5 * SIZE)
     return from_middle.max(axis=(1, 2)) > 0.5 * SIZE
 
@@ -323,7 +321,7 @@ def _middle(draws: Draws) -> np.ndarray:
 
 
 def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
-    """Return whether a straight drive at the greatest speed arrives after the meeting, (B,)."""
+    """Return in which of B cases even a straight drive at full speed would be late, (B,) bool."""
     distance = draws["meeting"] - _middle(draws)
     return np.linalg.norm(distance, axis=1) > TOP_SPEED * draws["time"]
 
@@ -331,7 +329,10 @@ def _is_too_far(_: Suite, draws: Draws) -> np.ndarray:
 def _gap(
     draws: Draws, kind: str, points: np.ndarray, times: float | np.ndarray = 0.0
 ) -> np.ndarray:
-    """Return least distances (B,) [m] of points (B, [M,] 2) from walls, or movers at `times`."""
+    """Return least distances (B,) [m] of points from obstacles, which are "walls" or "movers".
+
+    There are one or M points for each of B cases, (B, 2) or (B, M, 2); `times` [s] are for movers.
+    """
     corners, points = draws[kind], points if points.ndim == 3 else points[:, None]
     if kind == "movers":
         times = np.broadcast_to(times, len(points))[:, None, None, None]
@@ -356,7 +357,7 @@ def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 
 def _is_separated(_: Suite, draws: Draws) -> np.ndarray:
-    """Return whether walls close all paths of a disc as wide as the car to the meeting, (B,)."""
+    """Return in which of B cases walls bar a disc as wide as the car from the meeting, (B,)."""
     count = round(SIZE / _CELL)
     middles = (np.arange(count) + 0.5) * _CELL
     separated = np.zeros(len(draws["start"]), bool)

@@ -43,7 +43,7 @@ def wrap(angle: Array) -> Array:
 
 
 def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
-    """Cover the body by discs; return their radius, and positions ahead of the rear axle [m]."""
+    """Cover the car's body by `num` discs; return radius, and positions from the rear axle [m]."""
     half = 0.5 * body.length / num
     radius = jnp.sqrt(half**2 + (0.5 * body.width) ** 2)
     steps = np.arange(1 - num, num, 2)
@@ -53,9 +53,9 @@ def discs_of(body: CarBody, num: int) -> tuple[Array, Array]:
 def limit_terms(
     case: InterceptCase, time: Array, speed: Array, curvature: Array, weights: Weights, points: int
 ) -> tuple[Array, Array]:
-    """Compute the penalties on the car's limits, and the effort, for a motion of K pieces.
+    """Compute the penalties on the car's limits and on acceleration, for a motion of K pieces.
 
-    `points` is the static number of points of a piece at which the lateral acceleration is checked.
+    `points` is the number of points of a piece at which the lateral acceleration is checked.
 
     Returns:
         squares: (K, 6, 6), for every piece the sum of w g g^T over its residuals r with weights w.
@@ -81,7 +81,7 @@ def limit_terms(
         excesses.append(excess)
         squares.add({**{k: sign * each for k, each in by.items()}, 5: inside}, weights.limit)
 
-    # The condition 0 <= v <= v_max is written as |v - v_max / 2| <= v_max / 2.
+    # The limits 0 <= v <= v_max of the speed v are written as |v - v_max / 2| <= v_max / 2.
     hinge(v - 0.5 * limits.speed, 0.5 * limits.speed, {V_RIGHT: 1.0})
     hinge(c, limits.curvature, {C_RIGHT: 1.0})
     by = {V_LEFT: -rate, V_RIGHT: rate, TIME: -acceleration / time}
@@ -167,7 +167,10 @@ def meeting_terms(
 
 
 def following_terms(drive: Motion, positions: Array, weights: Weights) -> Array:
-    """Compute `squares` (K, 5, 5) as `meeting_terms` does, for positions (K, 2) at pieces' ends."""
+    """Compute the penalty on distances of the K pieces' ends from positions (K, 2) [m].
+
+    The result (K, 5, 5) is the matrix `squares` of `meeting_terms` for the end of every piece.
+    """
     x, y = (drive.pos[:, -1] - positions).T
     squares = SumOfSquares(5)
     squares.add({0: 1.0, 4: x}, weights.follow)
@@ -180,11 +183,11 @@ def obstacle_terms(
 ) -> tuple[Array, Array]:
     """Compute the penalties on the distances of the body from obstacles and from the map's edge.
 
-    The body is represented by `discs` discs, a static number. Fewer discs are larger and extend
-    further beyond the sides of the body.
+    The body is represented by `discs` discs. Fewer discs are larger and extend further beyond the
+    sides of the body.
 
     Returns:
-        squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for every sample.
+        squares: (K, S, 5, 5), the matrix `squares` of `meeting_terms` for S samples on K pieces.
         close: (), largest penetration of an obstacle by a disc, or excess of the body's middle
             beyond the map, divided by the body's width.
     """
@@ -197,7 +200,7 @@ def obstacle_terms(
     velocity = movers.velocity[..., None]  # (N, 2, 1)
 
     def measure(offset: Array) -> tuple[Array, Array, Array]:
-        """Return the distances of a disc from walls and movers, and their gradients, (1 + N, M)."""
+        """Return the disc's distances from walls and N movers at M samples, and gradients."""
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
@@ -268,7 +271,11 @@ def clearance(case: InterceptCase, drive: Motion) -> Array:
 
 
 def is_blocked(case: InterceptCase) -> tuple[Array, Array]:
-    """Return whether the body overlaps an obstacle at the start, and if the target is blocked."""
+    """Return whether the car overlaps an obstacle at the start, and whether the target is blocked.
+
+    The target is blocked if at the case's time it is off the map, or nearer to an obstacle than
+    half the car's width.
+    """
     goal = case.target.at(case.time).pos
     both = join_obstacles(case.walls, case.movers)
     x, y = (-(both.centre - case.start[None, :2])[:, axis, None] for axis in range(2))
