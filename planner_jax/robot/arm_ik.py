@@ -142,7 +142,7 @@ def _wrist_angles(turn: Array, flip: int, bend: Array) -> Array:
     """
     fourth = _angle(flip * turn[1, 0], -flip * turn[2, 0])
     sine, cosine = jnp.sin(fourth), jnp.cos(fourth)
-    # Joint 4 is not determined, and set to zero, if the wrist is straight.
+    # If the wrist is straight, joint 4 is not determined; then `fourth` is zero.
     fifth = _angle(sine * turn[1, 0] - cosine * turn[2, 0], turn[0, 0])
     left = cosine * turn[1] + sine * turn[2]
     return jnp.stack([fourth, fifth - bend, _angle(-left[2], left[1])])

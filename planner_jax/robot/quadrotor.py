@@ -17,9 +17,10 @@ from planner_jax.core.arithmetic import Components, at_least, components, invers
 from planner_jax.core.protocol import Plan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, join
 
-# Factor on the limits in bounds on reach: solved plans exceed limits by far less than 1 %.
+# Factor on the limits when `beyond_reach` computes how far a quadrotor can fly. Solved plans exceed
+# their limits by far less than 1 %.
 ALLOWED = 1.01
-_SHORTEST = 1e-3  # [s], least time in bounds on reach; avoids the product of zero and infinity
+_SHORTEST = 1e-3  # [s], least time in `beyond_reach`; avoids the product of zero and infinity
 
 
 @struct.dataclass

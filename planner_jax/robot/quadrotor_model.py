@@ -174,7 +174,7 @@ class QuadrotorModel:
 
     @property
     def thrust_bounds(self) -> tuple[float, float]:
-        """Least and greatest thrust per unit mass [m/s^2]: `limits.thrust`, or else the rotors'."""
+        """Least and greatest thrust per unit mass [m/s^2], by `limits.thrust` or by the rotors."""
         if self.limits.thrust is not None:
             return self.limits.thrust
         low, high = self.rotor_range or (self.rotors.min_thrust, self.rotors.max_thrust)

@@ -311,7 +311,6 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
-        """Return when a ball can be met, end poses, and the indices of those to try, in order."""
         flight = flight_of(case)
         poses = end_poses(case, flight, self.points, self.pieces, quickest=self.brisk)
         ranks, _ = read_learned_starts()
@@ -319,7 +318,7 @@ class OnlineBlock(Planner):
         return flight, poses, rank_poses(poses, num, 1.0 - self.slack)
 
     def _count_straight(self, flight: Flight, poses: EndPoses, attempt: Search) -> Array:
-        """Return the number of straight motions to check, () int32."""
+        """Return how many straight motions to check: those in time, at most `attempt.straight`."""
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 
@@ -362,8 +361,8 @@ class OnlineBlock(Planner):
     def model(self, point: Array, case: BlockCase, flight: Flight) -> Model:
         """Return the cost at the unknowns `point`, a sum of squares, and its quadratic model.
 
-        The residuals are the errors of the contact, excesses over joint limits, distances below
-        their margins, and joint accelerations.
+        The residuals are the errors of the shield's contact with the ball, excesses over joint
+        limits, distances below their margins, and joint accelerations.
         """
         steps, first, duration = self.decode(case, point)
         pieces, dtype = self.pieces, point.dtype

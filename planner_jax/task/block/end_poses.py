@@ -51,7 +51,7 @@ def flight_of(case: BlockCase) -> Flight:
 
 
 def all_profiles(pieces: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return all P speed profiles of `motion.profiles`, (P, K), and which end at rest, (P,)."""
+    """Return P speed profiles with K = `pieces` steps each, (P, K), and which end at rest, (P,)."""
     at_rest, free = profiles(pieces, True), profiles(pieces, False)
     return np.concatenate([at_rest, free]), np.arange(len(at_rest) + len(free)) < len(at_rest)
 

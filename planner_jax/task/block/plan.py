@@ -53,5 +53,5 @@ def mark_blocked(case: BlockCase, status: Array) -> Array:
         is_blocked = case.clearances(case.angles[None])[0] < 0.0
         return jnp.where(is_blocked, Status.BLOCKED, status).astype(jnp.int32)
 
-    # `cond` skips the check of a single case that is solved.
+    # For a single case, `cond` runs the check only if the case is unsolved.
     return lax.cond(is_solved(status), lambda: status.astype(jnp.int32), check)

@@ -92,9 +92,10 @@ def beam(case: CatchCase, table: Timetable, width: int) -> CatchChoice:
     """Search for W orders of one case that catch most targets, and catch them early.
 
     It is a beam search of width W = `width`. After each catch the W sequences of catches with the
-    least ranks continue. The rank is the estimated time plus 10 s for each metre that the quadrotor
-    lacks. Among sequences with the same targets and the same last target only the best continues.
-    If fewer than W orders are found, the first order is repeated. Leaves are (W, N), N targets.
+    least ranks continue. The rank is the estimated time plus 10 s for each metre by which targets
+    are missed. Among sequences with the same targets and the same last target only the best
+    continues. If fewer than W orders are found, the first one is repeated. For N targets the leaves
+    of the result have the shape (W, N).
 
     Raises:
         ValueError: there are more than `MOST_SEARCHED` targets.
@@ -172,7 +173,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
     """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
 
-    T_p are the times of catches that were decided before planning, T_o those in the B plans.
+    T_p are the times of catches that were decided before planning, T_o the times in the plans.
     """
     decided_times, optimised = np.asarray(plans.decided_times), np.asarray(plans.times)
     present = np.asarray(cases.present & plans.choice.taken)
@@ -221,7 +222,7 @@ class Best(CatchDecision):
             raise ArgumentError("width", f">= {self.finalists} finalists", self.width)
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the best orders of one case, best first; leaves have a row for each order."""
+        """Return the orders of one case with the least ranks, best first; each is a row."""
         table = timetable(case)
         if case.optional or case.num_targets > MOST_PERMUTED:
             found = beam(case, table, self.width)
@@ -239,7 +240,7 @@ class Greedy(CatchDecision):
     """Decision that always catches next the target with the earliest estimated catch."""
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the greedy order of one case, and variants with fewer catches if these may be."""
+        """Return the greedy order of one case; with optional targets, also without last catches."""
         table = timetable(case)
         choice = estimate.earliest_next(case, table, self._handicap(case, table))
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))

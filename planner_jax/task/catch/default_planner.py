@@ -61,7 +61,7 @@ _ROUNDS = (
     Round(starts=1, solver=LbfgsConfig(max_steps=80)),
     Round(starts=6, solver=LbfgsConfig(max_steps=200)),
 )
-_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # used after a network
+_FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a network's guess
 # With several targets this search runs before Newton's method, because the short search of `_FIRST`
 # would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
@@ -149,7 +149,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jnp.concatenate(numbers)
 
     def prepare(self, case: CatchCase) -> CatchContext:
-        """Return the context of a case, with the targets in the order of catching."""
+        """Return a case with its targets in the order of catching, for evaluations of the cost."""
         return order_targets(case)
 
     def guess_ends(self, context: CatchContext, num: int) -> Array:
@@ -160,7 +160,7 @@ class ExactCatch(ChainPlanner[CatchCase, CatchPlan]):
         return jax.vmap(lambda guess: self._guess(context, guess))(rows)
 
     def load_attempt(self, attempt: Round, cases: CatchCase) -> PyTree:
-        """Return a round as arguments of a compiled program, with iterations as its start needs."""
+        """Return a round, with the number of iterations that the cases need, as a pytree."""
         return super().load_attempt(self._for_start(attempt, cases), cases)
 
     def starts_long(self, cases: CatchCase) -> bool:

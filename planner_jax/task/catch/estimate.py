@@ -24,7 +24,7 @@ INSTANT = 0.05  # [s], least time between two catches
 _ACCELERATION = 7.0  # [m/s^2], of the point that models the quadrotor
 _TURNING = 0.2  # [s], time to tilt before the point starts to move
 _STEEPEST = 0.2  # greatest sine of a target's angle of ascent at a catch
-# [m], greatest estimated lack of distance at which an optional target is still tried, because plans
+# [m], distance by which the estimated flight may miss an optional target that is still tried: plans
 # reach farther than the estimate.
 _MARGIN = 0.8
 
@@ -75,8 +75,8 @@ def arrival(
     """Return time () [s], position (3,) [m] and shortfall () [m] of a target's earliest catch.
 
     The quadrotor leaves the position `place` (3,) [m] at `begin` () [s]; `speed` () [m/s] is its
-    greatest speed. The shortfall is 0 if a catch is possible, and else the distance that the
-    quadrotor lacks plus the penalty, at the time at which this sum is least.
+    greatest speed. The shortfall is 0 if a catch is possible. Else it is the distance by which the
+    quadrotor misses the target plus the table's penalty, at the time at which this sum is least.
     """
     times, places, penalty = table.times, table.places, table.penalty
     late = jnp.where(times > begin, 0.0, 100.0)
@@ -98,7 +98,7 @@ def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
 
 
 def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
-    """Return the sum () [m] of distances that the quadrotor lacks at the catches of a choice."""
+    """Return the sum () [m] of distances by which the quadrotor misses the targets of a choice."""
     order, times = choice.order, choice.times
     targets = jax.tree.map(lambda leaf: leaf[order], case.targets)
     states = jax.tree.map(lambda leaf: leaf[..., None], targets_at(targets, times))
@@ -113,8 +113,8 @@ def shortfall(case: CatchCase, choice: CatchChoice) -> Array:
 def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice, Array]:
     """Return an order of N targets with its earliest times of catches, and the shortfall () [m].
 
-    The shortfall is the sum of the distances that the quadrotor lacks. Absent targets are moved to
-    the end of the order.
+    The shortfall is the sum of distances by which the quadrotor misses its targets. Absent targets
+    are moved to the end of the order.
     """
     order = order[jnp.argsort(~case.present[order], stable=True)]
 
@@ -154,12 +154,12 @@ def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchCh
 
 
 def later_by_shortfall(times: Array, shortfalls: Array) -> Array:
-    """Return the ranks of catches, time plus 10 s for each metre of shortfall; least is best."""
+    """Return the ranks of catches: time plus 10 s for each metre of miss; the least is best."""
     return times + 10.0 * shortfalls
 
 
 def can_be_next(case: CatchCase, shortfalls: Array) -> Array:
-    """Return which of N targets may be caught next, by the distances `shortfalls` [m] it lacks."""
+    """Return which of N targets may be caught next; each would be missed by `shortfalls` [m]."""
     return case.present & (shortfalls <= _MARGIN) if case.optional else case.present
 
 

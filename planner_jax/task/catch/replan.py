@@ -180,7 +180,7 @@ class ReplanCatch(OptimisedPlanner):
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation; constant if the previous plan is going to be returned."""
+        """Return cost and violation at `point`; with `context.keep`, of the previous plan."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
@@ -207,7 +207,7 @@ def _states_along(trajectory: PiecewisePolynomial, times: Numbers) -> Array:
 
 
 def _segments(task: Replanning) -> tuple[Array, Array]:
-    """Return index of segment and time [s] of each remaining catch of the previous plan, (N,)."""
+    """Return indices of segments, and times [s], of N remaining catches of the previous plan."""
     times = task.previous.times
     num_past = jnp.sum(times <= task.elapsed)
     segments = jnp.minimum(num_past + np.arange(times.size), times.size - 1)

@@ -90,7 +90,7 @@ def draw(
     if size < own:
         raise ArgumentError("num_targets", f">= {own} for suite {suite!r}", size)
     random = np.random.default_rng([seed, zlib.crc32(suite.encode())])
-    # The random numbers of a case are one row of a long table: skip the rows of earlier cases.
+    # Each case uses `columns` random numbers: skip the numbers of the cases before `first`.
     columns, make_targets = _PATHS[suite]
     random.bit_generator.advance(first * columns)  # type: ignore[attr-defined]
     targets, horizon = make_targets(random.random((num, columns)))
@@ -108,7 +108,7 @@ def draw(
 
 
 def draw_by_key(key: Array, num: int, suite: str) -> CatchCase:
-    """Draw `num` cases of a suite of `SUITES` with a key of `jax.random`, inside `jax.jit` too."""
+    """Draw `num` cases of a suite with a key of `jax.random`; the function can be compiled."""
     columns, make_targets = _PATHS[suite]
     paths = make_targets(jax.random.uniform(key, (num, columns)))
     targets, horizon = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), paths)
@@ -135,7 +135,7 @@ def _unit(angle: PyTree) -> PyTree:
 
 
 def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTree]:
-    """Make thrown balls from three random numbers each, and the times of latest catches [s]."""
+    """Make thrown balls from three random numbers each, with latest times of their catches [s]."""
     xp = _module(uniform)
     drawn = [_throw(u, t) for u, t in zip(xp.split(uniform, len(throws), 1), throws, strict=True)]
     pos, vel, horizon = (xp.stack(column, axis=1) for column in zip(*drawn, strict=True))
@@ -146,7 +146,7 @@ def _throws(uniform: PyTree, throws: tuple[_Throw, ...]) -> tuple[BallPath, PyTr
 
 
 def _throw(uniform: PyTree, throw: _Throw) -> tuple[PyTree, PyTree, PyTree]:
-    """Return positions and velocities of B thrown balls at time 0, and their latest catches [s]."""
+    """Return positions and velocities of balls at time 0, and latest times of catches [s]."""
     xp = _module(uniform)
     level = (2.0 * uniform[:, :2] - 1.0) * xp.asarray(throw.land)
     land = xp.concatenate([level, xp.zeros_like(level[:, :1])], axis=1)
@@ -206,7 +206,7 @@ def _lines(pos: PyTree, vel: PyTree) -> BallPath:
 
 
 def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
-    """Make two oscillating targets from nine random numbers each, and times of latest catches."""
+    """Make two oscillating targets from nine random numbers each, with latest times of catches."""
     u = uniform.reshape(len(uniform), 2, 9)
     drift = _between(u[..., :1], 1.0, 1.5) * _unit(2.0 * np.pi * u[..., 1])
     xp, level = _module(u), _between(u[..., 2:3], 0.0, 1.5) * _unit(2.0 * np.pi * u[..., 3])
@@ -219,7 +219,7 @@ def _harmonic(uniform: PyTree) -> tuple[HarmonicPath, PyTree]:
 
 
 def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
-    """Make three targets along a triangle's sides from seven random numbers, and latest times."""
+    """Make three targets along the sides of a triangle, with latest times of their catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     centre = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(3) / 3.0)
@@ -230,7 +230,7 @@ def _triangle(uniform: PyTree) -> tuple[BallPath, PyTree]:
 
 
 def _polygon(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make parallel targets on a regular polygon from eight random numbers, and latest times."""
+    """Make parallel targets at a polygon's corners, with latest times of their catches [s]."""
     xp, u = _module(uniform), uniform[:, :, None]
     near = xp.concatenate([uniform[:, :2] - 0.5, _between(uniform[:, 2:3], 1.5, 2.5)], axis=1)
     corner = 2.0 * np.pi * (u[:, 3] + np.arange(num) / num)
@@ -256,7 +256,7 @@ def _rush(
 
 
 def _swarm(uniform: PyTree, *, num: int) -> tuple[BallPath, PyTree]:
-    """Make `num` sinking balls from six random numbers each, and times of latest catches [s]."""
+    """Make `num` sinking balls from random numbers, with latest times of their catches [s]."""
     xp, u = _module(uniform), uniform.reshape(len(uniform), num, 6)
     height, sinking = _between(u[..., 2:3], 2.0, 6.0), _between(u[..., 3:4], 0.4, 2.0)
     level = 6.0 * xp.sqrt(u[..., 1:2]) * _unit(2.0 * np.pi * u[..., 0])

@@ -43,7 +43,7 @@ class GroupIntercept(Planner):
     patient: SpacetimeIntercept = SpacetimeIntercept("least")  # for legs that `planner` fails
 
     def plan_by(self, drive: Drive, cases: InterceptGroup) -> GroupPlan:
-        """Return the plans of a batch, or of one group."""
+        """Plan a batch of cases, or one case, leg after leg; `drive` runs the legs' planners."""
         if cases.batch_shape == ():
             plans = self.plan_by(drive, jax.tree.map(lambda leaf: leaf[None], cases))
             return jax.tree.map(lambda leaf: leaf[0], plans)

@@ -222,7 +222,7 @@ class ExactHit(ChainPlanner[HitCase, HitPlan]):
         return jnp.concatenate(numbers)
 
     def prepare(self, case: HitCase) -> HitContext:
-        """Return the context of a case: the case, and a table of the incoming ball's path."""
+        """Return the case with a table of the incoming ball's path, for evaluations of the cost."""
         return prepare_hit(case, self.num_table_nodes)
 
     def guess_ends(self, context: HitContext, num: int) -> Array:

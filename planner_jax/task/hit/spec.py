@@ -4,8 +4,8 @@ from planner_jax.core.registry import Task
 
 # [1/m], coefficient K_D of the ball's quadratic drag, fitted to the published landing points.
 DRAG = 0.0616
-# [m], hover position of the quadrotor at time 0. The paper gives no numbers; its figure shows the
-# quadrotor at the line between the near and the far region.
+# [m], hover position of the quadrotor at time 0. [Yu2023bat] gives no numbers; its figure shows the
+# quadrotor at the line between the near and the far region of its half court.
 START = (-3.0, 0.0, 1.5)
 
 # The six scenarios of the real experiments of [Yu2023bat, Section VI-C] as names of serve, landing

@@ -161,7 +161,7 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
 
 
 class _AimTable(NamedTuple):
-    """Splines of a serve's properties over its horizontal distance [m] and vertical speed [m/s]."""
+    """Splines that interpolate serves by horizontal distance [m] and vertical speed [m/s]."""
 
     speed: RectBivariateSpline  # [m/s], horizontal speed that reaches the distance
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|

@@ -33,8 +33,9 @@ def draw(
 ) -> InterceptCase:
     """Draw a batch of interception cases from a suite, a named family of random cases.
 
-    The suite is "easy" (default), "medium", "hard", "storm", "gale", "maze", "rush", or a suite of
-    another package. Arguments and errors are as for `pj.hit.draw`.
+    "easy" (default), "medium" and "hard" have ever more obstacles, "storm" and "gale" many moving
+    ones, "maze" long walls with gaps, and "rush" little time. Suites of other packages are also
+    accepted. Arguments and errors are as for `pj.hit.draw`.
     """
     suite = suite_named(suite, "easy")
     if suite not in SUITES:

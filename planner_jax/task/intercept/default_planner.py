@@ -219,5 +219,5 @@ def quick(**fields: object) -> SpacetimeIntercept:
 
 
 def best(**fields: object) -> SpacetimeIntercept:
-    """Make a `SpacetimeIntercept` that tries more paths, for a least squared acceleration."""
+    """Make a `SpacetimeIntercept` that tries more paths to reduce the squared acceleration."""
     return SpacetimeIntercept(**{"searches": BEST, "tries_all": True, **fields})

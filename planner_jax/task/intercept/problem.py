@@ -1,10 +1,9 @@
 """The least-squares problem of an interception: cost, stages of its solution, and derivatives.
 
-The unknowns are speed and curvature at K equally spaced times (knots) after the start, and the time
-of the meeting if it is free.
-The cost is a sum of squares (`terms`): the effort, which is the integral of the squared
-acceleration; the distance from the target at the end; and one-sided penalties (hinges) on limits
-and on distances from obstacles.
+The n unknowns are speed and curvature at K equally spaced times (knots) after the start, and the
+time of the meeting if it is free. The cost is a sum of squares (`terms`): the effort, which is the
+integral of the squared acceleration; the distance from the target at the end; and one-sided
+penalties (hinges) on limits and on distances from obstacles.
 
 The search for a path round the obstacles cannot be differentiated. Its path only determines where
 least squares start and which local minimum of the cost they reach. This minimum moves smoothly with
@@ -108,7 +107,7 @@ class MotionProblem:
         )
 
     def decode(self, case: InterceptCase, point: Array, steps: Array) -> InterceptPlan:
-        """Make the plan of n unknowns; check the limits at more samples than the cost uses."""
+        """Make the plan of the unknowns `point`; check limits at more samples than the cost."""
         speed, curvature, time = self.unpack(case, point)
         plan = make_plan(case, time, speed, curvature, samples=self.checked, points=12, steps=steps)
         return dataclasses.replace(plan, cost=time) if self.meet == "early" else plan
@@ -170,7 +169,7 @@ class MotionProblem:
         positions: Array,
         discs: int = 3,
     ) -> Model:
-        """Return the cost, a sum of squares, at the n unknowns, and its quadratic model.
+        """Return the cost, a sum of squares, at the unknowns `point`, and its quadratic model.
 
         `field` has the distances from walls. `positions` (K, 2) [m] are the points that the rear
         axle should follow at the knots 1 to K. `discs` discs cover the car's body.
@@ -325,14 +324,14 @@ class SmoothIntercept(OptimisedPlanner):
         )
 
     def guesses(self, context: _Context, num: int) -> Array:
-        """Return the n unknowns that minimise the cost near the start, as `num` equal rows."""
+        """Return the unknowns that minimise the cost near the start, as `num` equal rows."""
         fixed = lax.stop_gradient(context)
         start = fixed.case.start_point
         end = least_squares(lambda x: self._exact_model(x, fixed), start, self.solver)
         return jnp.broadcast_to(end.point, (num, *end.point.shape))
 
     def _model(self, point: Array, context: _Context) -> Model:
-        """Return the cost at the n unknowns and its quadratic model; see `build_model`."""
+        """Return the cost at the unknowns `point` and its quadratic model; see `build_model`."""
         problem = self.problem
         weights = dataclasses.replace(problem.weights, early=_EARLY)
         positions = problem.guess_at(point).positions
@@ -350,12 +349,12 @@ class SmoothIntercept(OptimisedPlanner):
         return dataclasses.replace(model, gradient=0.5 * gradient)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:
-        """Return the cost at the n unknowns, and the largest relative excess over a limit."""
+        """Return the cost at the unknowns `point`, and the largest relative excess over a limit."""
         model = self._model(point, context)
         return Evaluation(cost=model.cost, violation=model.violation)
 
     def decode(self, point: Array, context: _Context) -> InterceptPlan:
-        """Return the plan that the n unknowns describe."""
+        """Return the plan of the unknowns `point`: speeds and curvatures at knots, free time."""
         return self.problem.decode(context.case, point, jnp.zeros((), jnp.int32))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> "SmoothIntercept":
@@ -364,5 +363,5 @@ class SmoothIntercept(OptimisedPlanner):
 
 
 def add_start(case: InterceptCase, point: Array) -> StartedCase:
-    """Add the n unknowns, (n,) or (B, n), from which least squares start to a case or a batch."""
+    """Add to a case, or a batch, the unknowns `point` from which least squares start."""
     return StartedCase(**vars(case), start_point=lax.stop_gradient(point))

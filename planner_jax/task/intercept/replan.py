@@ -114,7 +114,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         return Replanning(case=remainder, previous=previous, elapsed=elapsed)
 
     def load_attempt(self, attempt: Search | Warm, tasks: Replanning) -> PyTree:
-        """Return an attempt as arguments of a compiled program; the two kinds have two programs."""
+        """Return an attempt as arguments of a compiled program; each type has its own."""
         if isinstance(attempt, Search):
             return self.planner.load_attempt(attempt, tasks.case)
         return super().load_attempt(attempt, tasks)

@@ -241,7 +241,7 @@ _ARRIVAL = Search(paths=1, lattice=reach.Lattice(64, 30, 4, 32, 6.0), body_scale
 
 
 def earliest_arrival(case: InterceptCase) -> Array:
-    """Estimate the earliest time () [s] at which the car of one case can meet its target; pure.
+    """Estimate the earliest time () [s] at which the car of one case can meet its target.
 
     The estimate is the first time in the reach set (about 20 times up to 10 s) at which the car can
     be at the target; infinite if there is none up to the case's time. Nothing is optimised.

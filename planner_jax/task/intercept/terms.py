@@ -200,7 +200,7 @@ def obstacle_terms(
     velocity = movers.velocity[..., None]  # (N, 2, 1)
 
     def measure(offset: Array) -> tuple[Array, Array, Array]:
-        """Return the disc's distances from walls and N movers at M samples, and gradients."""
+        """Return one disc's distances from walls and moving obstacles, and their gradients."""
         at_x, at_y = x + offset * cos, y + offset * sin
         still, still_x, still_y = (each[None] for each in field.near(at_x, at_y))
         moved = movers.centre[..., None] + velocity * times[None, None]  # (N, 2, M)
