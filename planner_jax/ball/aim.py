@@ -77,7 +77,6 @@ def _aim_jvp(primals: Sequence[Array], tangents: Sequence[Tangent]) -> tuple[Arr
 
 
 def _changing(tangents: Sequence[Tangent]) -> list[int]:
-    """Return the indices of the tangents that are not symbolic zeros."""
     return [k for k, each in enumerate(tangents) if not isinstance(each, SymbolicZero)]
 
 

@@ -82,7 +82,7 @@ def ekf_predict(
 ) -> EkfState:
     """Predict the belief after `duration` [s] >= 0 without an observation.
 
-    The covariance P becomes F P F' + Q. F is the Jacobian of the flight, and Q the covariance that
+    The covariance P becomes F P F^T + Q. F is the Jacobian of the flight; Q is the covariance that
     a white acceleration causes during `duration`. With `linear_drag_flight` this is [Yu2023catch,
     eq. 10], except that the paper adds only velocity times duration to the position.
     """

@@ -118,8 +118,8 @@ def fly(
 def linear_drag_flight(ball: BallState, duration: Array, drag: Array, gravity: Array) -> BallState:
     """Return the ball after a flight with drag acceleration -K_i v_i on each axis i.
 
-    On each axis the position is s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K, where g is the
-    component of the gravitational acceleration. [Yu2023bat, eq. 4a] omits the constant of
+    On each axis, with K = K_i, s(t) = s_0 + (v_0 - g/K)(1 - exp(-K t))/K + g t/K is the position,
+    and g the component of the gravitational acceleration. [Yu2023bat, eq. 4a] omits the constant of
     integration. The result is exact to rounding for any K >= 0.
     """
     x = drag * duration

@@ -89,7 +89,7 @@ def _check_times(times: ArrayLike) -> np.ndarray:
 
 
 def _check_values(name: str, value: ArrayLike, num: int) -> Numbers:
-    """Check values (..., K, 3); convert them to float64 unless they are traced by JAX."""
+    """Check vectors (..., num, 3), and convert them to float64 unless they are traced by JAX."""
     if shape_of(name, value)[-2:] != (num, 3):
         raise ArgumentError(name, f"the shape (..., {num}, 3)", np.shape(value), verb="have")
     if isinstance(value, Tracer):
@@ -119,7 +119,7 @@ def _evaluate(times: np.ndarray, values: list[PyTree], at: np.ndarray, order: in
 
 
 def _fewest_nodes(times: np.ndarray, values: list[PyTree], error: float) -> int:
-    """Return the least number of nodes, 16, 32, 64, ..., whose table has at most `error` [m]."""
+    """Return the least of 16, 32, 64, ... nodes with which a table keeps the bound `error` [m]."""
     if any(isinstance(value, Tracer) for value in values):
         raise ArgumentError("nodes", "passed if positions are traced", shown="none")
     require_number("error", error, POSITIVE)

@@ -91,7 +91,7 @@ def numbers_of(
     """Return numbers for every case of a batch, as an array of the shape batch + shape.
 
     The argument has this shape, or the shape `shape` for numbers that all cases share. Other shapes
-    raise, so that no axis is broadcast by accident. `batch` is () or (B,).
+    raise, so that no axis is broadcast by accident. `batch` is () for one case, (B,) for B cases.
     """
     array, whole = np.asarray(_require_numeric(name, value)), (*batch, *shape)
     if array.shape not in (shape, whole):
@@ -179,7 +179,7 @@ def require_path(
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape that the paths' method `at` returns; cached, since tracing takes 1 ms."""
+    """Return the shape of the positions that `at` of the paths returns; cached, as it is slow."""
 
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)

@@ -42,7 +42,7 @@ class Status(enum.IntEnum):
 
     @classmethod
     def _missing_(cls, value: object) -> "Status | None":
-        """Return the status equal to a jax array (); the enum's own search needs a hash."""
+        """Return the status equal to a jax array of one number, as in `Status(plan.status)`."""
         return next((status for status in cls if status == value), None)
 
 

@@ -76,7 +76,7 @@ class Task:
 
     @property
     def judge(self) -> "Callable[..., PyTree]":
-        """Function `judge(cases, plans)`, which returns the verdict of the referee."""
+        """Function `judge(cases, plans)`, which checks plans independently of the planners."""
         return self._function("judge")
 
     def all_planners(self) -> dict[str, str | metadata.EntryPoint]:
@@ -126,7 +126,6 @@ def require_name(known: Collection[str], kind: str, name: object) -> str:
 
 
 def _require_options(planner: str, maker: object, options: Collection[str]) -> None:
-    """Raise `ArgumentTypeError` for an option that is not a field of a planner's dataclass."""
     if isinstance(maker, type) and dataclasses.is_dataclass(maker):
         known = [field.name for field in dataclasses.fields(maker) if field.init]
         for option in options:

@@ -95,7 +95,7 @@ class Case(Protocol):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Shape () for one case, or (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch of B cases."""
         ...
 
 

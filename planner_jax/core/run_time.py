@@ -85,5 +85,5 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
 
 @cached_by_precision
 def place_numbers(settings: Settings) -> Settings:
-    """Return settings with their run-time numbers as jax arrays on JAX's default device."""
+    """Return settings whose numbers are jax arrays, to be passed to a compiled program."""
     return settings

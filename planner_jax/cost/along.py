@@ -90,7 +90,7 @@ def integrate_along(
     """Integrate the penalties of N segments, and return the greatest excess of each segment.
 
     Args:
-        along: the excess functions and the quadrature.
+        along: functions of the excess over limits, and the quadrature.
         columns: (N, C, 3), C columns of each segment: boundary rows (scaled states at its ends) and
             whitened waypoint offsets.
         piece_durations: (N,) [s], mean duration h of the pieces of each segment.
@@ -117,7 +117,7 @@ def greatest_along(
 def _with_kernel(
     function: Callable, along: Along, mode: str, jvp: Callable | None = None
 ) -> Callable:
-    """Bind a function to `along`, and attach its CUDA kernel, one of `along_kernel.MODES`."""
+    """Pass `along` to a function, and attach the CUDA kernel that computes the same results."""
     path = "planner_jax.cost.along_kernel:along_kernel"
     return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
 
@@ -179,7 +179,7 @@ def _values(
 def _slopes(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
-    """Return `_values`, and the penalties' derivatives by columns (N, C, 3) and durations (N,)."""
+    """Return penalties, greatest excesses, and derivatives of penalties by columns, durations."""
     value = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
     penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
     return penalties, worst, *pull_back(jnp.ones_like(penalties))

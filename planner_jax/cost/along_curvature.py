@@ -52,11 +52,12 @@ def curvature_along(
     """Integrate the penalties of one segment, with first and second derivatives.
 
     Args:
-        along: the excess functions and the quadrature.
-        columns: (G + C, 3) boundary rows and whitened offsets.
+        along: functions of the excess over limits, and the quadrature.
+        columns: (G + C, 3), G fixed and C variable columns: boundary rows (scaled end states) and
+            whitened waypoint offsets.
         piece_duration: () [s], mean duration of the pieces.
         parameters: second argument of the excess functions.
-        given: G, the number of fixed columns, which come first.
+        given: G, the number of fixed columns, which precede the variable columns.
     """
     constants = _constants(along, given)
     samples = functools.partial(jnp.asarray, dtype=columns.dtype)
@@ -204,7 +205,6 @@ def _entries(
 
 
 def _square(entries: dict[tuple[int, int], Array], num: int) -> Array:
-    """Combine the entries of all pairs of columns into one matrix (num, 3, num, 3)."""
     blocks = {pair: found.reshape(num, num) for pair, found in entries.items()}
     rows = [
         jnp.stack([blocks[a, b] if a <= b else blocks[b, a].T for b in range(3)], axis=-1)
@@ -223,7 +223,8 @@ class _Constants:
     samples: np.ndarray
     moving_samples: np.ndarray  # (orders, K, C)
     groups: tuple[tuple[Slot, ...], ...]
-    # Groups of pairs of axes, each with the common terms, which are pairs of orders of derivatives.
+    # Groups of pairs of axes; with each group the pairs of orders of derivatives ("terms") for
+    # which second derivatives of the penalty are not zero.
     pairs: tuple[tuple[tuple[tuple[int, int], ...], tuple[tuple[int, int], ...]], ...]
 
     @property
@@ -261,7 +262,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return matrices (places, terms * K) that sum second derivatives at the K samples."""
+    """Return matrices from second derivatives at samples to those by pairs of columns `places`."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

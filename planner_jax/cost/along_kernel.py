@@ -43,14 +43,14 @@ Vectors = list[list[Array]]  # columns, or derivatives of a motion, each with it
 class Grid:
     """The division of a kernel's work into blocks, by segments and lanes (problems of a batch)."""
 
-    trajectories: int  # number of trajectories of each lane
+    trajectories: int  # number of segments of each lane
     num_columns: int  # number of columns (boundary rows and waypoint offsets) of a segment
     lanes: int
     threads: int  # number of threads of a block, one for each lane
 
     @property
     def blocks(self) -> int:
-        """Number of blocks that one trajectory of all lanes needs."""
+        """Number of blocks for one segment of all lanes (problems of the batch)."""
         return self.lanes // self.threads
 
     @property
@@ -59,7 +59,7 @@ class Grid:
         return min(max(_ENOUGH // (self.trajectories * self.blocks), 1), 8)
 
     def flatten(self, leaf: Array, lead: tuple[int, ...], *own: int) -> Array:
-        """Broadcast an array of (*own, lanes), and join the axes that `vmap` put in front of it."""
+        """Broadcast an array to (*lead, *own, lanes), and join the axes `lead` into one axis."""
         return jnp.broadcast_to(leaf, (*lead, *own, self.lanes)).reshape(-1, *own, self.lanes)
 
 
@@ -219,7 +219,7 @@ def load_numbers(ref: Ref) -> PyTree:
 
 
 def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
-    """Load a sample's row: C factors of the columns for each of position, ..., jerk."""
+    """Load a sample's factors of the columns, for position, velocity, acceleration and jerk."""
     return [[matrices[sample, d * num_columns + c] for c in range(num_columns)] for d in range(4)]
 
 
@@ -315,7 +315,7 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return a sample's greatest excess, and its weighted penalty with derivatives by `free`."""
+    """Return a sample's greatest excess, its weighted penalty, and derivatives by `free`."""
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 

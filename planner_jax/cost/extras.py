@@ -1,10 +1,11 @@
 """Limits and costs that a user defines along a quadrotor's trajectory: `extras` of a case.
 
 An extra is a `flax.struct.dataclass` of arrays with a method `excess`, `cost` or both, which are
-pure and for one case. The planner calls them with jax arrays, and the referee calls `excess` with
-float64 NumPy arrays: use operators and the methods of both. Other values of the arrays need no new
-compilation, but another class does. The search evaluates samples some centimetres apart, and the
-check of a finished plan every few millimetres. Smaller obstacles may be missed.
+pure and for one case. The planner calls them with jax arrays. The referee, an independent check of
+finished plans, calls `excess` with float64 NumPy arrays: use only operators and methods that both
+have. Other values of the arrays need no new compilation, but another class does. The search
+evaluates samples some centimetres apart, and then checks the plan every few millimetres. Smaller
+obstacles may be missed.
 """
 
 from collections.abc import Sequence
@@ -32,7 +33,7 @@ _CLOSE_NODES = 64
 
 @runtime_checkable
 class ExtraLimit(Protocol):
-    """A limit that a user defines; the planner keeps it and the referee checks it."""
+    """A limit that a user defines. Planners keep it, and the check of finished plans tests it."""
 
     def excess(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the excess (...), > 0 if broken, of a motion (..., 3) in SI units."""
@@ -41,7 +42,7 @@ class ExtraLimit(Protocol):
 
 @runtime_checkable
 class ExtraCost(Protocol):
-    """A term of the planner's cost that a user defines; the referee ignores it."""
+    """A term of the planner's cost that a user defines; the check of finished plans ignores it."""
 
     def cost(self, pos: Numbers, vel: Numbers, acc: Numbers) -> Numbers:
         """Return the cost per second (...), >= 0, of a motion (..., 3) in SI units."""
@@ -195,7 +196,7 @@ def num_limits(extras: tuple[Extra, ...]) -> int:
 
 
 def extra_excess(motion: Motion, extras: tuple[Extra, ...]) -> tuple[Numbers, ...]:
-    """Return the excess (N,) over each extra limit, along samples of a motion."""
+    """Return the excess (N,) over each extra limit at N samples of a motion."""
     samples = motion.pos, motion.vel, motion.acc
     return tuple(extra.excess(*samples) for extra in extras if isinstance(extra, ExtraLimit))
 

@@ -61,7 +61,7 @@ def ground_excess(height: Array, limits: QuadrotorLimits) -> Array:
 def limits_along(
     motion: Motion, given: tuple[Array, QuadrotorLimits, tuple[Extra, ...]]
 ) -> tuple[PyTree, ...]:
-    """Return the excess (N,) over each limit of flight, then over each limit of the extras."""
+    """Return the excess at N samples, (N,), over each limit of flight, then of the extras."""
     gravity, limits, extras = given
     return (*flight_excess(motion, gravity, limits), *extra_excess(motion, extras))
 
@@ -102,7 +102,7 @@ class QuadrotorCase(Protocol):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Shape () for one case, or (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch of B cases."""
         ...
 
     @property

@@ -22,7 +22,6 @@ def available_memory() -> int | None:
 
 
 def _of_system() -> int | None:
-    """Return the free memory of the system in bytes; None if unknown."""
     try:
         lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
     except OSError:
@@ -35,7 +34,6 @@ def _of_system() -> int | None:
 
 
 def _of_container() -> int | None:
-    """Return the free memory of the container in bytes; None outside of a container."""
     try:
         most = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         taken = int((_CGROUP / "memory.current").read_text(encoding="ascii"))

@@ -85,14 +85,14 @@ def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
 
 
 def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> list[Array]:
-    """Evaluate a function of one lane for all lanes, the last axis of arguments and results."""
+    """Evaluate a function of one problem for all lanes (problems), the last axis of all arrays."""
     values = _evaluate(closed, [_Lanes(leaf) for leaf in leaves], lanes)
     pairs = zip(values, closed.jaxpr.outvars, strict=True)
     return [_widen(value, shape_of(out), lanes) for value, out in pairs]
 
 
 def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
-    """Evaluate a function of one lane for all lanes, operation by operation."""
+    """Evaluate a function of one problem for all lanes (problems), operation by operation."""
     jaxpr = closed.jaxpr
     values: dict[Var, _Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -109,7 +109,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
-    """Evaluate one operation for all lanes, by a kernel or by a rule of `_RULES` if it has one."""
+    """Evaluate one operation for all lanes (problems), by a kernel or a rule if there is one."""
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
@@ -164,7 +164,6 @@ def _by_kernel(
 
 
 def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Array]:
-    """Evaluate the operation itself, with some of its parameters changed."""
     results = eqn.primitive.bind(*inputs, **{**eqn.params, **changes})
     return list(results) if eqn.primitive.multiple_results else [results]
 
@@ -178,7 +177,7 @@ def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
 
 
 def _by_vmap(eqn: JaxprEqn, inputs: list[_Value]) -> list[Array]:
-    """Evaluate any operation by `jax.vmap`, for which the lanes are moved to the front."""
+    """Evaluate any operation by `jax.vmap`, with the lanes (problems) moved to the first axis."""
     arrays = [jnp.moveaxis(v.array, -1, 0) if isinstance(v, _Lanes) else v for v in inputs]
     axes = tuple(0 if isinstance(value, _Lanes) else None for value in inputs)
     results = jax.vmap(lambda *operands: _bind(eqn, operands), in_axes=axes)(*arrays)
@@ -214,7 +213,7 @@ def _pad(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
 
 
 def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array] | None:
-    """Multiply by a matrix that all lanes share: one product, with the lanes as columns."""
+    """Multiply by a matrix that all lanes (problems) share: one product, with lanes as columns."""
     (left, right), ((left_dims, right_dims), batch) = inputs, eqn.params["dimension_numbers"]
     both = isinstance(left, _Lanes) and isinstance(right, _Lanes)
     if both or batch != ((), ()):

@@ -172,7 +172,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Split a point into N segments' offsets (N, O, 3) and end variables (N, K) in SI units."""
+        """Split a point into offsets of O waypoints and K end variables (SI units) per segment."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
@@ -209,7 +209,6 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return rows, durations, core, jnp.max(ends.excess)
 
     def _count(self, values: Float[Array, " N"], context: PyTree) -> Array:
-        """Return the sum of one value for each segment over the segments that the case uses."""
         return jnp.sum(jnp.where(self.active(context), values, 0.0))
 
     def objective(self, point: Float[Array, " n"], context: PyTree) -> Evaluation:

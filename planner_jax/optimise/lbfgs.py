@@ -141,10 +141,6 @@ def search_direction(memory: Memory, grad: Array, step_cap: float) -> Array:
 
 @functools.cache
 def _turn(num_pairs: int, step_cap: float) -> Callable:
-    """Make the function that stores the last step and computes the next search direction.
-
-    On a GPU a batch of problems uses a CUDA kernel for this function.
-    """
 
     def turn(memory: Memory, step: Array, change: Array, grad: Array) -> tuple[Memory, Array]:
         memory = remember(memory, step, change)

@@ -255,7 +255,6 @@ def _cheapest(costs: Array, num: int) -> Array:
 
 
 def _plan_at(planner: "OptimisedPlanner", optimum: Optimum, context: PyTree) -> PyTree:
-    """Return the plan at an optimum, with its cost, its iterations and its status."""
     plan = planner.decode(optimum.point, context)
     cost = optimum.evaluation.cost
     status = status_of(cost, plan.violation, optimum.stationary)

@@ -79,7 +79,7 @@ class Differentiated(OptimisedPlanner):
     """
 
     planner: OptimisedPlanner
-    # The number: a dotted name in the plan, such as "stroke.time", or a function of the plan.
+    # The differentiated number: a dotted name in the plan, such as "stroke.time", or a function.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
     # Iterations of conjugate gradients; None for the default of the field `curvature`.
@@ -311,7 +311,6 @@ def _members(tree: PyTree) -> dict[str, PyTree]:
 
 
 def _with_part(tree: PyTree, name: str, part: PyTree) -> PyTree:
-    """Return a copy of the tree in which the part with a dotted name is replaced."""
     first, _, rest = name.partition(".")
     inner = _with_part(_members(tree)[first], rest, part) if rest else part
     if isinstance(tree, tuple):

@@ -52,10 +52,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:
-    """Return the velocities (..., 2) for arrays of speed levels and heading bins.
-
-    The unit is one level of speed, and the axes are along the heading of bin 0 and to its left.
-    """
+    """Return velocities (..., 2) along the heading of bin 0 and to its left, in speed levels."""
     dtype = grid.cell.dtype
     angle = (2.0 * np.pi / grid.lattice.headings) * heading.astype(dtype)
     return level[..., None].astype(dtype) * jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

@@ -27,7 +27,7 @@ class Obstacles:
     present: Array  # (N,) bool, whether the entry is an obstacle or only padding
 
     def vertices(self, time: ArrayLike) -> Array:
-        """Return the corners (N, V, 2) [m] in the world frame at one time () [s]."""
+        """Return the V corners of the N obstacles at one time () [s], (N, V, 2) [m]."""
         return (self.centre + self.velocity * time)[..., None, :] + self.corners
 
 
@@ -92,7 +92,6 @@ def _check_room(room: object) -> tuple[int, int] | None:
 
 
 def _check_polygon(k: int, corners: object) -> np.ndarray:
-    """Return the corners of polygon k counter-clockwise; raise unless the polygon is convex."""
     if numeric(corners) is None:
         raise ArgumentTypeError("polygons", "corners of numbers", corners, k, verb="have")
     polygon = np.asarray(corners, float)
@@ -122,9 +121,9 @@ def distances(
     """Return the signed distances of points from convex polygons, and their gradients.
 
     Args:
-        corners: (N, V, 2) [m], counter-clockwise; corners may be repeated.
+        corners: (N, V, 2) [m], V corners of N polygons, counter-clockwise; may be repeated.
         present: (N,) bool; absent polygons get the distance 1000 m.
-        x: (N, P) or (1, P) [m], points: one row for each polygon, or one row for all polygons.
+        x: (N, P) or (1, P) [m], P points for each polygon, or P points for all polygons.
         y: (N, P) or (1, P) [m].
 
     Returns:
@@ -175,7 +174,7 @@ def separation(
     rectangle and polygon do not touch (the separating axis theorem), and is at most their distance.
 
     Args:
-        corners: (N, V, 2) [m], counter-clockwise; corners may be repeated.
+        corners: (N, V, 2) [m], V corners of N polygons, counter-clockwise; may be repeated.
         present: (N,) bool; absent polygons get the gap 1000 m.
         x: (N, P) or (1, P) [m], P positions of a reference point on the rectangle's long axis.
         y: (N, P) or (1, P) [m].

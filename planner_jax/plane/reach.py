@@ -198,7 +198,6 @@ def _draw_movers(grid: Grid, movers: Obstacles, stencils: Array, time: Array) ->
 
 
 def _word_of(row: Array, at: Array) -> Array:
-    """Return the bits of a word into which a 32-bit row is written from the word's bit `at` on."""
     by = jnp.minimum(jnp.abs(at), 31).astype(jnp.uint32)
     moved = jnp.where(at >= 0, row << by, row >> by)
     return jnp.where(jnp.abs(at) < 32, moved, jnp.uint32(0))
@@ -267,7 +266,7 @@ def reach_set(
     blocked = _map_needed(draw_obstacles, times, halves_needed)
 
     def find_free(blocked: Array) -> Array:
-        """Return the cells (words, headings, cells) in which the rear axle is allowed."""
+        """Return the cells (words, headings, cells) in which the car touches no obstacle."""
         each = jnp.broadcast_to(blocked[:, None], (num_cells // 32, headings, num_cells))
         return allowed & ~(_shift(each, discs[0]) | _shift(each, discs[1]))
 

@@ -240,7 +240,7 @@ class _Batch:
         return mark_out_of_time(plans, untried) if untried.any() else plans
 
     def _calls(self, attempt: Attempt, lanes: np.ndarray) -> list[_Call]:
-        """Split the indices `lanes` into compiled calls, each padded to an allowed size."""
+        """Split the indices `lanes` of cases into compiled calls, padded to an allowed size."""
         calls, devices = [], self.mesh.size
         for first, size in self.sizes(attempt).cuts(-(-lanes.size // devices)):
             part = lanes[first * devices :][: size * devices]
@@ -335,7 +335,7 @@ class _Batch:
 
 @jax.jit
 def _take(tree: PyTree, lanes: PyTree) -> PyTree:
-    """Return the entries `lanes` of every leaf; an index beyond the end selects the last entry."""
+    """Return entries of every leaf by index; an index beyond the end selects the last entry."""
     return jax.tree.map(lambda leaf: leaf[jnp.minimum(lanes, leaf.shape[0] - 1)], tree)
 
 

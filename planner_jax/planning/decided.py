@@ -44,7 +44,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the plans of one case or of a batch; a plan also stores the choice it realises."""
+        """Return the best plan of each case, for one case or a batch; it stores its choice, too."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)

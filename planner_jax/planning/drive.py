@@ -123,7 +123,6 @@ def _plan_purely(planner: Planner, attempts: Sequence[Attempt], cases: PyTree) -
 
 
 def _solve_by(planner: Planner, cases: PyTree, loaded: Sequence[PyTree], k: Array | int) -> PyTree:
-    """Return the plans of the k-th of attempts that have the same structure; pure."""
     if len(loaded) == 1:
         return solve_cases(planner, cases, loaded[0])
     chosen = jax.tree.map(lambda *leaves: jnp.stack(leaves)[k], *loaded)

@@ -56,7 +56,7 @@ class Sizes:
         return smaller if smaller >= self.busy and 2 * num <= fits else fits
 
     def cuts(self, num: int) -> Iterator[tuple[int, int]]:
-        """Yield the first lane and the size of every call that is needed for `num` lanes.
+        """Yield the first lane (case) and the size of every call that is needed for `num` lanes.
 
         The last call has the size of the calls before it, because another size needs another
         program. It is smaller only if this saves more than 1/8 of the work before it.
@@ -71,7 +71,7 @@ class Sizes:
 
 
 def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) -> Sizes:
-    """Return the call sizes of an attempt: `chunk` lanes, or numbers that suit the device."""
+    """Return the call sizes of an attempt: `chunk` cases, or numbers that suit the device."""
     busy = _GPU_BUSY // attempt.starts
     if chunk is not None:
         return Sizes(chunk, busy)
@@ -189,7 +189,7 @@ def _solve_on_devices(
 
 
 def with_unsolved(plans: PyTree) -> tuple[PyTree, Array]:
-    """Return the plans, and the number of unsolved plans as an array (1,)."""
+    """Return the plans, and the number of unsolved plans among them as an array (1,)."""
     return plans, jnp.sum(is_unsolved(plans.status), keepdims=True)
 
 

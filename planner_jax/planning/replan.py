@@ -25,12 +25,12 @@ class Replanning(Generic[CaseT, PlanT]):
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Shape () for one case, or (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch of B cases."""
         return self.case.batch_shape
 
 
 def check_elapsed(cases: Case, elapsed: PyTree) -> np.ndarray:
-    """Check and return the time since the plans started, () or (B,) [s], in the cases' float type.
+    """Check and return the time [s] since the plans started: one number, or one for each case.
 
     Raises:
         TypeError: `elapsed` is not a number.

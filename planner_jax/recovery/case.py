@@ -31,7 +31,7 @@ class RecoveryCase:
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
-        """Shape () for one case, or (B,) for a batch."""
+        """Shape () for one case, or (B,) for a batch of B cases."""
         return np.shape(self.gravity)
 
 

@@ -79,7 +79,7 @@ class RecoveringPlanner(PlannerAround[CaseT, PlanT]):
 
 
 def recovery_cases(cases: PyTree, plans: PyTree) -> RecoveryCase:
-    """Return the cases of the recovery trajectories from the ends of plans (B,)."""
+    """Return the cases of recovery trajectories that start at the ends of a batch of plans."""
     states: PyTree = _end_states(plans.trajectory)
     if isinstance(plans.status, np.ndarray):
         states = np.asarray(states)

@@ -357,7 +357,6 @@ def _rows(pair: Array) -> tuple[Vector, Vector]:
 
 
 def _ground(pair: Array) -> tuple[Vector, Vector]:
-    """Project two vectors (2, 3) onto the x-y plane, and return them as tuples of components."""
     return tuple(pair[0, :2]), tuple(pair[1, :2])
 
 

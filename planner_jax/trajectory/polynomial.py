@@ -125,7 +125,7 @@ def states_at(trajectory: PiecewisePolynomial, times: np.ndarray) -> np.ndarray:
     """Evaluate position, velocity, acceleration and jerk by NumPy, at one time per trajectory.
 
     Args:
-        trajectory: one trajectory, or a batch with a leading axis B on every leaf.
+        trajectory: one trajectory, or a batch of B, with a leading axis on every leaf.
         times: (B,) or () [s] since the start.
 
     Returns:

@@ -247,7 +247,7 @@ def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
 
 
 def trajectory_energy(maps: ProportionalMinco, rows: Array, offsets: Array, piece_duration: Array):
-    """Return the integral () of |p^(s)|^2 for boundary rows (2s, 3) and whitened offsets (O, 3)."""
+    """Return the energy (), the integral of |p^(s)|^2, for boundary rows (2s, 3) and offsets."""
     boundary = boundary_energy(maps, rows, piece_duration)
     return boundary + offset_energy(maps, offsets, piece_duration)
 
@@ -328,7 +328,7 @@ def chain_rows(
 def chain_trajectory(
     maps: ProportionalMinco, chain: Chain, active: Bool[Array, " N"]
 ) -> PiecewisePolynomial:
-    """Return the trajectory of N * M pieces; pieces of absent segments stand still for 0 s."""
+    """Join N segments of M pieces each; the pieces of inactive segments have a duration of 0 s."""
     build = functools.partial(proportional_trajectory, maps)
     pieces = jax.vmap(build)(chain.rows, chain.offsets, chain.piece_durations)
     ends = chain.rows[:, maps.order, :]  # positions at the ends of the segments
