@@ -169,7 +169,7 @@ def evaluate_actions(cases: CatchCase, actions: Array, iterations: int) -> dict[
 
     Args:
         cases: batch of B cases with N targets each.
-        actions: (B, N, PER_TARGET), components from -1 to 1.
+        actions: (B, N, 2), a handicap and a stretch for each target, from -1 to 1.
         iterations: number of planner iterations; for zero an estimate is used, not the planner.
 
     Returns:

@@ -253,10 +253,7 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """Return the number of rows in a part's learning curve, and of batches for each row.
-
-    A batch has one decision for each of `lanes` cases.
-    """
+    """Return the number of rows in a part's learning curve, and of batches of cases per row."""
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each

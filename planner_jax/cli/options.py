@@ -32,10 +32,7 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, and return the exit code `code`.
-
-    Where the error names an argument, the text has the argument's option in `flags`.
-    """
+    """Print an error in one line, with options from `flags` for arguments; return `code`."""
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -59,10 +56,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the parser's options, then parse the words.
-
-        In the result, `flags` has the option of each argument by name, such as "num": "--num".
-        """
+        """Add the parser's options, then parse; `flags` of the result are options by argument."""
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)
@@ -132,10 +126,7 @@ def _type_of(hint: Any) -> type:
 
 
 def pop_out(given: Options, kind: str = "folder") -> str | None:
-    """Remove the option `--out`, the path of a file or folder, from the options; return it or None.
-
-    `kind` names what the path is of, in error messages.
-    """
+    """Remove the option `--out`, the path of a file or folder, from the options, and return it."""
     out = given.pop("out", None)
     if out == "":
         raise ArgumentError("out", f"a {kind}", out, verb="name")

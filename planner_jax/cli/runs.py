@@ -222,10 +222,7 @@ def _how_to_continue(out: Path, again: str, sign: str = "manifest.json") -> str:
 def _tell_how_to_continue(
     remainder: Callable[[], str], rule: str = "--out must be a folder that can be written"
 ) -> Iterator[None]:
-    """Within the `with` block, add `remainder()` to messages of interruptions and failures.
-
-    It is a sentence on how to continue the run.
-    """
+    """Add `remainder()`, advice on how to continue, to errors and interruptions of the block."""
     try:
         yield
     except KeyboardInterrupt:

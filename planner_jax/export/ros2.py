@@ -100,10 +100,7 @@ def trajectory(plan: Plan, rate: float) -> tuple[str, dict[str, Json]]:
 
 
 def _motion(setpoints: QuadrotorSetpoints | CarSetpoints) -> tuple[np.ndarray, ...]:
-    """Return position, quaternion (x, y, z, w), velocity, angular velocity and acceleration.
-
-    All are in the world frame, with one row for each setpoint.
-    """
+    """Return position, quaternion (x, y, z, w), velocity, angular velocity, acceleration (ENU)."""
     if isinstance(setpoints, QuadrotorSetpoints):
         quat = setpoints.quat_wxyz
         spin = rotate(quat, setpoints.body_rate)

@@ -45,10 +45,9 @@ class Client:
         *,
         measured: float | None = None,
     ) -> Answer | None:
-        """Send the robot's position, velocity and acceleration in SI units.
+        """Send the robot's position, velocity, acceleration in SI units, and return the answer.
 
-        Returns the answer, or None after the timeout. `measured` [s] is the time of the measurement
-        by `time.monotonic()`; the default is the time of this call.
+        The other arguments and the result are as for `ball`.
         """
         return self._send(ROBOT, measured, (*pos, *vel, *acc), 0)
 

@@ -29,10 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make a course from the polynomials of a plan alone, without a trajectory to standstill.
-
-    Pieces of zero duration take its place, so that all courses have equal shapes.
-    """
+    """Make the course of a plan alone; pieces of zero duration replace the stop at its end."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -99,10 +96,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position, velocity, acceleration and jerk at the time `elapsed` [s] of a course.
-
-    After the end of the course the robot stands still.
-    """
+    """Return position to jerk at the time `elapsed` [s] of a course, standstill after its end."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:

@@ -139,10 +139,7 @@ def answer(
     times: tuple[float, float, float],
     setpoints: np.ndarray,
 ) -> bytes:
-    """Encode an answer to a packet.
-
-    `times` [s] are the time of the first setpoint, the period, and the time of the contact.
-    """
+    """Encode an answer; `times` [s] are of the first setpoint, the period, and of the contact."""
     head = _HEADER.pack(MAGIC, VERSION, ANSWER, packet.ball, packet.sequence, packet.sent)
     return head + _ANSWERED.pack(motion, fault, len(setpoints), *times) + setpoints.tobytes()
 

@@ -147,10 +147,7 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] at which the falling ball is too low for the net, or 0.
-
-    The net is then upright, with the quadrotor at its least height.
-    """
+    """Return the time (1,) [s] until the falling ball is too low for an upright net, or 0."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
     # The bisection starts at the ball's apex, since a rising ball may be too low at time 0.

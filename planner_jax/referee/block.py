@@ -210,10 +210,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test the contact time and the pieces' durations; return (failed, error [s], contact time).
-
-    `stays` (B,) [s] is the time from the end of each of B motions to the contact with the ball.
-    """
+    """Test the contact time, durations, and the time `stays` from the motion's end to contact."""
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -231,10 +228,7 @@ class _Motion:
 
 
 def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return joint angles, rates and accelerations at their extrema and at the ends of pieces.
-
-    Each of the three is returned with its times [s] since the start of the piece.
-    """
+    """Return joint angles, rates, accelerations at extrema and ends of pieces, each with times."""
     degree, shape = len(motion.coeffs) - 1, motion.coeffs.shape[1:]
     ends = np.stack([np.zeros(shape), np.broadcast_to(motion.durations, shape)])
     times, found = ends, []
@@ -255,10 +249,7 @@ def _extremes(motion: _Motion) -> list[tuple[np.ndarray, np.ndarray]]:
 
 
 def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find for each of B plans the greatest excess over a joint's limit, its time and its joint.
-
-    `excess` (K, 6, B, M) has K values for each of six joints and M pieces; the results are (B,).
-    """
+    """Return each plan's greatest excess over all joints, pieces and times; its time and joint."""
     by_lane = flat(np.moveaxis(excess, 2, 0))
     lanes, top = np.arange(len(by_lane)), by_lane.argmax(axis=1)
     k, joint, piece = np.unravel_index(top, (*excess.shape[:2], excess.shape[3]))
@@ -267,11 +258,7 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test the start, continuity and joint limits of motions.
-
-    Returns measurements, tests (failed, excess, time), and the joint with the greatest excess, each
-    by name. `extremes` is the result of `_extremes`.
-    """
+    """Test the start, continuity and joint limits; return measurements, tests and worst joints."""
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -301,11 +288,7 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test that a motion ends at standstill if the case requires it or the contact is later.
-
-    `stays` (B,) [s] is the time from the motion's end to the contact, for B plans. Returns the test
-    (failed, excess, time), and the name (B,) of the fastest joint.
-    """
+    """Test that a motion ends at standstill if the case requires it or the contact is later."""
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -319,10 +302,7 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return for each kind of obstacle the least distance (B,) [m], its time and the arm's part.
-
-    `turning` (B, M) [rad/s] bounds the norm of the joint rates in M pieces of each of B plans.
-    """
+    """Return for each kind of obstacle each plan's least distance, its time and the arm's part."""
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
@@ -350,10 +330,9 @@ def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) 
 def _sample(
     motion: _Motion, lanes: np.ndarray, count: np.ndarray, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the motions of B plans at S times: return times (B, S) [s], angles (6, B, S) [rad].
+    """Return times and joint angles at the samples with the indices `sample`, for some plans.
 
-    Piece m of plan b is divided into count[b, m] equal steps; `sample` has the indices (S,) of the
-    samples, and indices behind the last piece repeat its end.
+    Piece m of plan b has count[b, m] equal steps. Indices behind the last piece repeat its end.
     """
     behind = np.cumsum(count, axis=1)
     piece = (sample >= behind[..., None]).sum(axis=1).clip(max=count.shape[1] - 1)  # (B, S)
@@ -366,10 +345,7 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Test at the contact the ball's position on the shield, the shield's tilt, and the boxes.
-
-    `angles` (6, B) [rad] are the joint angles of B plans. Returns measurements and tests by name.
-    """
+    """Test at the contact the ball's position on the shield, the shield's tilt, and the boxes."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
@@ -390,10 +366,7 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test that at the contact the ball is in the outer box and has not entered the inner box.
-
-    `contact` [m] enlarges the outer box and shrinks the inner box.
-    """
+    """Test that at the contact the ball is in the outer box and has not entered the inner box."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:

@@ -188,10 +188,7 @@ def _ends(durations: np.ndarray, num: int) -> np.ndarray:
 
 
 def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities (B, N, 3) of targets at the times of their catches.
-
-    Entry [b, i] is of target order[b, i] of case b at times[b, i] [s].
-    """
+    """Return the position and velocity of target order[b, i] of case b at the time times[b, i]."""
     lanes, finite = np.arange(len(order))[:, None], np.ones(order.shape, bool)
 
     def leaf(name: str, value, *trailing: int) -> np.ndarray:
@@ -347,10 +344,7 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure and test distance and angle between net and target at the N catches of B plans.
-
-    Returns measurements (B, N), and tests (failed, excess, time) of arrays (B, N), by name.
-    """
+    """Measure and test the distance and the angle between net and target at all catches."""
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)

@@ -357,10 +357,7 @@ def _integrate_poses(case: dict, span: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _judge_clearance(case: dict, times: np.ndarray, poses: np.ndarray, contact: float) -> tuple:
-    """Test that the car's body stays in the map and off obstacles; also measure the distances.
-
-    `poses` (B, S, 3) are of the body's middle at S `times` of each of B plans.
-    """
+    """Test that the car's body stays in the map and off obstacles; also measure the distances."""
     middle = poses[..., :2]
     outside = np.maximum(case["lower"][:, None] - middle, middle - case["upper"][:, None])
     off, when = _greatest(outside.max(axis=2), times)

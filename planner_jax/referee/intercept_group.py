@@ -95,10 +95,7 @@ def referee_groups(
 
 
 def _leg(shared: Any, target: Any, begin: np.ndarray, car: tuple) -> SimpleNamespace:
-    """Return cases of one target that start at the times `begin` [s] in the state `car`.
-
-    `car` has the pose, the speed and the curvature at the end of the preceding leg.
-    """
+    """Return cases that start at `begin` [s] with the pose, speed and curvature in `car`."""
     movers, (start, speed, curvature) = shared.movers, car
     centre = movers.centre + begin[:, None, None] * np.asarray(movers.velocity, np.float64)
     own = {"start": start, "speed": speed, "curvature": curvature, "target": target}

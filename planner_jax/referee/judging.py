@@ -1,7 +1,4 @@
-"""Parts that the referees of all tasks share: verdicts, checks of shapes, threads and processes.
-
-A referee is an independent check of plans in float64.
-"""
+"""Parts that the referees, independent checks of plans, share: verdicts, shapes and threads."""
 
 import dataclasses
 import functools
@@ -221,10 +218,7 @@ def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarr
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate the derivative of an order of polynomials at `times` (...) [s].
-
-    `coeffs` (D + 1, ...) are coefficients of rising powers, up to the degree D.
-    """
+    """Evaluate a derivative of polynomials at `times` [s]; `coeffs` are of rising powers."""
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

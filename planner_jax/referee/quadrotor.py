@@ -114,10 +114,7 @@ def intervals_of(num_pieces: int) -> int:
 
 
 def check_coeffs(value: ArrayLike) -> np.ndarray:
-    """Convert coefficients to an array; raise a ValueError unless its shape is (B, M, D + 1, 3).
-
-    B trajectories have M polynomial pieces of degree D each.
-    """
+    """Convert coefficients to an array; raise a ValueError unless it has four axes, the last 3."""
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")
@@ -144,10 +141,7 @@ def read_flight(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _motion(pieces: Pieces, u: np.ndarray) -> list:
-    """Evaluate position, velocity, acceleration and jerk at fractions u (S,) of all pieces.
-
-    Each is (3, B, M, S), for B plans of M pieces.
-    """
+    """Evaluate position, velocity, acceleration and jerk at the fractions `u` of all pieces."""
     durations, num = pieces.durations, pieces.coeffs.shape[-1]
     spans = np.vander(durations.ravel(), num, increasing=True)
     powers = np.vander(u, num, increasing=True).T
@@ -273,10 +267,7 @@ def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Refine each plan's maximum of the quantity `name`, and its time, near one sample.
-
-    `likeliest` has the index of this sample among the samples of all pieces, for each plan.
-    """
+    """Find each plan's maximum of a quantity, and its time, near the sample number `likeliest`."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))

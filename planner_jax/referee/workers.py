@@ -26,10 +26,7 @@ _ONE_THREAD = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
 def map_in_processes(
     function: Callable[[ArgumentT], ResultT], arguments: list[ArgumentT]
 ) -> list[ResultT]:
-    """Return function(argument) for each argument, computed in worker processes.
-
-    The function and the arguments must be picklable.
-    """
+    """Return function(argument) for each argument, computed in processes; all must be picklable."""
     threads, idle = _start_workers()
 
     def call(argument: ArgumentT) -> ResultT:

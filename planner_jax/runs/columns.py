@@ -46,10 +46,7 @@ _KINDS = {"b": BOOL, "U": TEXT, "i": COUNT}  # Arrow types of columns by the `ki
 
 
 def list_of(kind: pa.DataType, length: int = -1) -> pa.DataType:
-    """Return the Arrow type of a column whose values are lists of `kind`.
-
-    Parquet names the entries of a list "element"; the lists have any length if `length` is -1.
-    """
+    """Return the Arrow type of a column of lists of `kind`; -1 as `length` allows any length."""
     return pa.list_(pa.field("element", kind), length)
 
 
@@ -145,10 +142,7 @@ def _columns_of(tree: PyTree, name: str, part: str, words: Mapping[str, str]) ->
 
 
 def rows_of(columns: Sequence[Column], batch: RefereedBatch, frame: str) -> pa.Table:
-    """Return the table of a batch with one row for each case.
-
-    `frame` describes the coordinate frame, and is stored in the table's metadata.
-    """
+    """Return a table with one row for each case; its metadata describe the coordinate `frame`."""
     num = len(batch.chunk)
     fields = [
         pa.field(c.name, c.type, metadata={"unit": c.unit, "meaning": c.meaning}) for c in columns

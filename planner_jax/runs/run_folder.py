@@ -25,13 +25,13 @@ from planner_jax.runs.dataset import Dataset
 from planner_jax.runs.manifest import MANIFEST, Entries, Row, read_written, to_write
 
 LOCK = ".lock"
-# Greatest number of failures, and number of all cases, that the figures of a run show.
+# Greatest number of rejected plans, and number of all plans, that one figure of a run shows.
 FAILURES_SHOWN, _CASES_SHOWN = 12, 60
 _TRIES, _BETWEEN = 20, 0.01  # number of attempts to take the lock, and [s] pause between attempts
 
 
 class RunFolder:
-    """The folder of one run; errors about its `path` name the caller's argument `name`."""
+    """The folder `path` of one run. In errors, `name` is the argument that holds the path."""
 
     def __init__(self, path: str | os.PathLike, name: str = "out"):
         self.name = name

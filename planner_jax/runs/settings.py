@@ -26,10 +26,7 @@ class WorkersFailed(PlannerJaxError, RuntimeError):
 
 
 def option(default: object, metavar: str, text: str) -> Any:
-    """Return a dataclass field for a command-line option with the help `text`.
-
-    `metavar` stands for the option's value in the help; "" makes a switch, which has no value.
-    """
+    """Return a dataclass field for a command-line option; "" as `metavar` makes a flag."""
     return dataclasses.field(default=default, metadata={"metavar": metavar, "help": text})
 
 
@@ -127,10 +124,7 @@ class SweepSettings:
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the stored settings of a run that is resumed.
-
-    Raises an error if the caller repeats a setting in `given` with another value.
-    """
+    """Return the stored settings of a run; raise if they differ from those repeated in `given`."""
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:

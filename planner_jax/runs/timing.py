@@ -89,10 +89,7 @@ def measure_warm(call: Callable[[], ResultT]) -> tuple[ResultT, float]:
 
 
 def measure_plans(planner: Planner[CaseT, PlanT], cases: CaseT) -> tuple[PlanT, np.ndarray]:
-    """Plan B cases one after another; return the plans, and the planning times (B,) [s].
-
-    The times exclude compilation.
-    """
+    """Plan cases one by one; return plans, and each case's planning time [s] without compiling."""
     num = jax.tree.leaves(cases)[0].shape[0]
     timed_each = [measure_warm(lambda k=k: plan(planner, take(cases, k))) for k in range(num)]
     plans, seconds = zip(*timed_each, strict=True)

@@ -183,11 +183,7 @@ def _make_here(
 
 
 def times_of(maker: Maker, records: dict[int, Record]) -> Entries:
-    """Return planning, compile and referee times for the manifest.
-
-    If JAX compiled while most cases were planned, the first chunk is planned again, to measure the
-    speed without compilation.
-    """
+    """Return planning, compile and referee times; may plan a chunk again to exclude compilation."""
     parts = [records[number] for number in sorted(records)]
     warm = [part for part in parts if part["warm"]]
     num, seconds = (sum(part[name] for part in warm) for name in ("num", "plan_seconds"))

@@ -136,10 +136,7 @@ def difference_of(first: ComparedRun, other: ComparedRun) -> Difference:
 
 
 def table_of(runs: Sequence[ComparedRun]) -> list[Entries]:
-    """Return a row of rates, costs and times for each run, and its difference from the first run.
-
-    The difference is None for the first run.
-    """
+    """Return success rates, costs and times of each run, and differences from the first run."""
     rows = []
     for index, run in enumerate(runs):
         times, speed = run.manifest["times"], run.manifest["summary"]["plans_per_second_warm"]

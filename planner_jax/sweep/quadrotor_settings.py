@@ -20,10 +20,7 @@ def robot_option(usual: str) -> Any:
 
 
 def resolve_robot(given: object, tool: str) -> "QuadrotorModel | None":
-    """Return the robot with the tool `tool` for a setting; raise `ArgumentError` if it is unknown.
-
-    A setting is a name, the path of a file, a mapping of the model's fields, or a model.
-    """
+    """Return the robot for a setting (name, file, mapping or model), or raise `ArgumentError`."""
     if given is None:
         return None
     from planner_jax.robot.quadrotor_file import RobotError, model_of

@@ -55,10 +55,7 @@ class SampledCatch(NamedTuple):
 
 
 def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCatch:
-    """Sample net and targets of a run's row at the times of `motion`.
-
-    `setting` is the manifest's entry with the size of the net and the gravity.
-    """
+    """Sample net and targets at the times of `motion`; `setting` has net size and gravity."""
     thrust = net_thrust(motion, setting["gravity"])
     axis = thrust / np.maximum(np.linalg.norm(thrust, axis=1, keepdims=True), 1e-9)
     centre = motion.pos + setting["net_height"] * axis
@@ -69,10 +66,7 @@ def sample_catch(row: Row, motion: SampledMotion, setting: Entries) -> SampledCa
 
 
 def due_distance(plan: SampledCatch) -> np.ndarray:
-    """Return the distance [m] of the net from the next target to be caught, at each sample.
-
-    The first sample after a catch is NaN, so that the drawn curve has a gap there.
-    """
+    """Return the net's distance [m] from the next target over time; NaN right after a catch."""
     times, num = plan.motion.time, len(plan.catches)
     place = np.searchsorted(np.array(plan.row["catch_times"])[:num], times - 1e-6)
     due = np.array(plan.row["order"])[np.minimum(place, num - 1)]

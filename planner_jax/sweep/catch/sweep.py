@@ -32,11 +32,7 @@ _NET_TESTS = {
 
 
 class CatchTally(Tally):
-    """Counts of successes, and means over the rows of a run.
-
-    The means are of the share of targets caught, of the catch times, and of the optimal time ratio,
-    the relative difference of decided and planned catch times [Yu2023catch, eq. 29].
-    """
+    """Counts of successes, and means of the share caught, catch times and optimal time ratio."""
 
     READS = (*COUNTED, "caught", "present", "catch_times", "time_ratio")
 
@@ -98,10 +94,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return a table of success rate and optimal time ratio, with the published numbers.
-
-        They are from [Yu2023catch, Tables I and III].
-        """
+        """Return success rate and optimal time ratio, beside [Yu2023catch, Tables I and III]."""
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:

@@ -85,10 +85,7 @@ class HitTally(Tally):
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first.
-
-        It has serves like the serve of [Yu2023bat, Fig. 7].
-        """
+        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
