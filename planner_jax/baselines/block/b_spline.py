@@ -1,10 +1,11 @@
 """Clamped uniform B-splines of any degree: smooth curves that the baseline `insat` optimises.
 
-With m control points p_i and a degree k, over positions s from 0 to 1 of the duration,
+A curve q of degree k with m control points p_i, at a fraction s of its duration from 0 to 1, is
 
-    q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    [Natarajan2024, eq. 3],
+    q(s) = sum_i  p_i N_{i,k}(s),    i = 0 .. m - 1    [Natarajan2024, eq. 3].
 
-and the basis N by the recursion of Cox and de Boor (eq. 2) over knots s_0 .. s_{m+k},
+The basis functions N follow from the recursion of Cox and de Boor (eq. 2). With knots s_0 ..
+s_{m+k},
 
     N_{i,0}(s) = 1 where s_i <= s < s_{i+1}, else 0,
     N_{i,k}(s) = (s - s_i) / (s_{i+k} - s_i) N_{i,k-1}(s)
@@ -35,12 +36,12 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 
 def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
-    """Return the basis matrix (..., num) that maps control points to curve points.
+    """Return the matrix (..., num) that maps `num` control points to points on the curve.
 
     Args:
-        degree: k >= 0.
+        degree: degree of the curve, >= 0.
         num: number of control points, more than the degree.
-        shares: (...) positions on the curve, as fractions of its duration from 0 to 1.
+        shares: (...), where the points are, as fractions of the curve's duration from 0 to 1.
 
     Raises:
         ArgumentError: there are too few control points, or a position is outside 0 to 1.
@@ -55,13 +56,14 @@ def basis(degree: int, num: int, shares: ArrayLike) -> np.ndarray:
 def hodograph(degree: int, order: int, num: int) -> np.ndarray:
     """Return the matrix (num - order, num) from control points to a derivative's control points.
 
-    The derivative of a B-spline is a B-spline over the same knot spans. Its degree is lower by the
-    order. Control point i of the first derivative is k (p_{i+1} - p_i) / (s_{i+k+1} - s_{i+1}).
-    The result is a derivative by position s; divide by duration^order for a derivative by time.
+    A derivative of a B-spline is a B-spline over the same knot spans. The matrix gives the
+    derivative by the fraction s of the duration; divide by duration^order for a derivative by time.
+    For degree k, control points p_i and knots s_i, control point i of the first derivative is
+    k (p_{i+1} - p_i) / (s_{i+k+1} - s_{i+1}).
 
     Args:
-        degree: k.
-        order: of the derivative, 0 to k.
+        degree: degree of the curve.
+        order: order of the derivative, 0 to `degree`.
         num: number of control points, more than the degree.
 
     Raises:
@@ -77,12 +79,13 @@ def hodograph(degree: int, order: int, num: int) -> np.ndarray:
 
 
 def b_spline(degree: int, points: ArrayLike, duration: ArrayLike) -> PiecewisePolynomial:
-    """Return a B-spline with these control points as a polynomial with one piece per knot span.
+    """Return a B-spline as a piecewise polynomial, with one piece per knot span.
 
     Args:
-        degree: k.
-        points: (m, D), m > k, control points; the curve starts at the first and ends at the last.
-        duration: () [s], > 0.
+        degree: k, degree of the curve.
+        points: (m, D), m > k control points of D coordinates; the curve starts at the first and
+            ends at the last.
+        duration: () [s], > 0, duration of the curve.
 
     Returns:
         m - k pieces of equal duration, with coefficients (m - k, k + 1, D).
@@ -114,12 +117,12 @@ def _spans(degree: int, num: int) -> int:
 
 
 def _knots(degree: int, spans: int) -> np.ndarray:
-    """Return the clamped knots (spans + 2 degree + 1,), whole numbers in units of one knot span."""
+    """Return the knots (spans + 2 degree + 1,) as multiples of the distance of two knots."""
     return np.clip(np.arange(spans + 2 * degree + 1) - degree, 0, spans)
 
 
 def _basis(degree: int, num: int, place: np.ndarray) -> np.ndarray:
-    """Evaluate the `num` basis functions, (..., num), at positions (...) in units of knot spans."""
+    """Return the values (..., num) of all basis functions at positions (...), in knot spans."""
     spans = num - degree
     knots = _knots(degree, spans)
     span = np.minimum(np.floor(place), spans - 1)  # the last span includes its end

@@ -1,8 +1,8 @@
 """The baseline `direct`: bang-bang motions of all joints straight to an end pose, then standstill.
 
-The planner does not avoid obstacles. It evaluates end poses in the order in which the arm can
-reach them. The plan is the first motion that arrives before the ball and touches nothing. With
-`tries` of 1 the planner evaluates only the end pose that the arm reaches first.
+The planner does not steer round obstacles. It evaluates end poses, in which the shield meets the
+ball, in the order in which the arm can reach them. The plan is the first motion that arrives before
+the ball and touches nothing.
 """
 
 import dataclasses
@@ -23,20 +23,19 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.trajectory.polynomial import evaluate
 
 _BANG_BANG_PIECES = 13  # number of polynomial pieces of a bang-bang motion of six joints
-_PIECES = 10  # number of pieces of the straight motions by which `end_poses` rejects poses
+_PIECES = 10  # number of polynomial pieces of the straight motions that `end_poses` evaluates
 
 
 def poses_in_time(case: BlockCase, points: int) -> tuple[EndPoses, Array]:
-    """Return the arm's possible end poses and the least times in which the joints reach them.
+    """Return the poses in which the arm meets the ball, and the quickest motions' durations.
 
     Args:
         case: one case.
         points: number of points of the ball's trajectory, each with eight end poses.
 
     Returns:
-        The C end poses, and the durations (C,) [s] of the quickest motions to them, which start at
-        the case's delay. A duration is infinite if the arm would arrive after the ball, or if the
-        pose does not exist.
+        C = 8 * points end poses, and durations (C,) [s] of the quickest motions to them. A duration
+        is infinite if the arm would arrive after the ball, or if the pose does not exist.
     """
     poses = end_poses(case, flight_of(case), points, _PIECES)
     limits = case.limits
@@ -92,7 +91,7 @@ class DirectBlock(Planner):
         gaps = least_clearances(case.arm, case.scene, angles)
         # A joint that moves at the start may overshoot its goal and a position limit.
         beyond = jnp.max(jnp.maximum(angles - case.arm.upper, case.arm.lower - angles))
-        # 1 cm below the margin counts as a relative violation of 1.
+        # A distance of 1 cm less than the margin counts as a relative violation of 1.
         violation = jnp.maximum(100.0 * (self.margin - jnp.min(gaps)), beyond)
         return BlockPlan(
             motion=motion,

@@ -1,14 +1,14 @@
 """The baseline `epase` of [Natarajan2024]: weighted A* over joint steps, timed by TOPP-RA.
 
-The steps follow the code that the paper's authors published: steps of 7 degrees of joints 1 to 4,
-and steps of 4 degrees of every joint, in both directions. A straight edge to the goal is tried
-first. States within a grid cell of 0.05 rad count as one state. The heuristic is the distance to
-the goal in joint space, and the cost is the length of the path from the start.
+A state of the search is a vector of joint angles. As in the code that the paper's authors
+published, a state's neighbours are 7 degrees away in joints 1 to 4, and 4 degrees away in every
+joint, in both directions. A straight edge to the goal is tried first. States within a grid cell of
+0.05 rad count as one state. The heuristic is the distance to the goal in joint space, and the cost
+is the length of the path from the start.
 
 The paper uses ePA*SE [Mukherjee2022], which evaluates edges in parallel on 64 cores. With a single
-thread, ePA*SE is the weighted A* search of this module. Here one thread evaluates all edges of a
-state as one batch. The authors' code stops within 0.1 rad of the goal; here a path ends at the
-goal.
+thread, ePA*SE is weighted A*. Here one thread evaluates all edges of a state as one batch. The
+authors' code stops within 0.1 rad of the goal; here a path ends at the goal.
 """
 
 import dataclasses
@@ -33,9 +33,9 @@ STEPS = np.concatenate(
 
 @dataclasses.dataclass
 class State:
-    """A state that the joint-space search has reached, with the path that leads to it."""
+    """Joint angles that the search has reached, with the path that leads to them."""
 
-    angles: np.ndarray  # (6,) [rad]
+    angles: np.ndarray  # (6,) [rad], joint angles
     length: float  # [rad], length of the path from the start in joint space
     parent: "State | None" = None
     spline: np.ndarray | None = None  # (S, 6) [rad], samples of a spline from the start, or None
@@ -64,7 +64,7 @@ class OpenStates:
         return None
 
     def steps_from(self, state: State) -> list[State]:
-        """Return the states one joint step away in open cells that no shorter path reaches."""
+        """Return the states one step away, without closed cells and cells with a shorter path."""
         neighbours = state.angles + STEPS
         lengths = state.length + np.linalg.norm(neighbours - state.angles, axis=1)
         return [
@@ -83,7 +83,6 @@ class OpenStates:
 
 
 def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
-    """Return the indices of the grid cell that contains six joint angles [rad]."""
     return tuple(np.round(angles / CELL).astype(int).tolist())
 
 
@@ -91,14 +90,14 @@ def _cell_of(angles: np.ndarray) -> tuple[int, ...]:
 class EpaseBlock(PathThenTime):
     """The planner `epase`, which tries end poses one by one; it needs the extra `arm-peers`."""
 
-    # [s], longest search for one pose. Few searches that take longer succeed.
+    # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05
-    weight: float = 10.0  # factor on the heuristic in weighted A*
+    weight: float = 10.0  # factor on the heuristic (distance to the goal) in weighted A*
 
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a collision-free path to the goal, or None without one."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None."""
         end = np.asarray(goal.angles, float)
         states = OpenStates(State(np.asarray(case.angles, float), 0.0), end, self.weight)
         while left() > 0.0 and (state := states.pop()) is not None:

@@ -16,22 +16,21 @@ from planner_jax.task.block.case import BlockCase
 from planner_jax.task.block.clearance import least_clearances
 from planner_jax.task.block.scene import Scene
 
-RESOLUTION = 0.05 / 3.0  # [rad], joint-space distance between samples of an edge, as in [1]
+# [rad], joint-space distance between samples of an edge, as in the code that the authors of
+# [Natarajan2024] published (github.com/sbpl/parallel_search).
+RESOLUTION = 0.05 / 3.0
 _BATCHES = (1, 64, 256, 1024)  # batch sizes for which programs are compiled
-
-# [1] is the planners' code that the authors of [Natarajan2024] published:
-# github.com/sbpl/parallel_search.
 
 
 @jax.jit
 def _nearest(arm: Arm, scene: Scene, angles: Array) -> Array:
-    """Return the arm's least distances (N,) [m] from obstacles and itself at angles (N, 6)."""
+    """Return the arm's distance (N,) [m] from obstacles and itself, for N joint poses (N, 6)."""
     return least_clearances(arm, scene, angles)
 
 
 @functools.cache
 def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
-    """Compile the programs of all batch sizes, since compilation must not count as search time.
+    """Compile the programs of all batch sizes before a search, so that compiling is not timed.
 
     `tree` is the pytree structure of (arm, scene), `layout` the shape and type of each leaf.
     """
@@ -41,10 +40,10 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
 
 
 class FreeSpace:
-    """The collision-free joint angles, within the position limits, of one case's arm."""
+    """The joint angles of one case's arm that are within limits and collision-free."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
-        """Compile the checks of a case with NumPy leaves; `margin` [m] is the least distance."""
+        """Compile the checks; `margin` [m] is the least distance from obstacles that is free."""
         self.lower, self.upper = np.asarray(case.arm.lower), np.asarray(case.arm.upper)
         self._dtype = np.asarray(case.angles).dtype
         self._arm, self._scene = jax.device_put((case.arm, case.scene))
@@ -92,8 +91,8 @@ class FreeSpace:
         It is checked at samples that are at most `RESOLUTION` apart in joint space.
 
         Args:
-            coeffs: (M, D + 1, 6), rising powers of the time [s] since the start of the piece.
-            durations: (M,) [s].
+            coeffs: (M, D + 1, 6), M pieces of degree D for six joints, lowest power of time first.
+            durations: (M,) [s], durations of the pieces.
         """
         rough = _sample_pieces(coeffs, durations, np.full(len(durations), 8))
         lengths = np.linalg.norm(np.diff(rough.reshape(-1, 9, 6), axis=1), axis=2).sum(axis=1)
@@ -102,7 +101,7 @@ class FreeSpace:
 
 
 def _sample_pieces(coeffs: np.ndarray, durations: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Sample the joint angles (N, 6) of each piece k at the ends of `counts[k]` equal steps."""
+    """Return joint angles (N, 6) at `counts[k]` + 1 equally spaced times of each piece k."""
     piece = np.repeat(np.arange(len(counts)), counts + 1)
     number = np.arange(len(piece)) - np.repeat(np.cumsum(counts + 1) - counts - 1, counts + 1)
     time = (number / counts[piece] * durations[piece])[:, None]

@@ -1,30 +1,27 @@
 """The planner `insat` of [Natarajan2024]: a search over joint steps, interleaved with splines.
 
-This is Algorithm 2 of the paper. The search is the search of `epase`. When it expands a state, it
-computes a spline from the start to that state, as follows. The spline of each ancestor is extended
-straight to the state. Control points are fitted to each extension, and all these splines are
-optimised at once. The cheapest collision-free spline becomes the state's spline. The goal is tried
-from every expanded state, first from the start.
+This is Algorithm 2 of the paper. The search over joint angles (states) is weighted A*, as in
+`epase`. When the search expands a state, it computes a spline from the start to that state. For
+this purpose the spline of each ancestor is extended straight to the state, control points are
+fitted to each extension, and all these splines are optimised at once. The cheapest collision-free
+spline becomes the state's spline. From every expanded state, a spline to the goal is tried.
 
-A spline is clamped, of degree 3 (order 4), with 7 control points; the authors' code has 4 to 7.
-With fewer control points the bounds on the derivatives' control points force longer motions. With
-4 of them a motion from standstill to standstill takes twice the necessary time. The objective
-(eq. 4a)
+A spline q(t) of duration t_f has degree 3 and 7 control points; the authors' code has 4 to 7.
+Velocity and acceleration are bounded at the control points of the derivatives. With only 4 control
+points these bounds would double the duration of a motion between standstills. The objective (eq.
+4a)
 
     w_1 t_f + w_2 int_0^{t_f} |q'(t)|_2 dt,    w_1 = 1, w_2 = 0.1,
 
-is minimised over the control points and t_f. The velocity bounds (4d) and bounds on accelerations
-are imposed on the control points of the derivatives. The arm stands still at the start, and at the
-goal if the case requires it. For given control points the least t_f that keeps these bounds is a
-maximum in closed form, so that every iterate keeps them. The maximum is smoothed for the gradient.
-The optimisation ignores obstacles (4c): every iterate is checked afterwards, and the last
-collision-free iterate is used.
+is minimised over the control points and t_f. The arm stands still at the start, and at the goal if
+the case requires it. For given control points the least t_f within the bounds is a maximum in
+closed form, so that every iterate keeps the bounds. The maximum is smoothed for the gradient. The
+optimisation ignores obstacles: every iterate is checked afterwards, and the last collision-free
+iterate is used.
 
-Two parts of the authors' code that the paper does not mention are left out: bounds on jerk, which
-the code sets to the acceleration bounds, and attraction to the last control points. This module
-computes a state's spline when the state is expanded; the authors' code computes it when the edge
-to the state is found. The search uses one thread, while PINSAT has many; compiled programs may use
-more.
+Two parts of the authors' code that the paper does not mention are left out: bounds on jerk, and a
+cost that attracts the last control points. The authors' code computes a state's spline when the
+edge to the state is found, not when the state is expanded. The search uses one thread.
 """
 
 import dataclasses
@@ -49,12 +46,12 @@ from planner_jax.task.block.plan import BlockPlan
 DEGREE = 3  # degree of the splines
 CONTROL_POINTS = 7  # number of control points of a spline
 ANCESTORS = 8  # number of splines optimised at once: from the start and the nearest ancestors
-TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s] and [1/rad], w_1 and w_2 of eq. 4a
-LEAST_TIME = 0.1  # [s], least duration of a spline; the greatest is the available time
-_SHARES = np.linspace(0.0, 1.0, 33)  # sample positions, as fractions of a spline's duration
+TIME_WEIGHT, LENGTH_WEIGHT = 1.0, 0.1  # [1/s], [1/rad]: weights of duration and length (eq. 4a)
+LEAST_TIME = 0.1  # [s], least duration of a spline
+_SHARES = np.linspace(0.0, 1.0, 33)  # sample times, as fractions of a spline's duration
 _OUTSIDE = 100.0  # [1/rad^2], penalty weight of control points beyond the position limits
-_NORM = 16  # exponent p of the p-norm that replaces the maximum in the objective
-_UNIT = 0.3  # [rad], joint angle that one unit of the optimiser's variables stands for
+_NORM = 16  # exponent of the norm that replaces the maximum in the objective
+_UNIT = 0.3  # [rad], unit of the optimiser's variables, which are joint angles
 
 
 @struct.dataclass
@@ -69,34 +66,37 @@ class Bounds:
 
 @struct.dataclass
 class Splines:
-    """Iterates of the spline optimisation: K iterates of each of A splines, m control points."""
+    """All K iterates of A splines that are optimised at once."""
 
-    points: Array  # (A, K, m, 6) [rad], control points
-    time: Array  # (A, K) [s], duration t_f
+    points: Array  # (A, K, m, 6) [rad], m control points
+    time: Array  # (A, K) [s], duration
     length: Array  # (A, K) [rad], length of the path in joint space
-    angles: Array  # (A, K, S, 6) [rad], samples of the joint angles
+    angles: Array  # (A, K, S, 6) [rad], joint angles at S samples
 
 
 @dataclasses.dataclass(frozen=True)
 class InsatBlock(PoseByPose):
-    """The planner `insat`; its motions end at standstill only if the case requires it."""
+    """The planner `insat`: weighted A* over joint steps, interleaved with spline optimisation."""
 
     pieces: ClassVar[int] = CONTROL_POINTS - DEGREE + 1  # the spline's pieces and an initial wait
     degree: ClassVar[int] = DEGREE
-    # [s], longest search for one pose. Few searches that take longer succeed.
+    # [s], longest search for one end pose. Few searches that take longer succeed.
     longest: float = 0.05
-    weight: float = 10.0  # factor on the heuristic in weighted A*
+    weight: float = 10.0  # factor on the heuristic (distance to the goal) in weighted A*
     solver: lbfgs.LbfgsConfig = lbfgs.LbfgsConfig(max_steps=12)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case with NumPy leaves; compile before the search is timed."""
+        """Return the plan of one case, after compiling, so that only the search is timed."""
         _compile(np.asarray(case.angles).dtype, self.solver)
         return super().plan_of(case)
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the motion along the first valid spline to an end pose, or None without one."""
+        """Return the motion along the first valid spline to an end pose, or None if none is found.
+
+        `free` checks collisions, and `left` returns the remaining search time [s].
+        """
         start = np.asarray(case.angles, float)
         first = State(start, 0.0, spline=start[None])
         states = OpenStates(first, np.asarray(goal.angles, float), self.weight)
@@ -124,14 +124,14 @@ class InsatBlock(PoseByPose):
     def best_spline(
         self, case: BlockCase, free: FreeSpace, goal: Goal, state: State, rests: bool
     ) -> tuple[np.ndarray, float, float, np.ndarray] | None:
-        """Return the cheapest collision-free spline to a state that is not too long, or None.
+        """Return the cheapest collision-free spline to a state within the available time, or None.
 
-        Each candidate extends the spline of one of the state's ancestors. `rests` requires that the
-        arm stands still at the end.
+        Each candidate extends the spline of one of the state's ancestors. If `rests` is True, the
+        arm must stand still at the end.
 
         Returns:
             The spline's control points (m, 6) [rad], its duration [s], its length [rad] and its
-            samples (S, 6) [rad].
+            joint angles at samples (S, 6) [rad].
         """
         before = [each.spline for each in state.path()[1:] if each.spline is not None]
         dtype = case.angles.dtype
@@ -172,7 +172,7 @@ class InsatBlock(PoseByPose):
 
 @functools.cache
 def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
-    """Compile all programs, since compilation must not count as search time."""
+    """Compile the spline programs before the search, so that compiling is no search time."""
     joints = host_leaf(np.zeros(6, dtype))
     guesses = np.zeros((ANCESTORS, CONTROL_POINTS, 6), dtype)
     bounds = Bounds(joints, joints, joints + 1, joints + 1)
@@ -181,7 +181,7 @@ def _compile(dtype: np.dtype, config: lbfgs.LbfgsConfig) -> None:
 
 
 def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
-    """Fit control points (m, 6) to a path (N, 6) that is extended straight to an end (6,)."""
+    """Fit control points (m, 6) to a path (N, 6) and its straight extension to `end` (6,)."""
     straight = path[-1] + _SHARES[1:, None] * (end - path[-1])
     curve = np.concatenate([path, straight])
     lengths = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1)))
@@ -196,7 +196,10 @@ def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the basis (S, m) and the pseudo-inverse of its free columns, 2 to `stop` - 1."""
+    """Return the basis (S, m) of a spline at S samples, and a pseudo-inverse.
+
+    The pseudo-inverse is of the columns 2 to `stop` - 1, whose control points are fitted.
+    """
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 
@@ -215,7 +218,7 @@ def _optimise(
     Args:
         start: (6,) [rad], joint angles at the start.
         end: (6,) [rad], joint angles at the end.
-        guesses: (A, m, 6) [rad], control points; they are the first iterates.
+        guesses: (A, m, 6) [rad], m control points of each spline; they are the first iterates.
         rests: () bool, whether the arm stands still at the end.
         bounds: limits of the joints.
         config: settings of the optimiser.
@@ -273,15 +276,15 @@ _of_points = jax.jit(functools.partial(b_spline, DEGREE))
 
 
 def _pieces(points: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the polynomial coefficients (m - 3, 4, 6) and durations (m - 3,) [s] of a spline."""
+    """Return the coefficients (M, 4, 6) and durations (M,) [s] of a spline's M cubic pieces."""
     spline = _of_points(points, time)
     return np.asarray(spline.coeffs, float), np.asarray(spline.durations, float)
 
 
 def _motion(case: BlockCase, goal: Goal, points: np.ndarray, time: float) -> HostMotion:
-    """Return the motion along a spline, after a wait unless the case requires a final standstill.
+    """Return the motion along a spline.
 
-    The wait makes a moving arm reach the goal exactly when the ball arrives.
+    If the arm may move at the goal, a wait comes first, so that it arrives together with the ball.
     """
     coeffs, durations = _pieces(points, time)
     if not case.ends_at_rest:

@@ -1,7 +1,7 @@
-"""Time-optimal motion of the joints along a path, by TOPP-RA, for `rrt-connect` and `epase`.
+"""Quickest motion of the joints along a path, by TOPP-RA, for `rrt-connect` and `epase`.
 
-TOPP-RA [Pham2018] is called through the package `toppra`. [Natarajan2024] times the paths of its
-baselines with this method. A cubic spline interpolates the points of the path, and the arm stands
+The method TOPP-RA [Pham2018] is called through the package `toppra`. [Natarajan2024] uses it for
+the paths of its baselines. A cubic spline interpolates the points of the path, and the arm stands
 still at the start and at the end.
 """
 
@@ -12,10 +12,10 @@ import numpy as np
 
 from planner_jax.core.errors import MissingExtra
 
-PIECES = 128  # greatest number of pieces of a timed motion
-DEGREE = 6  # degree of a timed piece: a cubic spline in a quadratic function of time
+PIECES = 128  # greatest number of polynomial pieces of a timed motion
+DEGREE = 6  # degree of a piece: a cubic in the path length, which is quadratic in time
 _INSIDE = np.array([0.0, 0.25, 0.5, 0.75, 1.0])  # fractions of a piece at which limits are checked
-_SPARE = 2e-4  # relative slowdown beyond the necessary one, against rounding
+_SPARE = 2e-4  # additional relative slowdown of a motion, because of rounding errors
 
 
 def import_extra(name: str) -> ModuleType:
@@ -38,17 +38,17 @@ def time_path(
 ) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the quickest motion along a spline through points, from standstill to standstill.
 
-    TOPP-RA keeps the limits at the points of a grid. If a limit is exceeded between grid points,
-    the whole motion is slowed down.
+    TOPP-RA keeps the limits at some points of the path (a grid). If a limit is exceeded between
+    two of them, the whole motion is slowed down.
 
     Args:
-        points: (N, 6) [rad], 2 to `PIECES` / 2 points, of which neighbours differ.
+        points: (N, 6) [rad], joint angles of 2 to `PIECES` / 2 points; neighbours must differ.
         velocity: (6,) [rad/s], > 0, limits of the joints.
         acceleration: (6,) [rad/s^2], > 0, limits of the joints.
 
     Returns:
-        Coefficients (M, DEGREE + 1, 6) [rad/s^k] and durations (M,) [s] of M <= `PIECES` pieces, or
-        None if TOPP-RA fails.
+        Coefficients (M, DEGREE + 1, 6), lowest power of time first, and durations (M,) [s] of
+        M <= `PIECES` polynomial pieces; or None if TOPP-RA fails.
 
     Raises:
         MissingExtra: toppra is not installed.
@@ -89,9 +89,9 @@ def time_path(
 
 
 def _grid(knots: np.ndarray) -> np.ndarray:
-    """Return up to `PIECES` + 1 about equally spaced positions along a path, knots included.
+    """Return up to `PIECES` + 1 positions along a path, at nearly equal distances.
 
-    Each span between knots is divided into equal parts, in proportion to its length.
+    Each span between two neighbouring `knots` is divided into equal parts.
     """
     spans = np.diff(knots)
     parts = 1 + np.floor((PIECES - len(spans)) * spans / spans.sum()).astype(int)
@@ -100,7 +100,10 @@ def _grid(knots: np.ndarray) -> np.ndarray:
 
 
 def _compose(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarray:
-    """Return coefficients (M, 7, 6) in time t of cubics (M, 4, 6) in p = speed t + rise t^2."""
+    """Convert M cubics in the path length to polynomials of degree 6 in the time t, (M, 7, 6).
+
+    The path length is speed t + rise t^2. `cubic` (M, 4, 6) has coefficients for six joints.
+    """
     none, one, two, three = np.moveaxis(cubic, 1, 0)
     return np.stack(
         [
@@ -119,7 +122,7 @@ def _compose(cubic: np.ndarray, speed: np.ndarray, rise: np.ndarray) -> np.ndarr
 def _excess(
     coeffs: np.ndarray, durations: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
 ) -> float:
-    """Return the factor >= 1 by which a motion has to be slowed down to keep its limits."""
+    """Return the factor >= 1 on the durations of a motion that it needs to keep its limits."""
     powers = np.arange(coeffs.shape[1])
     times = (_INSIDE * durations[:, None])[..., None]  # (M, S, 1)
     rates = np.where(powers > 0, times ** np.maximum(powers - 1, 0), 0.0) * powers

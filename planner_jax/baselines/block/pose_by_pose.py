@@ -1,12 +1,11 @@
 """Planners on the host that try one end pose after another [Natarajan2024, Section IV-C].
 
-The paper's goals are poses at equidistant points of a tunnel, tried "sequentially until it
-succeeds". Here the goals are at points of the ball's own trajectory, each with the eight branches
-of inverse kinematics. Poses that collide, or that no motion reaches in time, are left out. Poses
-are tried in the order of (duration of a bang-bang motion) / (available time). If the planner is
-`patient`, the search continues after a motion that arrives too late. The paper's planners must have
-stopped at such a motion: the paper reports 18 ms for RRT-Connect, of 2 s that it may use, although
-less than half of its motions are in time.
+In the paper the end poses hold the shield at equidistant points of a tunnel, the space through
+which a ball may come. Here they hold it at points of the ball's own trajectory, with the eight
+solutions of inverse kinematics at each point. Poses that collide, or that no motion reaches in
+time, are left out. Poses are tried in the order of (duration of a bang-bang motion) / (time until
+the ball arrives). If the planner is `patient`, the search continues after a motion that arrives too
+late.
 """
 
 import abc
@@ -41,25 +40,25 @@ class Goal:
     """An end pose of the arm to which a motion is planned."""
 
     angles: np.ndarray  # (6,) [rad], joint angles of the end pose
-    available: float  # [s], time from the delay until the ball arrives at the shield
+    available: float  # [s], time from the start of the motion until the ball reaches the shield
 
 
 @dataclasses.dataclass(frozen=True)
 class HostMotion:
-    """A joint motion with NumPy arrays; it starts when the case's delay has passed."""
+    """A joint motion of M polynomial pieces; it starts when the case's delay has passed."""
 
-    coeffs: np.ndarray  # (M, D + 1, 6) [rad/s^k]
-    durations: np.ndarray  # (M,) [s]
+    coeffs: np.ndarray  # (M, D + 1, 6), of degree D for six joints [rad], lowest power first
+    durations: np.ndarray  # (M,) [s], durations of the pieces
     execution: float  # [s], duration of the motion without an initial wait
 
 
 @dataclasses.dataclass(frozen=True)
 class PoseByPose(Planner, abc.ABC):
-    """Base of planners that try end poses; the cost of a plan is the duration of its motion [s].
+    """Base class of planners that try end poses; a plan's cost is its motion's duration [s].
 
-    A plan's `violation` is (duration / available time) - 1, infinite if no motion was found. The
-    plan's `iterations` is the number of tried poses. These planners plan from standstill only: a
-    case whose arm moves at the start gets no motion.
+    A plan's `violation` is (duration / time until the ball arrives) - 1, or infinite if no motion
+    was found. The plan's `iterations` is the number of tried poses. If the arm moves at the start
+    of a case, no motion is found.
     """
 
     case_type: ClassVar[type] = BlockCase
@@ -68,7 +67,8 @@ class PoseByPose(Planner, abc.ABC):
     degree: ClassVar[int]
     points: int = 12  # number of points of the ball's trajectory, each with eight end poses
     budget: float = 2.0  # [s], search time of each case, as in the paper
-    longest: float = 0.25  # [s], search time of one pose; doubled after each pass over all poses
+    # [s], search time of one pose in the first pass over all poses; each next pass doubles it.
+    longest: float = 0.25
     patient: bool = True  # whether the search continues after a motion that arrives too late
     margin: float = 0.003  # [m], least distance from obstacles and from the arm itself
 
@@ -81,7 +81,10 @@ class PoseByPose(Planner, abc.ABC):
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return a collision-free motion to one end pose, or None if none is found in time."""
+        """Return a collision-free motion to one end pose, or None if none is found in time.
+
+        `free` checks collisions, and `left` returns the remaining search time [s].
+        """
 
     def solve_on_host(self, cases: BlockCase, attempt: Attempt) -> BlockPlan:
         """Return the plans of a batch, one case after another."""
@@ -89,7 +92,7 @@ class PoseByPose(Planner, abc.ABC):
         return jax.tree.map(lambda *leaves: np.stack(leaves), *plans)
 
     def plan_of(self, case: BlockCase) -> BlockPlan:
-        """Return the plan of one case with NumPy leaves: the motion that is least late."""
+        """Return the plan of one case: the first motion in time, or else the least late motion."""
         hopeless, angles, contacts, shares = (np.asarray(x) for x in _list_goals(case, self.points))
         if hopeless != Status.NO_PATH:
             return self._plan(case, Status(int(hopeless)))
@@ -123,7 +126,7 @@ class PoseByPose(Planner, abc.ABC):
         contact: ArrayLike = 0.0,
         tries: int = 0,
     ) -> BlockPlan:
-        """Return a motion that meets the ball at `contact` [s], or standstill, as a plan."""
+        """Return a plan of a motion that meets the ball at `contact` [s], or of standstill."""
         dtype = np.asarray(case.angles).dtype
         if motion is None:
             stay = np.zeros((1, self.degree + 1, 6))
@@ -151,14 +154,14 @@ class PoseByPose(Planner, abc.ABC):
 
 @functools.partial(jax.jit, static_argnames="points")
 def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Array]:
-    """Return the end poses of a case, and the reason if no plan can exist.
+    """Return C end poses of a case, eight for each point of the ball's trajectory.
 
     Returns:
         status: () int32, NO_PATH if a plan is possible, else the reason why none exists.
         angles: (C, 6) [rad], joint angles of the end poses.
         contact: (C,) [s], when the ball arrives at each pose.
-        share: (C,), (duration of a bang-bang motion) / (available time); infinite if the motion is
-            too late.
+        share: (C,), (duration of a bang-bang motion) / (time until the ball arrives); infinite if
+            the motion is too late.
     """
     poses, times = poses_in_time(case, points)
     share = times / jnp.maximum(poses.time - case.delay, 1e-6)
@@ -168,7 +171,7 @@ def _list_goals(case: BlockCase, points: int) -> tuple[Array, Array, Array, Arra
 
 @dataclasses.dataclass(frozen=True)
 class PathThenTime(PoseByPose):
-    """A planner that searches a path of the joints, and then times the path by TOPP-RA.
+    """A planner that searches a path of the joints, then the quickest motion along it by TOPP-RA.
 
     The constructor raises `MissingExtra` unless the packages that the planner needs are installed.
     """
@@ -186,15 +189,16 @@ class PathThenTime(PoseByPose):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a free path from the case's angles to a goal, or None."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None."""
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> HostMotion | None:
-        """Return the timed path, or None; a motion of 0 s if the arm already is at the goal.
+        """Return the quickest motion along a path to the goal, or None if none is found.
 
-        The spline through the path's points deviates from the path and may collide. In this case
-        midpoints are inserted between the points, so that the spline follows the path more closely.
+        The motion lasts 0 s if the arm already is at the goal. The spline through the path's points
+        deviates from the path and may collide. Then midpoints are inserted between the points, so
+        that the spline follows the path more closely.
         """
         points = self.path_to(case, free, goal, left)
         if points is not None:

@@ -1,8 +1,8 @@
-"""The baseline `rrt-connect` of [Natarajan2024]: RRT-Connect by OMPL, timed by TOPP-RA.
+"""The baseline `rrt-connect` of [Natarajan2024]: a path by RRT-Connect, timed by TOPP-RA.
 
-RRT-Connect [Kuffner2000] grows two trees, from start and goal, by edges of at most `reach`, the
-value in the code that the paper's authors published. The search uses one thread and checks the
-samples of an edge as one batch.
+RRT-Connect [Kuffner2000], of the library OMPL, grows two trees of joint poses, from start and goal.
+The greatest length of an edge is the value in the code that the paper's authors published. The
+search uses one thread.
 """
 
 import dataclasses
@@ -41,7 +41,7 @@ class RrtConnectBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return points (N, 6) [rad] of a collision-free path to the goal, or None without one."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)
@@ -78,7 +78,6 @@ class RrtConnectBlock(PathThenTime):
 
 
 def _numbers(state: Sequence[float]) -> np.ndarray:
-    """Return the six joint angles [rad] of an OMPL state as an array."""
     return np.array([state[k] for k in range(6)])
 
 

@@ -1,4 +1,4 @@
-"""The baseline `mpp`: sampled minimum-jerk primitives to catches at a predetermined height."""
+"""The baseline `mpp`: minimum-jerk trajectories to sampled states of catches at a fixed height."""
 
 import dataclasses
 from typing import ClassVar
@@ -35,15 +35,15 @@ from planner_jax.trajectory.polynomial import (
 )
 
 _BISECTIONS = 30  # number of bisection steps for the time of a fall
-_SHORTEST = 1e-2  # [s], least duration of a segment, which leads from one catch to the next
-_SLOWEST = 1e-3  # [m/s], least speed of a target whose velocity defines the net's axis
+_SHORTEST = 1e-2  # [s], least duration of a segment, the trajectory from one catch to the next
+_SLOWEST = 1e-3  # [m/s], below this speed of the target, the net's axis points upwards
 
 
 @struct.dataclass
 class Candidates:
-    """K candidate primitives of one segment, which leads from one catch to the next."""
+    """K candidate trajectories of one segment, which leads from one catch to the next."""
 
-    trajectory: PiecewisePolynomial  # leaves (K, 2, ...)
+    trajectory: PiecewisePolynomial  # leaves (K, 2, ...): candidate, polynomial piece
     cost: Array  # (K,) [m^2/s^6], mean squared jerk
 
 
@@ -77,44 +77,45 @@ def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Arr
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class MppCatch(Planner):
-    """The motion primitive planner that [Yu2023catch] compares with; it does not optimise.
+    """The planner MPP (motion primitives) that [Yu2023catch] compares with; it does not optimise.
 
     Its parts come from these sources:
 
-    - [Yu2023catch, Sections V-B and VII-A]: the primitive of least jerk of [Mueller2015] leads to a
-      catch whose height is fixed by hand, below 2 m. The target's fall through this height gives
-      time and position. Velocity and acceleration at the catch are sampled, and the primitive of
-      least mean squared jerk is selected. Limits are checked only afterwards.
+    - [Yu2023catch, Sections V-B and VII-A]: a minimum-jerk trajectory (primitive) of [Mueller2015]
+      leads to a catch whose height is fixed by hand, below 2 m. Time and position of the catch are
+      where the target falls through this height. Velocity and acceleration at the catch are
+      sampled, and the primitive of least mean squared jerk is selected. Limits are checked only
+      afterwards.
     - [Yu2023catch, eq. 22]: the net's centre is at the target.
-    - [Yu2023catch, eq. 25]: the net must face the target. For this planner the paper checks only
-      the end state, so that every sampled acceleration turns the net towards the target.
-    - Assumptions, since the paper does not say: the grids of samples; the height of 1.2 m, about
-      the height of the net in the initial hover; the ramp of `minimum_jerk_after_ramp`, without
+    - [Yu2023catch, eq. 25]: the net must face the target. Every sampled acceleration turns the net
+      towards the target.
+    - Assumptions, since the paper does not report them: the sampled values; the height of 1.2 m,
+      about the height of the net at the start; the ramp of `minimum_jerk_after_ramp`, without
       which the body rate would jump at time 0 and after every catch. Several targets are caught in
-      the case's order, each where it first falls through the height. The primitive of each segment
-      is selected by its own cost.
+      the case's order.
 
-    The success rates depend on the height. Cases are drawn with the limits of `pj.catch.case`:
+    Success on two suites (families of random cases) depends on the height of the catches:
 
-        height [m]     0.8    1.2    1.9
-        throws [%]      99   ~ 80     68
-        hard [%]        51   ~ 40     27
+        height [m]                                       0.8    1.2    1.9
+        `throws`, one ball [%]                            99   ~ 80     68
+        `hard`, one ball that is seen later [%]           51   ~ 40     27
 
-    Failures exceed the body rate limit. In the paper this planner plans 14 % of the throws, within
-    limits and at a height that the paper does not report.
+    Failures exceed the body rate limit. In the paper this planner succeeds on 14 % of the throws;
+    the paper reports neither the limits nor the height.
 
-    If a target does not fall through the height before its horizon, or not after the previous
-    target, the case stays unsolved, since this planner has no other catching time.
+    A case is unsolved if a target does not fall through the height in time, or if it does so
+    before the previous target.
 
-    This planner ignores a case's extras; the referee checks them.
+    This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
     case_type: ClassVar[type] = CatchCase
     height: float = 1.2  # [m], height of the targets at the catches
-    speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)  # [m/s], sampled on each axis at a catch
-    thrusts: tuple[float, ...] = (0.5, 1.0, 1.5)  # sampled at a catch, in units of gravity
-    ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
+    # [m/s], velocity components of the quadrotor that are tried on each axis at a catch.
+    speeds: tuple[float, ...] = (-1.0, 0.0, 1.0)
+    thrusts: tuple[float, ...] = (0.5, 1.0, 1.5)  # thrusts tried at a catch, in units of gravity
+    ease: float = 0.02  # [s], duration of the ramp of the jerk at the start of each segment
     nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
     time_nodes: int = 128  # number of intervals of a horizon that are searched for a fall
 
@@ -125,10 +126,9 @@ class MppCatch(Planner):
             raise ArgumentError("speeds and thrusts", "an entry", verb="have", shown="none")
 
     def solve(self, case: CatchCase, attempt: Attempt) -> CatchPlan:
-        """Return the plan of the cheapest primitives, selected one segment after another.
+        """Return the plan of one case, with the cheapest candidate of each segment.
 
-        The planner optimises nothing. The plan's cost is the mean squared jerk of the whole
-        trajectory.
+        The plan's cost is the mean squared jerk of the whole trajectory.
         """
         context = order_targets(case)
         times, missed = self.times(context)
@@ -164,8 +164,9 @@ class MppCatch(Planner):
         )
 
     def times(self, context: CatchContext) -> tuple[Array, Array]:
-        """Return increasing catching times (N,) [s] and their excess (N,), <= 0 if they are valid.
+        """Return increasing catching times (N,) [s] of N targets, and their excess (N,).
 
+        The excess is <= 0 if the target falls through the height, later than the previous target.
         Targets that are absent from the case come last and have the time of the last catch.
         """
         height = jnp.asarray(self.height, context.horizon.dtype)
@@ -181,7 +182,7 @@ class MppCatch(Planner):
     def candidates(
         self, head_state: Array, ball: BallState, duration: Array, case: CatchCase
     ) -> Candidates:
-        """Return the candidate primitives of the segment that ends with the catch of `ball`.
+        """Return candidate trajectories of the segment that ends with the catch of `ball`.
 
         The segment starts at `head_state` (4, 3), which has position, velocity, acceleration and
         jerk, and lasts `duration` () [s].
@@ -211,7 +212,7 @@ class MppCatch(Planner):
         return jnp.stack([pos, jnp.stack([vx, vy, vz], axis=1), acc], axis=1)
 
     def _excess(self, segment: PiecewisePolynomial, case: CatchCase) -> Array:
-        """Return the largest relative excess over a limit in a segment, (); [m] for the ground."""
+        """Return a segment's largest relative excess over a limit, (); for the ground in metres."""
         limits = case.limits
         motion = sample_pieces(segment, self.nodes)
         weak, strong = thrust_excess(motion.acc, case.gravity, *limits.thrust_bounds)

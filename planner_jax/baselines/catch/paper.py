@@ -1,4 +1,4 @@
-"""The baseline `catch`: the planner of [Yu2023catch], with penalties on contact and attitude."""
+"""The baseline `catch`: the planner of [Yu2023catch], which penalises misses of the net."""
 
 import dataclasses
 
@@ -38,9 +38,8 @@ from planner_jax.trajectory.proportional_minco import (
 )
 
 _ORDER = 4  # derivative whose square is minimised: snap
-# Units of the optimiser's variables: of the offsets, and of each catch's variables from the
-# logarithm of the duration to the jerk. They are tuned on the cost gap of drawn throws, since with
-# stiff hinges the Hessian varies strongly from point to point.
+# Units of the optimiser's variables, tuned for low costs on random throws: of a waypoint offset,
+# and of each catch: logarithm of the duration, position, velocity, acceleration, jerk.
 _OFFSET_SCALE = 0.05
 _CATCH_SCALE = (0.035, *(0.06,) * 3, *(0.6,) * 3, *(1.2,) * 3, *(2.4,) * 3)
 _PATIENT = {
@@ -53,10 +52,10 @@ COST_UNIT = 1e3  # divisor of the cost, so that the Hessian has moderate entries
 
 
 def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple[Array, ...]:
-    """Return by how much samples exceed speed, body rate, thrust and ground limits (eqs 26-28).
+    """Return the excess of samples over limits of speed, body rate, thrust, height (eqs 26-28).
 
-    Each excess is a difference of squares in SI units, for the ground a height difference [m].
-    `given` is gravity and limits of a case.
+    Each excess is a difference of squares in SI units; for the height it is a difference [m].
+    `given` has gravity and limits of a case.
     """
     gravity, limits = given
     return (
@@ -70,8 +69,8 @@ def limits_excess(motion: Motion, given: tuple[Array, QuadrotorLimits]) -> tuple
 def steep_hinge(x: Array, width: float | Array) -> Array:
     """Return the penalty L_eps(x) for eps = width [Yu2023catch, eq. 23].
 
-    L_eps is x^3 from 0 to eps. Above eps it is eps^3 + (x - eps)^2 x / eps^4, as printed, which
-    rises far more steeply. The value is continuous at eps, but the slope drops from 3 eps^2 to 0.
+    L_eps is 0 below 0, and x^3 from 0 to eps. Above eps it is eps^3 + (x - eps)^2 x / eps^4, as
+    printed in the paper. The value is continuous at eps, but the slope drops from 3 eps^2 to 0.
     """
     inside = jnp.clip(x, 0.0, width)
     beyond = jnp.maximum(x - width, 0.0)
@@ -79,10 +78,11 @@ def steep_hinge(x: Array, width: float | Array) -> Array:
 
 
 def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) -> Array:
-    """Return (f - middle)^2 - half^2 [m^2/s^4] for the thrust f of accelerations (..., 3).
+    """Return the excess of thrusts over their limits, (...) [m^2/s^4]; <= 0 within the limits.
 
-    The published code of [Yu2023catch] has this form. `least` and `most` are the thrust limits per
-    unit mass [m/s^2]; `middle` is their mean and `half` is half of their difference.
+    The excess is (f - middle)^2 - half^2, as in the code published with [Yu2023catch]. f is the
+    thrust per unit mass for accelerations `acc` (..., 3). `middle` is the mean of the limits
+    `least` and `most` [m/s^2], and `half` is half of their difference.
     """
     x, y, z = components(acc)
     z = z + gravity
@@ -93,13 +93,15 @@ def thrust_band_excess(acc: Array, gravity: Array, least: Array, most: Array) ->
 
 @struct.dataclass
 class Catch:
-    """The N catches that a point of the search space describes."""
+    """The N catches that a vector of decision variables describes."""
 
     times: Array  # (N,) [s], when the balls are caught
     durations: Array  # (N,) [s], durations of the segments that end with a catch
     tail_states: Array  # (N, 4, 3), position to jerk of the quadrotor at the catches
     miss: Array  # (N,) [m], distance from the net's centre to the ball
-    angle_excess: Array  # (N,), cos(theta_safe) + z_d . v / |v|; <= 0 if the net faces the ball
+    # (N,), cosine of the greatest angle minus cosine of the angle between the net's axis and the
+    # reversed ball velocity; <= 0 if the net faces the ball.
+    angle_excess: Array
 
 
 @jax.tree_util.register_static
@@ -107,29 +109,29 @@ class Catch:
 class PaperCatch(OptimisedPlanner):
     """The planner of [Yu2023catch], which optimises catching times and states together.
 
-    The cost (eqs 18-28) is a sum: the integral of |snap|^2; rho T; smoothed penalties of speed,
-    body rate, thrust and ground, integrated by the trapezoid rule; and penalties of the net's
-    distance (eqs 22-24) and angle (eq. 25). The paper reports neither weights nor thresholds. They
-    come from the authors' published C++ code, with squared quantities in SI units. All pieces of a
-    segment have the same duration, and the jerk at the last catch is zero.
+    The cost (eqs 18-28) is a sum: the integral of |snap|^2; the weighted total time; smoothed
+    penalties of speed, body rate, thrust and ground, integrated by the trapezoid rule; and
+    penalties of the net's distance (eqs 22-24) and angle (eq. 25). The paper reports neither
+    weights nor thresholds. They come from the authors' published C++ code. All polynomial pieces of
+    a segment (the trajectory to one catch) have the same duration. The last catch has zero jerk.
 
-    The variables are a change of coordinates of the paper's variables, so that the optima are the
-    same. Waypoints are whitened offsets from the smoothest trajectory, and the position at a catch
-    is the net's offset from the ball. Each of N segments has 3 (M - 1) + 13 variables: waypoint
-    offsets, log duration, miss, velocity, acceleration and jerk (unused at the last catch).
+    The variables are other coordinates of the paper's variables, so that the optima are the same:
+    offsets of the waypoints from the smoothest trajectory, and for each catch the logarithm of the
+    segment's duration, the net's position relative to the ball, and the quadrotor's velocity,
+    acceleration and jerk. The jerk of the last catch is unused.
 
-    This planner ignores a case's extras; the referee checks them.
+    This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
     case_type = CatchCase
-    num_pieces: int = 4  # M, number of pieces of one segment
+    num_pieces: int = 4  # number of polynomial pieces of one segment
     nodes: int = 16  # number of intervals per piece in which penalties are integrated
-    time_weight: float = 1000.0  # rho, weight of the duration
+    time_weight: float = 1000.0  # weight of the time of the last catch
     limit_weight: float = 1e5
     ground_weight: float = 1e7
     miss_weight: float = 1e4
     angle_weight: float = 1e2
-    hinge_width: float = 0.01  # width mu of the limits' hinges and eps of the angle's hinge
+    hinge_width: float = 0.01  # width of the smoothed penalties of limits and of the net's angle
     # The penalty weights increase in stages, since the final penalties are too stiff to start with.
     rounds: tuple[Round, ...] = (
         Round(
@@ -157,7 +159,7 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices that map boundary states and offsets to one segment."""
+        """The constant matrices that map end states and waypoint offsets to one segment."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
@@ -170,7 +172,7 @@ class PaperCatch(OptimisedPlanner):
         return order_targets(case)
 
     def guesses(self, context: CatchContext, num: int) -> Array:
-        """Return the initial guess (1, n): primitives between standstills below all balls."""
+        """Return the initial guess (1, n) of the n variables: standstill below each caught ball."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.times.dtype
         durations = jnp.maximum(jnp.diff(context.times, prepend=jnp.zeros((1,), dtype)), 0.05)
@@ -205,7 +207,7 @@ class PaperCatch(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype)[None]).reshape(1, -1)
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
-        """Return the catches that the variables (N, 13) after the waypoint offsets describe."""
+        """Return N catches from their variables (N, 13), those after the waypoint offsets."""
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -228,7 +230,7 @@ class PaperCatch(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: CatchContext) -> tuple[Chain, Catch]:
-        """Return the segments and the catches that a point of the search space describes."""
+        """Return the segments and the catches that a vector of decision variables describes."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         catch = self.catches(natural[:, self.num_offsets :], context)
@@ -238,7 +240,7 @@ class PaperCatch(OptimisedPlanner):
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
-        """Return the cost of energy, catches and total time, (); without the limits' penalties."""
+        """Return the cost () of snap, missed catches and total time, without limits' penalties."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(
@@ -248,7 +250,6 @@ class PaperCatch(OptimisedPlanner):
         return rest + self.time_weight * catch.times[-1]
 
     def _along(self) -> Along:
-        """Return the settings that integrate the limits' penalties along the trajectory."""
         return Along(
             maps=self.maps,
             nodes=self.nodes,
@@ -276,7 +277,7 @@ class PaperCatch(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: CatchContext) -> CatchPlan:
-        """Return the plan of a search point, with its violation at `nodes` samples per piece."""
+        """Return the plan of a vector of variables, with its violation at samples of each piece."""
         chain, catch = self._unpack(point, context)
         gravity, limits, net = context.case.gravity, context.case.limits, context.case.net
         motion = jax.vmap(lambda *segment: sample_motion(self.maps, self.nodes, *segment))(

@@ -8,15 +8,14 @@ from planner_jax.task.catch.spec import SUITES
 
 
 class PublishedRates(NamedTuple):
-    """Published results: 50 real throws for `throws`, 1,000 simulated cases for other suites.
+    """Results of [Yu2023catch] for one suite: 50 real throws, or 1,000 simulated cases.
 
-    The paper does not publish the ranges of its cases, so that they are similar to this library's
-    cases, but not equal.
+    The paper does not publish the ranges of its cases, so that this library's cases differ.
     """
 
-    success: float | None = None  # [%], of the planner
-    time_ratio: float | None = None  # optimal time ratio
-    mpp_success: float | None = None  # [%], of the motion primitives of the paper
+    success: float | None = None  # [%], success rate of the paper's planner
+    time_ratio: float | None = None  # mean relative change of the decided times by the optimiser
+    mpp_success: float | None = None  # [%], success rate of the planner MPP (motion primitives)
 
 
 RATES = {
@@ -34,7 +33,7 @@ SOURCE = (
 
 
 def make_table(manifest: Entries) -> RateTable:
-    """Return success and optimal time ratio of a run beside the paper's, one row per suite."""
+    """Return a table of a run's success rate and optimal time ratio beside published values."""
     summary, settings = manifest["summary"], manifest["parameters"]
     planner, names = settings["planner"], list({**SUITES, settings["suite"]: None})
     header = ["suite", "cases", f"{planner} %", "95 % interval", f"{planner} OTR"]

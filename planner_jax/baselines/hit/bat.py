@@ -39,21 +39,22 @@ _ORDER = 4  # derivative whose square is minimised: snap
 _COST_UNIT = 1e4  # divisor of the cost, so that the Hessian has moderate entries
 _DECODE_NODES = 24  # number of samples per piece at which the plan's violation is evaluated
 
-# Constants of [Yu2023bat, Section VI-A]. The paper lists phi but does not define it; here it is the
-# fraction at which s_mid divides the segment from s_0 to s_t.
+# Fractions alpha, eta, phi of [Yu2023bat, Section VI-A], used by `transition_point`. The paper does
+# not define phi. Here the point at fraction phi from the ball's origin to its target lies on the
+# line along which the racket swings.
 _ALPHA, _ETA, _PHI = 0.5, 2.0 / 3.0, 0.5
-_SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # varpi, (velocity at transition) / (velocity at hit)
+_SLOWING = np.array([0.5, 0.5, 1.0 / 3.0])  # (velocity at transition) / (velocity at hit), x, y, z
 _ACCELERATION_SHARE = 2.0 / 3.0  # (acceleration at transition) / (acceleration at hit)
 
-_LEAST_RISE = 0.1  # [m/s], least vertical speed for extrapolation to the ground
+_LEAST_RISE = 0.1  # [m/s], least vertical ball speed by which a remaining height is divided
 
 
 def serve_origin(case: HitCase) -> Array:
-    """Return where the ball's flight, traced backwards, leaves the ground: s_0, (3,) [m].
+    """Return the point (3,) [m] on the ground at which the ball's flight, traced back, starts.
 
-    A ball with the opposite velocity flies forward against drag of the opposite sign, for the
-    flight time without drag. A straight line covers the height that then remains. If drag of the
-    opposite sign makes the flight diverge, the flight without drag is used.
+    The flight is traced back by a forward flight with opposite velocity and opposite drag, which
+    lasts as long as a fall without drag. A straight line then covers the remaining height. If the
+    flight with opposite drag diverges, the flight without drag is used.
     """
     mirrored = BallState(pos=case.ball.pos, vel=-case.ball.vel)
     floor = jnp.zeros_like(case.gravity)
@@ -70,15 +71,15 @@ def serve_origin(case: HitCase) -> Array:
 def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> Array:
     """Return p_t of [Yu2023bat, Section IV-A], the point where the quadrotor starts the swing.
 
-    The paper's ray of Fig. 4 is taken as the ray from s_mid through p_h, along which the racket
-    swings. p_alpha lies halfway between p_0 and p_h, and p_perp is the projection of p_alpha onto
-    the ray. p_t divides the segment from p_perp to p_alpha at the fraction eta.
+    The ray of the paper's Fig. 4 is interpreted as the ray from the middle of origin and target
+    through the hit. The middle of start and hit is projected onto this ray. p_t is at two thirds of
+    the segment from the projection to the middle of start and hit.
 
     Args:
-        start: (3,) p_0 [m].
-        hit: (3,) p_h [m].
-        origin: (3,) s_0 [m], origin of the ball's flight.
-        target: (3,) s_t [m], where the returned ball should land.
+        start: (3,) [m], position of the quadrotor at time 0.
+        hit: (3,) [m], position of the quadrotor at the hit.
+        origin: (3,) [m], where the ball's flight starts on the ground.
+        target: (3,) [m], where the returned ball should land.
 
     Returns:
         (3,) [m].
@@ -91,8 +92,8 @@ def transition_point(start: Array, hit: Array, origin: Array, target: Array) -> 
     return foot + _ETA * (halfway - foot)
 
 
-# Units of the variables: waypoint coordinate [m], log T, racket speed [m/s], thrust [m/s^2]. They
-# are chosen by hand so that a step of one unit is of moderate size in every variable.
+# Units of the optimiser's variables, chosen by hand: 0.1 m for a waypoint's coordinate, 0.05 for
+# the logarithm of the impact time, 0.3 m/s for a racket speed and 0.5 m/s^2 for a thrust.
 _UNITS = (0.1, 0.05, 0.3, 0.5)
 
 
@@ -101,58 +102,60 @@ _UNITS = (0.1, 0.05, 0.3, 0.5)
 class BatHit(OptimisedPlanner):
     """The planner of [Yu2023bat]; with `transition=False` its "Bat-Lite".
 
-    The n = 3 (M - 1) + 5 decision variables, in units of `scale`, are the waypoints' positions [m],
-    log T, p_y_dot, p_z_dot, tau_x and tau_z. These parts follow the paper without changes:
+    A trajectory of M polynomial pieces has M - 1 inner waypoints. The decision variables, in units
+    of `scale`, are the waypoints' positions [m], the logarithm of the impact time T [s], y and z of
+    the racket's velocity [m/s], and x and z of the thrust per unit mass [m/s^2] at the impact.
+    These parts follow the paper without changes:
 
     - Eqs 11-14 derive the complete state at the impact (`solve_decoupled_hit`).
     - The initial guess has the values of Section VI-A. It consists of two minimum-jerk primitives
       (eqs 15-17, Section IV-C), to the transition point of Section IV-A and from there to the hit.
-    - The trajectory is MINCO with s = 4 and equal times (eq. 19). The cost is a weighted sum of the
-      squared snap, T and the penalties L_mu of the paper's ref. [10] (eqs 18a, 20-22 and 24a).
+    - The trajectory has the least snap, with pieces of equal duration (MINCO, eq. 19). The cost is
+      a weighted sum of the squared snap, T and smooth penalties (eqs 18a, 20-22 and 24a).
     - L-BFGS runs from one start. Its last iterate is returned even if this iterate breaks limits.
 
-    Two misprints are corrected: eq. 18a has D_max^2, and eq. 22 has the velocity's z. The ground
-    term of eq. 18a is z_min - z, because the difference of squares changes its sign below the
-    ground.
+    Two misprints are corrected. Eq. 18a compares the square of a quantity with its limit; here it
+    is compared with the limit's square. Eq. 22 computes the ball's apex from the x component of its
+    velocity; here it is z. In the ground term z_min^2 - z^2 of eq. 18a, a height z below -z_min
+    would be allowed; here the term is z_min - z.
 
     The paper leaves some choices open. This planner makes these choices:
 
-    - The transition acts only on the initial guess. Eq. 18e leaves the transition state free, and
-      the least-snap trajectory through free waypoints is the trajectory of MINCO.
+    - The transition acts only on the initial guess, since eq. 18e leaves the transition state free.
     - `transition_point` interprets the ray of Fig. 4, and `transition_state` the thrust of Fig. 4b.
     - The jerk at the impact is zero.
-    - Bat-Lite's initial guess is one primitive straight to the impact (ref. [11]), with time T_0.
-    - Weights, mu, M = 4, kappa, units and the stopping rule are usual values of MINCO planners.
+    - Bat-Lite's initial guess is one primitive straight to the impact, of duration T_0.
+    - Weights, numbers of pieces and nodes, and the stopping rule are usual values.
 
-    `max_steps` is fitted to the mean success rates of the published trials, 85.4 % for `bat` and
-    46.6 % for `bat-lite`. With 80 iterations both planners are within two points of these rates,
-    though they hardly succeed on the same serves as the published planners. The number of
-    iterations decides the success almost alone. Success on 1,800 published serves, in %:
+    The number of L-BFGS iterations is fitted to the mean success rates of the published trials,
+    85.4 % for `bat` and 46.6 % for `bat-lite`. With 80 iterations both rates are within two points,
+    although the published planners succeed on other serves. Success on 1,800 published serves in %,
+    where T_0 and T_1 are the durations before and after the transition in the initial guess:
 
         iterations                 0   20   40   60   80  100  150  200  300
         bat                        0   45   58   77   85   92   94   94   94
         bat-lite                   0    8    5   23   48   63   79   82   82
         bat-lite from T_0 + T_1   24   53   72   85   91   94   94   94   94
 
-    In the last row Bat-Lite starts with the longer impact time of `bat`. The main benefit of the
-    guess in two stages is therefore an initial impact time closer to the optimum. A solver that
-    runs to convergence needs this benefit less than the published solver.
+    In the last row Bat-Lite starts with the longer impact time of `bat`, and nearly reaches the
+    success of `bat`. The transition therefore helps mainly by a better initial impact time.
 
-    This planner ignores a case's extras; the referee checks them.
+    This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
     case_type = HitCase
     transition: bool = True
-    num_pieces: int = 4  # M, number of polynomial pieces
-    nodes: int = 16  # kappa, number of intervals per piece in which penalties are integrated
+    num_pieces: int = 4  # number of polynomial pieces
+    nodes: int = 16  # number of intervals per piece in which penalties are integrated
     num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
-    time_weight: float = 1e3  # rho, weight of the impact time T
-    limit_weight: float = 1e5  # W_D and W_c: speed, acceleration, body rate, ground
-    terminal_weight: float = 1e4  # W_r and W_t: apex, hitting speed, and the defect of eqs 13-14
-    hinge_width: float = 0.01  # mu, in the unit of each constraint
-    stage_times: tuple[float, float] = (0.7, 0.5)  # T_0, T_1 [s]; without transition only T_0
+    time_weight: float = 1e3  # weight of the impact time
+    limit_weight: float = 1e5  # weight of speed, acceleration, body rate and ground
+    terminal_weight: float = 1e4  # weight of apex, hitting speed, and the defect of eqs 13-14
+    hinge_width: float = 0.01  # width of the smooth penalties, in the unit of each limit
+    # [s], durations before and after the transition in the initial guess; Bat-Lite uses the first.
+    stage_times: tuple[float, float] = (0.7, 0.5)
     first_angle: float = math.radians(60.0)  # [rad], elevation of the returned ball in the guess
-    first_thrust_z: float = 1.1  # tau_z of the guess, divided by gravity
+    first_thrust_z: float = 1.1  # vertical thrust at the impact in the guess, divided by gravity
     first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s], in the guess
     rounds: tuple[Round, ...] = (
         Round(
@@ -176,7 +179,7 @@ class BatHit(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices that map boundary states and offsets to the trajectory."""
+        """The constant matrices that map end states and waypoint offsets to the trajectory."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
@@ -189,9 +192,10 @@ class BatHit(OptimisedPlanner):
         return prepare_hit(case, self.num_table_nodes)
 
     def impact(self, natural: Array, context: HitContext) -> tuple[Impact, Array]:
-        """Return the impact of the last five variables, and by how much eqs 13-14 are unsolvable.
+        """Return the impact from the last five variables, and the defect of eqs 13-14.
 
-        The variables are log T; p_y_dot, p_z_dot [m/s]; tau_x, tau_z [m/s^2].
+        `natural` (5,) has the logarithm of the impact time, y and z of the racket's velocity [m/s],
+        and x and z of the thrust per unit mass [m/s^2]. The defect is > 0 if no hit is possible.
         """
         case, time = context.case, jnp.exp(natural[0])
         ball = target_at(context.path, time)
@@ -204,11 +208,11 @@ class BatHit(OptimisedPlanner):
         return impact, hit.defect
 
     def guesses(self, context: HitContext, num: int) -> Array:
-        """Return the initial guess (1, n): values of Section VI-A, waypoints on the primitives."""
+        """Return the initial guess (1, n) of the n variables, with values of Section VI-A."""
         require(num == 1, "starts", "1", num)
         case, dtype = context.case, context.landing_time.dtype
         stages = self.stage_times if self.transition else self.stage_times[:1]
-        # If planning starts late, the ball may land before T_0 + T_1. Then the guess is earlier.
+        # If the ball lands early, the guess of the impact time is 0.9 of the landing time.
         time = jnp.minimum(sum(stages), 0.9 * jnp.maximum(context.landing_time, 0.1))
         ball = target_at(context.path, time)
         after = aim_at_angle(ball.pos, case.target, self.first_angle, case.gravity)
@@ -221,7 +225,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Sample the minimum-jerk primitives at M - 1 equally spaced times, (M - 1, 3) [m]."""
+        """Return the waypoints (W, 3) [m] of the guess, sampled from minimum-jerk primitives."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)
@@ -235,12 +239,11 @@ class BatHit(OptimisedPlanner):
         return jnp.where((times < switch)[:, None], first, second)
 
     def transition_state(self, impact: Impact, case: HitCase) -> Array:
-        """Return position, velocity and acceleration at the transition, (3, 3).
+        """Return the quadrotor's position, velocity and acceleration at the transition, (3, 3).
 
-        The acceleration is 2/3 of the acceleration at the hit, so that the thrust has the paper's
-        vertical part g + 2 (tau_z - g) / 3. The thrust's direction e_tau is defined only by the
-        paper's Fig. 4b. Here it follows from the acceleration, and lies between the vertical and
-        the thrust's direction at the hit.
+        The acceleration is two thirds of the acceleration at the hit, so that the vertical thrust
+        equals the paper's. The paper shows the thrust's direction only in Fig. 4b; here it follows
+        from the acceleration.
         """
         hit = impact.tail_state
         pos = transition_point(case.head_state[0], hit[0], serve_origin(case), case.target)
@@ -249,7 +252,7 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return offsets, boundary rows, piece duration, impact and defect of a search point."""
+        """Return waypoint offsets, end states, piece duration, impact and defect of `point`."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
@@ -306,7 +309,7 @@ class BatHit(OptimisedPlanner):
         return is_too_far(context)
 
     def decode(self, point: Array, context: HitContext) -> HitPlan:
-        """Return the plan of a search point; its violation is evaluated at 24 nodes per piece."""
+        """Return the plan of a vector of variables; its violation is sampled 24 times per piece."""
         case = context.case
         offsets, rows, duration, impact, defect = self._unpack(point, context)
         columns = jnp.concatenate([rows, offsets])

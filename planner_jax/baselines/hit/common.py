@@ -34,12 +34,12 @@ def make_impact(
         flight_time: () [s], duration of the ball's flight from the impact to the landing.
         ball: state of the ball just before the impact.
         after: (3,) [m/s], velocity of the ball just after the impact.
-        racket_vel: (3,) [m/s], velocity of the quadrotor.
+        racket_vel: (3,) [m/s], velocity of the quadrotor at the impact.
         thrust: (3,) [m/s^2], thrust per unit mass; not zero.
         case: the case, for the height of the racket and gravity.
 
     Returns:
-        The impact, with the racket's centre at the ball and no jerk of the quadrotor.
+        The impact, with the racket's centre at the ball and zero jerk of the quadrotor.
     """
     normal = thrust / jnp.sqrt(jnp.maximum(jnp.sum(thrust**2), 1e-6))
     tail_state = jnp.stack(
@@ -63,11 +63,11 @@ def make_impact(
 
 
 def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
-    """Return the largest excess over any limit, (); relative, but in metres for the ground.
+    """Return the largest relative excess over any limit, (); for the ground it is in metres.
 
     Args:
-        along: (4, N) excess at samples of the trajectory, from `motion_excess`.
-        impact: the impact, for apex and hitting speeds.
+        along: (4, N) excess at N samples of the trajectory, from `motion_excess`.
+        impact: the impact, for the returned ball's apex and the quadrotor's velocity.
         case: the case, for its limits.
     """
     limits = case.hit_limits
@@ -79,7 +79,10 @@ def largest_violation(along: Array, impact: Impact, case: HitCase) -> Array:
 
 
 def motion_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tuple[Array, ...]:
-    """Return the excess (N,) over speed, acceleration, body rate, ground [Yu2023bat, eq. 18a]."""
+    """Return the excess (N,) of N samples over four limits [Yu2023bat, eq. 18a].
+
+    The limits are speed, acceleration, body rate, and the least height above the ground.
+    """
     return (
         speed_excess(motion.vel, limits),
         acceleration_excess(motion.acc, limits),

@@ -16,19 +16,19 @@ from planner_jax.task.hit.suites import Serves
 
 
 def describe_serves(serves: Serves) -> Entries:
-    """Return the number of distinct balls among serves, and a SHA-256 of balls and targets."""
+    """Return the number of distinct balls among serves, and a hash of balls and targets."""
     balls = np.column_stack([serves.position, serves.velocity])
     digest = hashlib.sha256(np.column_stack([balls, serves.target]).tobytes()).hexdigest()
     return {"distinct": len(np.unique(balls, axis=0)), "sha256": digest}
 
 
 def choose_reference(planner: str) -> str:
-    """Return the published planner to compare with: the planner of this name, or else `bat`."""
+    """Return the name of the published planner to compare with: the same name, or else `bat`."""
     return planner if planner in court.PLANNERS else "bat"
 
 
 def _outcome_column(index: int, planner: str) -> Column:
-    """Return the column with the published outcomes of a planner of `court.PLANNERS`."""
+    """Return the column of published outcomes of the planner that has this name and index."""
 
     def values(batch: RefereedBatch) -> pa.Array | None:
         if (found := cast(Serves, batch.chunk.origin).published) is None:
@@ -44,7 +44,7 @@ OUTCOMES = [_outcome_column(*numbered) for numbered in enumerate(court.PLANNERS)
 
 
 class ScenarioCounts:
-    """Counts by court scenario of the run's successes and of published ones on the same serves."""
+    """Numbers of successes of a run and of published planners on the run's serves, by scenario."""
 
     READS = ("scenario", *(column.name for column in OUTCOMES))
 
@@ -67,7 +67,7 @@ class ScenarioCounts:
             self._published.update((planner, name) for name in scenario[solved])
 
     def summary(self) -> Entries:
-        """Return each scenario's success rate from 0 to 1, and published rates on its serves."""
+        """Return success rates of the run and of the published planners for each scenario."""
         return {
             name: {
                 "num": self._num[name],
@@ -112,7 +112,7 @@ def make_table(manifest: Entries) -> RateTable:
 
 
 def explain_table(manifest: Entries) -> str:
-    """Return sentences that explain the published columns of the table."""
+    """Return sentences that explain the columns with published rates."""
     other, same = choose_reference(manifest["parameters"]["planner"]), ""
     if _knows_same_serves(manifest["summary"], other):
         same = '"Same serves" are the published outcomes of this run\'s cases, if known. '

@@ -1,7 +1,7 @@
-"""The impact of [Yu2023bat, Section IV-B], computed from decoupled components (eqs 11-14).
+"""The impact of a ball on a quadrotor's racket by [Yu2023bat, Section IV-B] (eqs 11-14).
 
-Two components of the racket's velocity and two of its thrust are given. The remaining components
-follow from the ball and the target.
+Two components of the racket's velocity and two of the quadrotor's thrust are given. The remaining
+components follow from the ball and the target.
 """
 
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ from jax import Array
 from planner_jax.ball.aim import aim_drag_free
 from planner_jax.ball.flight import BallState
 
-_LEAST_THRUST_X = 1e-2  # [m/s^2], least |tau_x|
+_LEAST_THRUST_X = 1e-2  # [m/s^2], least size of the thrust's x component
 _LEAST_ROOT = 1e-2  # [m/s], least root of the discriminant of eq. 13c
 _LEAST_FLIGHT = 1e-2  # [s], least flight time of the returned ball
 _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
@@ -19,9 +19,9 @@ _LEAST_PUSH = 1e-3  # [s], least (change of the ball's velocity) / thrust
 
 @struct.dataclass
 class DecoupledHit:
-    """The solution of eqs 13 and 14 for four given components."""
+    """The solution of eqs 13 and 14 for given racket velocity (y, z) and thrust (x, z)."""
 
-    ball_vel_after: Array  # (3,) [m/s]
+    ball_vel_after: Array  # (3,) [m/s], velocity of the ball after the impact
     flight_time: Array  # () [s], of the ball from the impact to the target
     racket_vel: Array  # (3,) [m/s], its x by eq. 14a
     thrust: Array  # (3,) [m/s^2], per unit mass, its y by eq. 14b
@@ -38,21 +38,23 @@ def solve_decoupled_hit(
 ) -> DecoupledHit:
     """Solve eqs 13 and 14 for a hit that sends the ball to the target.
 
-    With delta = tau_z / tau_x, xi = target - ball and c = v-_z - delta v-_x the flight time is the
-    later root of  g t^2 / 2 - c t - (delta xi_x - xi_z) = 0 . Eq. 13c is xi_x divided by that root.
-    Using the root avoids the divisions by xi_x and delta xi_x - xi_z in eq. 13c. Eq. 14b is the
-    change of the ball's v_y divided by the change of its v_x, times tau_x.
+    Let tau be the thrust, v the ball's velocity before the impact, and g gravity. With
+    delta = tau_z / tau_x, xi = target - ball and c = v_z - delta v_x, the flight time t after the
+    impact is the later root of g t^2 / 2 - c t - (delta xi_x - xi_z) = 0. The velocity of eq. 13c
+    is xi_x / t; this form needs no division by xi_x or delta xi_x - xi_z. By eq. 14b, tau_y is
+    tau_x times the change of the ball's v_y divided by the change of its v_x.
 
-    The remaining singularities are guarded, so that values and gradients are finite everywhere.
-    `defect` measures how far a hit is beyond a guard: tau_x = 0, a negative discriminant, or a ball
-    that flies or is pushed backwards.
+    Divisors and roots are kept above small bounds, so that values and gradients are finite. If a
+    bound applies, no hit with these components reaches the target, and `defect` is the distance
+    from the bound. This happens for tau_x near 0, for a negative discriminant, and if the ball
+    would fly backwards in time or the racket would pull it.
 
     The paper's eq. 13d measures xi from the quadrotor. Here xi is measured from the ball, 6 cm
     away, so that the ball meets the target exactly.
 
     Args:
         ball: state of the ball just before the impact.
-        target: (3,) [m].
+        target: (3,) [m], where the ball should arrive.
         racket_vel_yz: (2,) [m/s], y and z of the racket's velocity.
         thrust_xz: (2,) [m/s^2], tau_x and tau_z, thrust per unit mass.
         restitution: (), coefficient of restitution.
@@ -95,9 +97,9 @@ def aim_at_angle(pos: Array, target: Array, angle: float, gravity: Array) -> Arr
     """Return the initial velocity of a drag-free ball that leaves at an angle and hits a target.
 
     Args:
-        pos: (3,) [m].
-        target: (3,) [m]. A target above the line at that angle is replaced by a point 0.1 m below
-            the line.
+        pos: (3,) [m], position of the ball at the start.
+        target: (3,) [m]. A target above the straight line at that angle cannot be hit; it is
+            replaced by a point 0.1 m below the line.
         angle: [rad], above the horizontal, less than pi / 2.
         gravity: () [m/s^2], magnitude.
 

@@ -1,4 +1,4 @@
-"""The baseline `juggle`: one primitive to a racket state that is fixed without optimisation."""
+"""The baseline `juggle`: a minimum-jerk trajectory to a hit that is chosen without optimisation."""
 
 import dataclasses
 from typing import ClassVar
@@ -20,14 +20,14 @@ from planner_jax.trajectory.polynomial import sample_pieces, snap_energy
 
 _BISECTIONS = 30  # number of bisection steps for the time of the fall
 _SHORTEST = 1e-2  # [s], least duration of a trajectory
-_LEAST_UPRIGHT = 1e-2  # least vertical part of the racket's normal, by which v_z is divided
+_LEAST_UPRIGHT = 1e-2  # least vertical component of the racket's normal, which is a divisor
 
 
 def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array) -> Array:
     """Return the time () [s] at which the ball falls through a height.
 
     Bisection is followed by one Newton step, and only this step is differentiated. If the ball does
-    not cross the height between the bounds, the result is next to one of the bounds.
+    not cross the height between `earliest` and `latest`, the result is next to one of these times.
 
     Args:
         path: tabulated trajectory of the ball.
@@ -53,7 +53,7 @@ def falling_time(path: PathTable, height: Array, earliest: Array, latest: Array)
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class JuggleHit(Planner):
-    """The "Juggle" of [Yu2023bat]: a primitive to a predetermined hit, without optimisation.
+    """The "Juggle" of [Yu2023bat]: a minimum-jerk trajectory (primitive) to a predetermined hit.
 
     Its parts come from these sources:
 
@@ -61,20 +61,19 @@ class JuggleHit(Planner):
       returned ball rises to a fixed apex. Two components of the racket's velocity are fixed, and
       the third follows from the impact.
     - [Mueller2015]: the primitive of least jerk to that state.
-    - [Yu2023bat]: eqs 11-12 (the impact solved for normal and normal speed), eqs 15-17 (the
-      primitive), and tau_z = 1.1 g at the impact.
-    - The published trials: every recorded hit has v_x = v_y = 0. The quadrotor is at a height of
-      1.43 to 1.50 m, never above, which is the first 10 ms sample below 1.5 m. The apex is 2.3 m
-      (median; quartiles 2.2 and 2.4 m); it follows from attitude and target if only gravity acts.
+    - [Yu2023bat]: eqs 11-12 (the racket's normal and its speed along the normal), eqs 15-17 (the
+      primitive), and a vertical thrust of 1.1 times gravity at the impact.
+    - The published trials: at every recorded hit the quadrotor's horizontal velocity is zero, and
+      its height is 1.43 to 1.50 m. The ball's apex after the hit is 2.3 m in the median, computed
+      from attitude and target without drag.
     - Assumption: the ramp of `minimum_jerk_after_ramp`; without it the body rate jumps at time 0.
 
-    With the restitution 0.7 of [Yu2023bat] this planner succeeds on two of three serves, the
-    published planner on one of ten. The recorded hits imply a restitution near 0.32. A racket then
-    has to rise at 3 m/s at the impact, instead of almost standing still. With a restitution of 0.32
-    in the cases this planner also succeeds on one of ten. Over the 36 scenarios its success rate
-    correlates with the published success rate (coefficient 0.65).
+    With the coefficient of restitution 0.7 of [Yu2023bat] this planner succeeds on two of three
+    serves, and the published planner on one of ten. The recorded hits imply a coefficient near
+    0.32, with which the racket has to rise at 3 m/s at the impact instead of almost standing still.
+    With 0.32 this planner also succeeds on one of ten serves.
 
-    This planner ignores a case's extras; the referee checks them.
+    This planner ignores the additional limits of a case (`extras`); the referee checks them.
     """
 
     attempts: ClassVar[tuple[Attempt, ...]] = (Attempt(),)  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -83,7 +82,7 @@ class JuggleHit(Planner):
     apex: float = 2.3  # [m], height to which the returned ball rises
     thrust_z: float = 1.1  # vertical thrust at the impact, divided by gravity
     racket_vel_xy: tuple[float, float] = (0.0, 0.0)  # [m/s], of the quadrotor at the impact
-    ease: float = 0.02  # [s], duration of the ramp to the primitive's initial jerk
+    ease: float = 0.02  # [s], duration of the ramp of the jerk at the start
     nodes: int = 60  # number of intervals per piece, at whose ends limits are evaluated
     num_table_nodes: int = 48  # number of nodes at which the incoming ball is tabulated
 
@@ -101,7 +100,7 @@ class JuggleHit(Planner):
         )
         motion = sample_pieces(trajectory, self.nodes)
         along = jnp.stack(motion_excess(motion, case.gravity, case.limits))
-        # A height or apex that cannot be met, or a vertical racket, counts as a violation too.
+        # A height or apex that the ball cannot reach, or an upright racket face, is a violation.
         meeting = jnp.abs(impact.stroke.ball_pos[2] - self.height)
         too_low = jnp.maximum(impact.stroke.ball_pos[2], case.target[2]) - self.apex
         lying = _LEAST_UPRIGHT - impact.stroke.normal[2]

@@ -26,7 +26,7 @@ _SERVE_COLUMNS = ("serve position", "serve velocity", "landing position", "targe
 _HIT_COLUMNS = (("hitting position", 3), ("hitting velocity", 3), ("hitting attitude", 4))
 _LISTED = 5  # greatest number of problems that an error message lists
 
-# The twelve numbers and the outcome of each line of a file, by line; None if parsing failed.
+# Line number -> the serve's twelve numbers and whether it was solved; None if parsing failed.
 _Table: TypeAlias = dict[int, tuple[list[float], bool] | None]
 
 
@@ -41,7 +41,10 @@ class Trial(NamedTuple):
 
 
 def read_serves(folder: str | os.PathLike) -> Serves:
-    """Read all serves of a folder of trial files, for `task.hit.suites.read_serves`."""
+    """Read all serves of a folder of published trial files, sorted by line and scenario.
+
+    A wrong file or line raises `ArgumentError`, which lists up to five problems.
+    """
     problems: list[str] = []
     trials: list[Trial] = []
     for scenario, paths in _find_trial_files(folder).items():
@@ -69,7 +72,7 @@ def read_serves(folder: str | os.PathLike) -> Serves:
 
 
 def _find_trial_files(folder) -> dict[int, dict[str, Path]]:
-    """Return the paths of a folder's trial files, by scenario index and planner letter."""
+    """Return the paths of trial files by index of the scenario, then by planner (p, l or b)."""
     folder = Path(folder)
     require(folder.is_dir(), "serves", "an existing folder", str(folder))
     files: dict[int, dict[str, Path]] = {}
@@ -112,7 +115,7 @@ def _read_file(path: Path, problems: list[str]) -> _Table:
 
 
 def _parse(line: str) -> tuple[list[float], bool]:
-    """Parse one line of a trial file: the serve's twelve numbers, and whether it was solved."""
+    """Return the twelve numbers of a serve, and whether it was solved, from a trial file's line."""
     cells = [cell.strip() for cell in line.split(",")]
     if len(cells) != 8:
         raise ArgumentError("row", "8 columns between commas", len(cells), verb="have")
@@ -127,7 +130,6 @@ def _parse(line: str) -> tuple[list[float], bool]:
 
 
 def _vector(name: str, cell: str, size: int) -> list[float]:
-    """Parse one cell of `size` finite numbers separated by blanks; `name` is for the error."""
     try:
         vector = [float(word) for word in cell.split()]
     except ValueError:
@@ -140,7 +142,7 @@ def _vector(name: str, cell: str, size: int) -> list[float]:
 def _merge(
     scenario: int, paths: dict[str, Path], tables: dict[str, _Table], problems: list[str]
 ) -> list[Trial]:
-    """Merge one scenario's serves from all planners' files; append a problem for each conflict."""
+    """Merge the files of all planners for one scenario; append a problem if serves differ."""
     trials = []
     for line in sorted(set().union(*tables.values())):
         present = [letter for letter, table in tables.items() if line in table]
@@ -165,7 +167,7 @@ def _merge(
 
 
 def _list_out_of_play(trials: list[Trial]) -> list[str]:
-    """List problems of serves that start in the ground or do not land in the hitting half."""
+    """List the serves that start below the ground or do not land in the quadrotor's half."""
     numbers = np.array([trial.numbers for trial in trials]).reshape(-1, 12)
     height = numbers[:, 2]
     position = np.column_stack([numbers[:, :2], np.where(height > 0.0, height, 1.0)])
@@ -182,9 +184,9 @@ def _list_out_of_play(trials: list[Trial]) -> list[str]:
 
 @dataclasses.dataclass(frozen=True)
 class PublishedRates:
-    """Planning success rates in percent, one row per court scenario, one column per planner.
+    """Published success rates in percent, one row per court scenario, one column per planner.
 
-    The two sources differ by up to 20 points, so that every comparison should name its source.
+    The paper and its trial files differ by up to 20 points.
     """
 
     paper: np.ndarray  # (36, 3) [%], Table I of the paper

@@ -1,14 +1,13 @@
 """Scalar curves over time, made of Bezier pieces of equal duration, for `speed.py`.
 
-Piece j of K runs from j T / K to (j + 1) T / K and is sum_i points[j, i] b_i(u), with the Bernstein
-polynomials b_i of degree n and u from 0 to 1 [Qu2022, eq. 18]. A control point here is the paper's
-control point times the duration of its piece, h_j c_j^i. The curve lies within the range of its
-control points, so that a bound on the control points also bounds the curve. Eqs 22 and 23 as
-printed bound c_j^i, which is right only for pieces of 1 s.
+A curve of duration T (its horizon) has K pieces. Piece j is sum_i points[j, i] b_i(u), with the
+Bernstein polynomials b_i of degree n; u runs from 0 to 1 during the piece [Qu2022, eq. 18]. The
+curve lies within the range of its control points `points`, so that a bound on the control points
+also bounds the curve. The paper's control points are `points` divided by the duration of a piece.
+Eqs 22 and 23 as printed bound these quotients, which is right only for pieces of 1 s.
 
-All maps that are linear in the control points are constant NumPy matrices for a horizon of 1, in
-double precision. For a horizon T, speeds scale with 1 / T and accelerations with 1 / T^2. Since all
-pieces have the same duration, the matrices do not depend on the problem.
+The functions of this module return constant NumPy matrices in double precision for a horizon of 1.
+For a horizon T, speeds scale with 1 / T and accelerations with 1 / T^2.
 """
 
 import math
@@ -27,7 +26,7 @@ class BezierCurve:
     horizon: Array  # () T [s], duration of all pieces together
 
     def at(self, time: Array, order: int = 0) -> Array:
-        """Return the value of one curve, or its derivative of an order, at times (...) [s].
+        """Return one curve's value, or its derivative of the given order, at times (...) [s].
 
         Before time 0 the first piece is extrapolated, after the horizon the last piece.
         """
@@ -47,8 +46,10 @@ class BezierCurve:
 def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
     """Return the matrix that maps a piece's control points to control points of a derivative.
 
-    The derivative has the given order. The horizon is 1 and has `pieces` pieces ([Qu2022], third
-    property of Bezier curves).
+    Args:
+        degree: degree of the piece.
+        order: order of the derivative.
+        pieces: number of equal pieces of the curve, whose horizon is 1.
 
     Returns:
         (degree + 1 - order, degree + 1).
@@ -60,7 +61,7 @@ def hodograph(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
-    """Return the Bernstein polynomials' values (S, degree + 1) at fractions (S,) of a piece."""
+    """Return the Bernstein polynomials (S, degree + 1) at S positions: fractions of a piece."""
     u = np.asarray(shares, float)[:, None]
     i = np.arange(degree + 1)
     binomials = np.array([math.comb(degree, k) for k in i])
@@ -68,10 +69,10 @@ def bernstein(degree: int, shares: np.ndarray) -> np.ndarray:
 
 
 def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
-    """Return the quadratic form that integrates a curve's squared derivative over a horizon of 1.
+    """Return the matrix Q of the integral of a curve's squared derivative over a horizon of 1.
 
-    Returns:
-        (K (n + 1), K (n + 1)), symmetric; the integral is points^T form points.
+    The derivative has the given order. The integral is p^T Q p for the control points p of all
+    pieces. Q has the shape (pieces (degree + 1),) * 2.
     """
     map_ = hodograph(degree, order, pieces)
     m = degree - order
@@ -83,12 +84,13 @@ def energy_of_pieces(degree: int, order: int, pieces: int) -> np.ndarray:
 
 
 def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
-    """Return rows that vanish if neighbouring pieces agree up to derivative `orders`.
+    """Return the matrix of the equations by which neighbouring pieces join smoothly.
 
-    The product of the rows with all control points is the left side of [Qu2022, eq. 21].
+    The product with the control points of all pieces is zero if neighbouring pieces agree in their
+    derivatives of the orders 0 to `orders` [Qu2022, eq. 21].
 
     Returns:
-        ((K - 1) (orders + 1), K (n + 1)).
+        ((pieces - 1) (orders + 1), pieces (degree + 1)).
     """
     size = degree + 1
     rows = np.zeros((pieces - 1, orders + 1, pieces * size))
@@ -101,10 +103,10 @@ def joints(degree: int, orders: int, pieces: int) -> np.ndarray:
 
 
 def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
-    """Expand rows (W, n + 1) for one piece's control points into rows for all pieces.
+    """Expand rows (W, n + 1) for the n + 1 control points of one piece into rows for K pieces.
 
-    On a smooth curve the first row of a piece equals the last row of the previous piece. Such first
-    rows are left out.
+    A row computes a value at a point of a piece. The first point of a piece is the last point of
+    the previous piece, so that its row is left out.
 
     Returns:
         (K (W - 1) + 1, K (n + 1)).
@@ -114,7 +116,7 @@ def rows_of_pieces(of_piece: np.ndarray, pieces: int) -> np.ndarray:
 
 
 def bounds_of_pieces(lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Convert bounds (K, W) on the rows of single pieces into bounds on `rows_of_pieces`.
+    """Convert bounds (K, W) on W rows of each of K pieces into bounds on `rows_of_pieces`.
 
     Where two pieces meet, the stricter bound of the two pieces applies.
     """

@@ -1,8 +1,8 @@
 """Closed forms of Dubins paths, compiled by numba; importing this module requires numba.
 
-A Dubins word is a sequence of left turns L, right turns R and straight lines S, such as LSL; C is a
-turn of either direction. The unit of length is the least turning radius, and the start is the
-origin of the frame. All code is scalar and runs on the host in float64.
+A Dubins word is a sequence of left turns L, right turns R and straight lines S, such as LSL. The
+unit of length is the least turning radius, and the start is the origin, with heading 0. All code is
+scalar and runs on the host in float64.
 """
 
 import math
@@ -15,17 +15,17 @@ TURN = 2.0 * math.pi
 
 @njit(cache=True)
 def _positive(angle):
-    """Return an angle in [0, 2 pi); a whole turn within rounding becomes 0."""
+    """Return an angle modulo 2 pi in [0, 2 pi); values within 1e-9 of 2 pi become 0."""
     turned = angle % TURN
     return 0.0 if turned > TURN - 1e-9 else turned
 
 
 @njit(cache=True)
 def words_to_pose(x, y, heading, lengths):
-    """Write the lengths of the three parts of each Dubins word to a pose into `lengths` (6, 3).
+    """Compute the Dubins paths from the origin to the pose (x, y, heading).
 
-    Rows are LSL, LSR, LRL and their mirror images RSR, RSL, RLR, as in `SENSES`. A row is infinite
-    if no path of this word exists.
+    Row k of `lengths` (6, 3) receives the lengths of the three parts of path k, with the words LSL,
+    LSR, LRL, RSR, RSL and RLR. A row is infinite if no path of this word exists.
     """
     lengths[:, :] = np.inf
     sin, cos = math.sin(heading), math.cos(heading)
@@ -56,7 +56,7 @@ def words_to_pose(x, y, heading, lengths):
             lengths[row + 1, 2] = _positive(angle - heading)
 
 
-# Turning directions of the parts of every word: 1 left, -1 right, 0 straight.
+# Turning directions of the three parts of LSL, LSR, LRL, RSR, RSL and RLR: 1 left, -1 right.
 SENSES = np.array(
     [[1, 0, 1], [1, 0, -1], [1, -1, 1], [-1, 0, -1], [-1, 0, 1], [-1, 1, -1]], np.float64
 )
@@ -64,9 +64,10 @@ SENSES = np.array(
 
 @njit(cache=True)
 def words_to_point(x, y, lengths):
-    """Write the lengths of an arc and a straight line to a point, for either side, into `lengths`.
+    """Compute the two paths of an arc and a straight line from the origin to a point (x, y).
 
-    The two paths stand in the rows of LSL and RSR of `lengths` (6, 3); other rows are infinite.
+    `lengths` (6, 3) receives the lengths of arc and line: in row 0 for a left turn, in row 3 for a
+    right turn. Other rows are infinite.
     """
     lengths[:] = np.inf
     for side in range(2):
@@ -81,10 +82,10 @@ def words_to_point(x, y, lengths):
 
 @njit(cache=True)
 def length_to_point(x, y):
-    """Return the length of the shortest path to a point with any heading.
+    """Return the length of the shortest path from the origin to a point, with any final heading.
 
-    The shortest path is a turn and a straight line (CS) or, if the point is inside a turning
-    circle, two turns (CC) [Bui1994].
+    The shortest path is a turn and a straight line or, if the point is inside a turning circle, two
+    turns [Bui1994].
     """
     y = abs(y)
     best = np.inf
@@ -108,7 +109,7 @@ def length_to_point(x, y):
 
 @njit(cache=True)
 def in_frame(pose, goal, curvature):
-    """Return a goal's position ahead and to the left of a pose, in least turning radii."""
+    """Return how far ahead and to the left of a pose a goal is, in units of 1 / curvature."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     east, north = goal.pose[0] - pose[0], goal.pose[1] - pose[1]
     return (cos * east + sin * north) * curvature, (cos * north - sin * east) * curvature

@@ -2,11 +2,11 @@
 
 The search runs over cells of position and heading, with one continuous state per cell, along arcs
 that the car can drive [Dolgov2008]. It is the first half of the path planning of [Qu2022, Section
-III-B]. A shot is a Dubins path from a node to the goal that touches nothing. Shots are tried more
-often near the goal. When no open node can be cheaper than the cheapest shot, this shot ends the
-search; the paper takes the first shot. The search runs on the host, one case at a time. Its loops
-are compiled by numba, which the extra `baselines` installs. Positions are in the world frame in the
-plane, in SI units, with headings counter-clockwise from the x axis.
+III-B]. Now and then, and more often near the goal, the search tries a Dubins path from a node to
+the goal. It ends when no open node can lead to a cheaper path than the cheapest collision-free
+Dubins path found; the paper takes the first one. The search runs on the host, one case at a time.
+Its loops are compiled by numba, which the extra `baselines` installs. Positions are in the world
+frame in the plane, in SI units, with headings counter-clockwise from the x axis.
 """
 
 import dataclasses
@@ -28,31 +28,30 @@ class HybridAstar:
     """Settings of the search Hybrid A*.
 
     The cost of a path is its length plus a price for turns. The heuristic is the length of the
-    shortest path without obstacles. [Qu2022] takes the maximum of this length and the straight-line
-    distance. Both heuristics are equal, since the straight line is never longer.
+    shortest path without obstacles.
     """
 
     cell: float = 0.1  # [m], side of a cell
     headings: int = 72  # number of heading bins in a full turn
     turn_price: float = 0.05  # added cost [m] per metre driven at the greatest curvature
-    # Relative inflation of the heuristic (weighted A* [Pohl1970]), and thereby a bound on the
-    # relative excess over the least cost on the lattice.
+    # Weighted A* [Pohl1970]: the heuristic is multiplied by 1 + slack. The cost of a path is at
+    # most this factor times the least cost of all paths that the search can represent.
     slack: float = 0.1
-    margin: float = 0.01  # [m], distance from polygons; covers the gaps between samples
+    margin: float = 0.01  # [m], least distance from polygons, since only samples are checked
     poses: int = 129  # number of poses of the resulting path
     max_expansions: int = 200_000  # number of expanded nodes after which the search gives up
 
 
 @dataclasses.dataclass(frozen=True)
 class HybridPath:
-    """Result of Hybrid A*; without a path the arrays are NaN, and length and cost infinite.
+    """Path found by Hybrid A*; if none is found, arrays are NaN, and length and cost infinite.
 
     The poses are equally spaced along the path. The path consists of arcs and straight lines, so
     that the curvature jumps between poses.
     """
 
-    poses: np.ndarray  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
-    curvature: np.ndarray  # (N,) [1/m], just after each pose, at the last pose just before
+    poses: np.ndarray  # (N, 3) x, y [m] of the rear axle, heading [rad] without jumps of 2 pi
+    curvature: np.ndarray  # (N,) [1/m], of the arc after each pose
     length: float  # [m]
     cost: float  # [m], length plus price of turns
     expansions: int  # number of expanded nodes
@@ -74,19 +73,18 @@ def hybrid_astar(
 ) -> HybridPath:
     """Search a path on which the body's centre of a car reaches the meeting point.
 
-    Three discs cover the body, so that the search treats the body as wider and longer than it is. A
-    gap just as wide as the car counts as closed. If the final heading is free, paths end with an
-    arc and a straight line.
+    The search tests three discs that cover the body, so that the body counts as wider and longer
+    than it is. If the final heading is free, paths end with an arc and a straight line.
 
     Args:
         start: (3,) x, y [m] of the rear axle and heading [rad].
         meeting: (2,) [m], required position of the body's centre.
         walls: walls of one case; their velocities are ignored.
         curvature: [1/m], > 0, greatest curvature.
-        body: ends of the body behind (negative) and ahead of the rear axle, and half its width [m],
-            as for `separation`.
-        lower: (2,) [m], corner of the map, which contains the body's centre.
-        upper: (2,) [m], opposite corner.
+        body: [m], distances of the body's rear (negative) and front end ahead of the rear axle, and
+            half of its width.
+        lower: (2,) [m], least coordinates of the map, in which the body's centre must stay.
+        upper: (2,) [m], greatest coordinates of the map.
         end_heading: [rad], final heading; None leaves it free.
         settings: settings of the search.
 
@@ -145,7 +143,6 @@ def hybrid_astar(
 
 
 def _kernels() -> ModuleType:
-    """Import the compiled loops, or raise `MissingExtra` if numba is not installed."""
     try:
         return importlib.import_module("planner_jax.baselines.intercept.hybrid_astar_kernels")
     except ModuleNotFoundError as error:
@@ -155,7 +152,6 @@ def _kernels() -> ModuleType:
 
 
 def _require(start, meeting, lower, upper, curvature, body, end_heading, settings) -> None:
-    """Raise `ArgumentError` if an argument or a setting of `hybrid_astar` is out of its range."""
     points = {"meeting": (meeting, 2), "lower": (lower, 2), "upper": (upper, 2)}
     for name, (value, size) in ({"start": (start, 3)} | points).items():
         is_finite = value.shape == (size,) and np.isfinite(value).all()
@@ -193,7 +189,10 @@ def _sample_arcs(
 
 
 def _chords(heading: np.ndarray, curvature: np.ndarray, length: np.ndarray) -> np.ndarray:
-    """Return the vectors (..., 2) [m] from the start to the end of arcs [rad], [1/m], [m]."""
+    """Return the vectors (..., 2) [m] from the start to the end of arcs.
+
+    An arc has an initial heading [rad], a curvature [1/m] and a length [m].
+    """
     half = 0.5 * curvature * length
     chord = length * np.sinc(half / np.pi)
     return chord[..., None] * np.stack([np.cos(heading + half), np.sin(heading + half)], axis=-1)

@@ -35,7 +35,7 @@ class Scene(NamedTuple):
     middle: float  # [m], distance of the body's centre ahead of the rear axle
     offsets: np.ndarray  # (D,) [m], distances of the discs' centres ahead of the rear axle
     clear: float  # [m], least distance of a disc's centre from a polygon
-    corner: np.ndarray  # (2,) [m], lowest corner of a grid that contains rear axle and all discs
+    corner: np.ndarray  # (2,) [m], least coordinates of a grid that contains rear axle and discs
     shape: tuple[int, int]  # number of cells of this grid along x and y
 
 
@@ -53,25 +53,26 @@ class Rules(NamedTuple):
     cell: float  # [m], side of a cell
     headings: int  # number of heading bins in a full turn
     price: float  # added cost [m] per metre driven at the greatest curvature
-    slack: float  # relative inflation of the heuristic
+    slack: float  # the heuristic is multiplied by 1 + slack
     max_expansions: int  # number of expanded nodes after which the search gives up
 
 
 class _Field(NamedTuple):
     """Distances from the nearest polygon at the nodes of a grid, computed before a search."""
 
-    far: np.ndarray  # (X, Y) [m], distances from the nearest polygon
+    far: np.ndarray  # (X, Y) [m], distance of each node
     corner: np.ndarray  # (2,) [m], position of node (0, 0)
     step: float  # [m], distance between neighbouring nodes
 
 
 class _Primitives(NamedTuple):
-    """The arcs that lead from a node to its neighbours; each turns by a whole number of bins."""
+    """The arcs that lead from a node to its neighbours, sampled at M points."""
 
     reach: float  # [m], length of every arc
-    bins: np.ndarray  # (PRIMITIVES,) int, heading change of each arc in heading bins
-    moves: np.ndarray  # (PRIMITIVES, M, 2) [m], samples in the frame of the start
-    directions: np.ndarray  # (headings, PRIMITIVES, M, 2), cos and sin of the samples' headings
+    bins: np.ndarray  # (PRIMITIVES,) int, heading change of each arc, in heading bins
+    moves: np.ndarray  # (PRIMITIVES, M, 2) [m], samples ahead and to the left of the node
+    # (headings, PRIMITIVES, M, 2), cos and sin of the samples' headings for each node heading.
+    directions: np.ndarray
 
 
 class _Tree(NamedTuple):
@@ -163,7 +164,6 @@ def _is_free(x, y, cos, sin, scene, field):
 
 @njit(cache=True)
 def _is_free_at(pose, scene, field):
-    """Return whether the body at a pose is on the map and collision-free."""
     return _is_free(pose[0], pose[1], math.cos(pose[2]), math.sin(pose[2]), scene, field)
 
 
@@ -178,7 +178,7 @@ def _compute_field(scene, cell):
 
 @njit(cache=True)
 def _list_goal_poses(goal, scene, num):
-    """Return the pose at the goal, (1, 3), or `num` poses (num, 3) if its heading is free."""
+    """Return the goal's pose (1, 3), or `num` poses (num, 3) around it if the heading is free."""
     back = 0.0 if goal.has_heading else scene.middle
     poses = np.empty((1 if goal.has_heading else num, 3))
     for k in range(poses.shape[0]):
@@ -203,7 +203,7 @@ def _is_blocked(start, goal, scene, field):
 
 @njit(cache=True)
 def _compute_primitives(start_heading, rules):
-    """Compute arcs longer than a cell's diagonal, with samples at most half a cell apart."""
+    """Compute the arcs from a node: longer than a cell's diagonal, sampled every half cell."""
     width = TURN / rules.headings
     turns = 2
     while turns * width / rules.curvature <= math.sqrt(2.0) * rules.cell:
@@ -229,13 +229,16 @@ def _compute_primitives(start_heading, rules):
 
 @njit(cache=True)
 def _sinc(x):
-    """Return sin(x) / x, and 1 near x = 0."""
     return math.sin(x) / x if abs(x) > 1e-9 else 1.0
 
 
 @njit(cache=True)
 def _is_free_along(pose, parts, senses, curvature, scene, field):
-    """Return whether a path of three arcs or lines [m] from a pose is collision-free."""
+    """Return whether a path of three parts from a pose is collision-free.
+
+    `parts` (3,) [m] are the lengths of the parts, `senses` (3,) their turning directions: 1 left, 0
+    straight, -1 right.
+    """
     x, y, heading = pose[0], pose[1], pose[2]
     for k in range(3):
         if parts[k] > 0.0:
@@ -253,10 +256,12 @@ def _is_free_along(pose, parts, senses, curvature, scene, field):
 
 @njit(cache=True)
 def _shoot(pose, goal, bound, rules, scene, field, lengths):
-    """Find the cheapest collision-free Dubins path to the goal that costs less than a bound [m].
+    """Find the cheapest collision-free Dubins path to the goal that costs less than `bound` [m].
+
+    The lengths of the paths' parts are written into `lengths` (6, 3) [m].
 
     Returns:
-        The path's row in `lengths` [m], or -1 without such a path, and its cost [m].
+        The path's row in `lengths`, or -1 if there is no path; and the path's cost [m].
     """
     x, y = in_frame(pose, goal, rules.curvature)
     if goal.has_heading:
@@ -310,9 +315,9 @@ def _cell_of(x, y, heading_bin, field, headings):
 
 @njit(cache=True)
 def _is_free_primitive(tree, node, p, primitives, scene, field):
-    """Return whether the body touches nothing along arc `p` of the primitives from a node."""
+    """Return whether the body touches nothing along arc `p` from a node."""
     x, y, k = tree.place[node, 0], tree.place[node, 1], tree.bin[node]
-    # The straight arc keeps the node's heading, so that its first sample has the node's direction.
+    # The node's heading is the heading of the first sample on the straight arc.
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     for m in range(primitives.moves.shape[1]):
         ahead, aside = primitives.moves[p, m]
@@ -325,7 +330,10 @@ def _is_free_primitive(tree, node, p, primitives, scene, field):
 
 @njit(cache=True)
 def _trace_back(tree, node, primitives, lengths, senses, curvature):
-    """Collect curvatures [1/m] and lengths [m] of a path: arcs to a node, then to the goal."""
+    """Return curvatures [1/m] and lengths [m] of a path's parts, from the start to the goal.
+
+    The path leads along arcs to a node, then along three parts with `lengths` and `senses`.
+    """
     count, back = 0, node
     while tree.parent[back] >= 0:
         back = tree.parent[back]
@@ -342,14 +350,13 @@ def _trace_back(tree, node, primitives, lengths, senses, curvature):
 
 @njit(cache=True)
 def _enter(tree, node, parent, primitive, x, y, cost, heading_bin):
-    """Write position, cost, heading bin, parent and arc of a node into the tree."""
     tree.place[node, 0], tree.place[node, 1], tree.place[node, 2] = x, y, cost
     tree.bin[node], tree.parent[node], tree.primitive[node] = heading_bin, parent, primitive
 
 
 @njit(cache=True)
 def _expand(node, num, best_cost, start, goal, scene, rules, field, primitives, tree, heap):
-    """Add a node's neighbours to tree and heap; return how many nodes the tree then has."""
+    """Add a node's neighbours to tree and heap; return the new number of nodes of the tree."""
     x, y, cost, k = tree.place[node, 0], tree.place[node, 1], tree.place[node, 2], tree.bin[node]
     cos, sin = primitives.directions[k, PRIMITIVES // 2, 0]
     last = primitives.moves.shape[1] - 1
@@ -387,14 +394,14 @@ def search(start, goal, scene, rules, node_of):
 
     Args:
         start: (3,) x, y [m] of the rear axle and heading [rad].
-        goal: a `Goal`.
-        scene: a `Scene`.
-        rules: `Rules`.
-        node_of: (cells times heading bins,) int32, zeros, overwritten. The caller allocates the
-            zeros in NumPy, which does not touch the memory; numba would write every zero.
+        goal: goal of the path.
+        scene: obstacles, map and body.
+        rules: settings and limits.
+        node_of: (cells * heading bins,) int32 zeros, overwritten. They are an argument, since NumPy
+            allocates zeros much faster than numba.
 
     Returns:
-        Status (FOUND, NOT_FOUND or BLOCKED), curvatures (P,) [1/m] and lengths (P,) [m] of the
+        Status (FOUND, NOT_FOUND or BLOCKED), curvatures (P,) [1/m] and lengths (P,) [m] of the P
         parts of the path, its cost [m], and the number of expanded nodes.
     """
     none = np.zeros(0)
@@ -421,7 +428,7 @@ def search(start, goal, scene, rules, node_of):
         tree.node[cell] *= -1
         expansions += 1
         wait -= 1
-        if wait <= 0:  # the wait is shorter near the goal, so that shots are more frequent there
+        if wait <= 0:  # near the goal a direct path is tried more often
             row, rest = _shoot(pose, goal, best_cost - cost, rules, scene, field, lengths)
             if row >= 0:
                 best_cost, best_node, best_row = cost + rest, node, row

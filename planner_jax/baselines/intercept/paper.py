@@ -1,9 +1,10 @@
-"""The planner of [Qu2022]: Hybrid A*, gradient descent, dynamic programming, Bezier pieces.
+"""The planner `paper` [Qu2022]: a path by Hybrid A*, then a speed along the path.
 
-The search runs on the host, one case after another; all later steps are one compiled program. If
-the paper does not report a size or a limit, the value of the case is used. The curvature of a
-searched path jumps, and differs from the car's curvature at the start. The car therefore drives a
-path close to the smoothed path whose curvature starts at the case's curvature and has no jumps.
+Hybrid A* runs on the host, one case after another. One compiled program smooths the paths by
+gradient descent, and plans the speeds by dynamic programming and Bezier curves. If the paper does
+not report a limit, the limit of the case is used. The curvature of a searched path jumps, and
+differs from the car's curvature at the start. The car therefore drives a path close to the smoothed
+path, without jumps of the curvature.
 """
 
 import dataclasses
@@ -27,17 +28,15 @@ from planner_jax.task.intercept.plan import InterceptPlan, explain
 from planner_jax.task.intercept.searches import Search
 from planner_jax.task.intercept.terms import ends_of
 
-_PACE = 1.2  # factor on the expected speed that the steering rate limit must still allow
+_PACE = 1.2  # the path must be drivable, within the steering rate limit, at 1.2 times mean speed
 
 
 def paper_speed_step(end_weight: float | None = None) -> SpeedStep:
-    """Return the settings of the speed step of [Qu2022].
-
-    The corridor continues the polygons' edges, and a curve has ten pieces of equal duration.
+    """Return the settings with which [Qu2022] plans the speed along a path.
 
     Args:
-        end_weight: w_2 T^3 / w_1 of a soft end, 300 for the paper's weights and T = 10 s. By
-            default the end is exact.
+        end_weight: weight of the squared distance from the path's end at the meeting time, 300 in
+            the paper for a meeting after 10 s. By default the path's end is reached exactly.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["trapezoid-edges"], end_weight=end_weight)
     return SpeedStep(speed=speed)
@@ -55,7 +54,7 @@ class PaperIntercept(Planner):
     attempts: ClassVar[tuple[Search, ...]] = (Search(1),)  # pyright: ignore[reportIncompatibleMethodOverride]
 
     def solve_on_host(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
-        """Return the plans of a batch: search paths one by one, then plan all speeds compiled."""
+        """Return the plans of a batch: search paths one by one, then plan all speeds together."""
         num = len(np.asarray(cases.time))
         found = [self.search_path(take(cases, k)) for k in range(num)]
         poses, curvatures, length, is_found = (np.stack(each) for each in zip(*found, strict=True))
@@ -135,7 +134,7 @@ def _drive_paths(
     length: Array,
     is_found: Array,
 ) -> InterceptPlan:
-    """Plan a speed along each case's searched path; leaves have a leading axis B, one per case."""
+    """Plan a speed along the searched path of each case; arrays have a leading axis of cases."""
 
     def plan_one(lane: tuple) -> InterceptPlan:
         case, poses, curvatures, length, is_found = lane

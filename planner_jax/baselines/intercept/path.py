@@ -16,8 +16,7 @@ _HIGHEST = lax.Precision.HIGHEST
 class Path:
     """N equally spaced points of a path, or a batch of paths with leading axes.
 
-    A station is a distance along the path from its start. Between two points the curvature is
-    linear in the station.
+    Between two points the curvature is linear in the station, the distance along the path.
     """
 
     pos: Array  # (N, 2) [m], of the rear axle's middle
@@ -26,7 +25,10 @@ class Path:
     length: Array  # () [m]
 
     def curvature_at(self, station: Array) -> Array:
-        """Return the curvature [1/m] of one path at stations (M,) [m]; constant beyond its ends."""
+        """Return the curvature (M,) [1/m] at M stations [m] along one path.
+
+        Before the start and after the end the curvature is constant.
+        """
         stations = jnp.linspace(0.0, 1.0, self.curvature.shape[-1]) * self.length
         return jnp.interp(station, stations, self.curvature)
 
@@ -45,21 +47,21 @@ def path_along(start: Array, length: Array, curvature: Array) -> Path:
 def path_of_drive(
     start: Array, time: Array, speed: Array, curvature: Array, num: int, samples: int = 8
 ) -> Path:
-    """Return the path of a drive whose speed and curvature are linear between equally spaced knots.
+    """Return the path of a drive whose speed and curvature are linear in time between knots.
 
     Args:
         start: (3,) x, y [m], heading [rad].
         time: () [s], duration of the drive.
-        speed: (K + 1,) [m/s], >= 0, at the knots.
+        speed: (K + 1,) [m/s], >= 0, at K + 1 equally spaced times (knots).
         curvature: (K + 1,) [1/m], at the knots.
-        num: N, number of points of the path.
-        samples: number of samples per piece, between which the curvature is linear in the station.
+        num: number of points of the path.
+        samples: number of samples between two knots from which the path is interpolated.
     """
     knots = jnp.arange(speed.shape[0]) * samples
     fine = jnp.arange((speed.shape[0] - 1) * samples + 1)
     v, c = (jnp.interp(fine, knots, each) for each in (speed, curvature))
     step = time / (fine.shape[0] - 1)
-    # Interpolation needs distinct stations. At standstill the station increases by a tiny step.
+    # Interpolation needs increasing stations, so that at standstill a step counts as 1e-6 m.
     moved = jnp.maximum(0.5 * (v[1:] + v[:-1]) * step, 1e-6)
     station = jnp.concatenate([jnp.zeros_like(moved[:1]), jnp.cumsum(moved)])
     even = jnp.linspace(0.0, 1.0, num) * station[-1]
@@ -68,11 +70,11 @@ def path_of_drive(
 
 @dataclasses.dataclass(frozen=True)
 class FollowConfig:
-    """Settings of the fit of a drivable path to given points; static."""
+    """Settings of the fit of a drivable path to given points."""
 
     stride: int = 2  # number of points from one knot of the curvature to the next
     miss: float = 0.01  # [m], distance from a point that adds 1 to the cost
-    rate: float = 1.0  # weight of (curvature rate / limit) in the residuals
+    rate: float = 1.0  # weight of (change of curvature / limit) in the residuals
     slack: float = 0.02  # fraction of every limit that stays unused
     solver: LevenbergConfig = LevenbergConfig(30)
 
@@ -96,13 +98,13 @@ def path_beside(
     Args:
         start: (3,) x, y [m] and heading [rad].
         curvature: () [1/m], at the start.
-        points: (N, 2) [m], at equal distances, the first at the start; N - 1 is a multiple of the
-            stride.
+        points: (N, 2) [m], given points at equal distances, the first at the start; N - 1 is a
+            multiple of `config.stride`.
         curvatures: (N,) [1/m], curvature at the points, the initial guess.
-        length: () [m], of the path.
+        length: () [m], length of the path.
         most: () [1/m], limit of the curvature.
-        rate: () [1/m^2], limit of the curvature's derivative by station.
-        config: weights and sizes.
+        rate: () [1/m^2], limit of the curvature's derivative along the path.
+        config: settings of the fit.
     """
     num = (points.shape[0] - 1) // config.stride
     identity = jnp.eye(num, dtype=points.dtype)
@@ -143,10 +145,10 @@ def path_beside(
 
 
 def nearness(push: Array, miss: float) -> Quadratic:
-    """Return the quadratic model of the squared distance of samples (K, S) from given positions.
+    """Return the quadratic model of the squared distances of samples from given positions.
 
-    `push` (K, S, 2) is half the cost's gradient by the samples' positions. `miss` [m] is the
-    distance that adds 1 to the cost.
+    `push` (K, S, 2) is half of the cost's gradient by the positions of S samples in each of K
+    pieces. `miss` [m] is the distance that adds 1 to the cost.
     """
     num, samples, _ = push.shape
     stiffness = jnp.zeros((4, 4), push.dtype).at[jnp.arange(2), jnp.arange(2)].set(miss**-2)

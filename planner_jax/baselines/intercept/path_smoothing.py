@@ -1,25 +1,22 @@
 """Smoothing of searched paths by gradient descent [Qu2022, Section III-C].
 
-Inner points of the path move, its ends are fixed. The cost (eq. 12) keeps the points away from
+Gradient descent moves the inner points of the path. The cost (eq. 12) keeps them away from
 obstacles (eq. 13), within the curvature limit (eq. 14) and evenly spaced on a line that is as
 straight as possible (eq. 15). The equations as printed do not work. These are the changes:
 
-* J_obs counts only points nearer than d_max, as the paper's text says. Eq. 13 would also attract
-  farther points to that distance.
-* J_cur counts only the excess over kappa_max, squared. Eq. 14 sums the difference itself, which has
-  no minimum. Delta phi is the angle between two displacements; the difference of two arctangents
-  has jumps.
-* alpha_1, alpha_2, alpha_3 of eq. 16 are the single step alpha times the weights of eq. 12, as in
-  the paper's experiments.
-* The unit of length is the mean distance of neighbouring points, which is close to a pixel of the
-  paper's map. The scale of J_cur depends on the unit, and in metres the descent diverges. A step
-  that would increase the cost is halved instead.
+* The obstacle cost counts only points nearer than a distance d_max, as the paper's text says.
+  Eq. 13 would also attract farther points to that distance.
+* The curvature cost is the squared excess of the curvature over its limit. Eq. 14 sums the
+  difference itself, which has no minimum. The change of heading is the angle between two steps of
+  the path; the paper's difference of two arctangents has jumps.
+* The three step sizes of eq. 16 are a single step size times the weights of eq. 12, as in the
+  paper's experiments.
+* The unit of length is the mean distance of neighbouring points, since the paper uses pixels of its
+  map; in metres the descent diverges. A step that would increase the cost is halved.
 * The first two and the last two points are fixed, since the car's heading at the ends is given.
 
-The points are the control points of a cubic B-spline, which has headings and a continuous
-curvature. At a knot the spline's curvature is close to the curvature of three neighbouring points,
-which J_cur limits. No term is a strict limit, so that a smooth path may exceed the curvature limit.
-This often happens if a wall near an end pushes the points next to the fixed points. Points between
+The points are the control points of a cubic B-spline, whose curvature is continuous. A smooth path
+may still exceed the curvature limit, since the limit is only a term of the cost. Points between
 the given and the smooth path are then tried, and at last the given path is returned. A given path
 at the curvature limit leaves no freedom; the caller should search with nine tenths of the limit.
 Positions are in the world frame in the plane, in SI units.
@@ -37,9 +34,9 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.plane.obstacles import Obstacles, distances, separation
 
 _FINE = 8  # number of samples per piece of the spline, for the computation of its length
-# Fractions of the shift from given to smooth points that are tried; at 0 only the spline smooths.
+# Fractions of the shift from given to smooth points that are tried, until a path keeps all limits.
 _SHARES = (1.0, 0.5, 0.25, 0.0)
-# Relative tolerance for rounding, since searched arcs have exactly the greatest curvature.
+# Relative excess over the curvature limit that is allowed, because of rounding errors.
 _CURVATURE_TOLERANCE = 1e-3
 
 
@@ -47,21 +44,21 @@ _CURVATURE_TOLERANCE = 1e-3
 class Smoothing:
     """Weights and step of [Qu2022, Section V-C], and sizes of the compiled program."""
 
-    obstacle: float = 0.1  # weight of J_obs
-    curvature: float = 0.1  # weight of J_cur
-    smoothness: float = 0.2  # weight of the smoothness term
-    step: float = 0.25  # initial step size alpha of gradient descent
-    reach: float = 0.5  # [m], d_max, range of obstacles; not in the paper
+    obstacle: float = 0.1  # weight of the cost of obstacles
+    curvature: float = 0.1  # weight of the cost of curvature above the limit
+    smoothness: float = 0.2  # weight of the squared differences of neighbouring steps
+    step: float = 0.25  # initial step size of gradient descent
+    reach: float = 0.5  # [m], points nearer to an obstacle than this have a cost; not in the paper
     iterations: int = 100  # number of gradient steps
-    stride: int = 4  # number of poses from one moving point to the next
-    margin: float = 0.01  # [m], distance from walls; covers the gaps between poses
+    stride: int = 4  # number of poses of the given path from one moving point to the next
+    margin: float = 0.01  # [m], least distance from walls, since only poses are checked
 
 
 @struct.dataclass
 class SmoothPath:
     """A path with N poses at equal distances, of one case or of a batch."""
 
-    poses: Array  # (N, 3) x, y [m] of the rear axle and heading [rad], not wrapped
+    poses: Array  # (N, 3) x, y [m] of the rear axle, heading [rad] without jumps of 2 pi
     curvature: Array  # (N,) [1/m]
     length: Array  # () [m]
     is_smooth: Array  # () bool; False if the given path is returned unchanged
@@ -83,21 +80,22 @@ def smooth_path(
     """Smooth a path; return it unchanged if every smooth path would break a limit.
 
     A path breaks a limit if it touches a wall, leaves the map, or exceeds the greatest curvature.
-    Pure, for one case; use `vmap` for a batch.
 
     Args:
-        poses: (N, 3) at equal distances, N - 1 a multiple of the stride.
+        poses: (N, 3) x, y [m] and heading [rad], at equal distances; N - 1 is a multiple of
+            `settings.stride`.
         curvatures: (N,) [1/m], curvature at the poses.
-        length: () [m], of the given path.
+        length: () [m], length of the given path.
         walls: standing obstacles.
         curvature: () [1/m], > 0, greatest curvature.
-        body: ends of the body behind and ahead of the rear axle, and half its width [m].
-        lower: (2,) [m], corner of the map, which contains the body's centre.
-        upper: (2,) [m], opposite corner.
-        settings: weights and sizes.
+        body: [m], distances of the body's rear (negative) and front end ahead of the rear axle, and
+            half of its width.
+        lower: (2,) [m], least coordinates of the map, in which the body's centre must stay.
+        upper: (2,) [m], greatest coordinates of the map.
+        settings: weights and numbers of the descent.
 
     Raises:
-        ArgumentError: the number of poses does not fit the stride, or is too small.
+        ArgumentError: N - 1 is not a multiple of the stride, or less than four times the stride.
     """
     pieces, rest = divmod(poses.shape[0] - 1, settings.stride)
     if rest or pieces < 4:
@@ -110,7 +108,10 @@ def smooth_path(
     middle = 0.5 * (body[0] + body[1])
 
     def evaluate(share: Array) -> tuple[Array, Array, Array, Array]:
-        """Return the path at a fraction of the shift to smooth points, and if it keeps limits."""
+        """Return the path at a fraction of the shift to the smooth points, and whether it is valid.
+
+        The path is its poses, curvatures and length.
+        """
         points = given + share * (smooth - given)
         found, bent, total = resample(points, poses[0, 2], poses[-1, 2], poses.shape[0])
         x, y, heading = found.T
@@ -143,10 +144,10 @@ def smooth_points(
     """Return the points (n + 1, 2) [m] after gradient descent on the cost [Qu2022, eq. 16].
 
     Args:
-        points: (n + 1, 2) [m], about equally spaced, such as `control_points`.
+        points: (n + 1, 2) [m], n + 1 nearly equally spaced points, such as `control_points`.
         walls: standing obstacles.
         curvature: () [1/m], greatest curvature.
-        settings: weights and sizes.
+        settings: weights and numbers of the descent.
     """
     unit = _mean_distance(points)
     moves = (np.arange(len(points)) >= 2) & (np.arange(len(points)) < len(points) - 2)
@@ -158,8 +159,8 @@ def smooth_points(
 
     def descend(state: tuple, _: None) -> tuple[tuple, None]:
         points, value, slope, step = state
-        # Steps are in the unit of length. The gradient by units is unit * slope, and a step of one
-        # unit is `unit` metres.
+        # The cost's unit of length is `unit` [m]. The gradient in this unit is unit * slope, and
+        # the step is converted to metres by another factor `unit`.
         moved = points - jnp.where(moves[:, None], step * unit**2 * slope, 0.0)
         new = (moved, *value_and_slope(moved))
         is_lower = new[1] <= value
@@ -178,13 +179,13 @@ def smoothing_cost(
     curvature: Array,
     settings: Smoothing = Smoothing(),
 ) -> Array:
-    """Return J_G of [Qu2022, eq. 12], (), dimensionless; the module's docstring explains its terms.
+    """Return the cost () of a path: obstacles, curvature and smoothness [Qu2022, eq. 12].
 
     Args:
-        points: (n + 1, 2) [m].
-        unit: () [m], unit of length.
+        points: (n + 1, 2) [m], points of the path.
+        unit: () [m], unit of length in which the cost is computed.
         walls: standing obstacles.
-        curvature: () [1/m], kappa_max.
+        curvature: () [1/m], greatest curvature.
         settings: weights, and the range `reach` of obstacles.
     """
     steps = (points[1:] - points[:-1]) / unit
@@ -201,14 +202,14 @@ def smoothing_cost(
 
 
 def control_points(poses: Array, curvatures: Array) -> Array:
-    """Return control points (n + 1, 2) [m] of a B-spline close to poses (n + 1, 3).
+    """Return control points (n + 1, 2) [m] of a cubic B-spline close to n + 1 poses.
 
     A cubic B-spline deviates from a control point by a sixth of the second difference of the points
     around it. Inner points are shifted to compensate for this deviation. The points next to the
     ends are placed so that the spline has the given curvature at its ends.
 
     Args:
-        poses: (n + 1, 3), about equally spaced.
+        poses: (n + 1, 3), x, y [m] and heading [rad], nearly equally spaced.
         curvatures: (n + 1,) [1/m], curvature at the poses.
     """
     points = poses[:, :2]
@@ -232,15 +233,16 @@ def resample(
     The spline starts and ends at the first and last control point, with the given headings.
 
     Args:
-        points: (n + 1, 2) [m], about equally spaced.
+        points: (n + 1, 2) [m], nearly equally spaced control points.
         start_heading: () [rad].
-        end_heading: () [rad], up to a multiple of a full turn.
-        num: N, number of poses.
+        end_heading: () [rad]; full turns make no difference.
+        num: number of poses.
 
     Returns:
-        poses: (N, 3), the first heading is `start_heading`, the others continue it without jumps.
-        curvature: (N,) [1/m].
-        length: () [m].
+        poses: (num, 3), x, y [m] and heading [rad], which starts at `start_heading` and has no
+            jumps.
+        curvature: (num,) [1/m], curvature at the poses.
+        length: () [m], length of the path.
     """
     pieces = points.shape[0] - 1
     control = _clamp_ends(points, start_heading, end_heading)
@@ -263,7 +265,7 @@ def resample(
 
 
 def _clamp_ends(points: Array, start_heading: Array, end_heading: Array) -> Array:
-    """Add a control point beyond each end, (n + 3, 2), for the headings [rad] at both ends.
+    """Add a control point before the first and after the last, for the headings [rad] at both ends.
 
     The first and the last control point are shifted, so that the spline starts and ends at their
     original positions.
@@ -279,15 +281,13 @@ def _clamp_ends(points: Array, start_heading: Array, end_heading: Array) -> Arra
 
 
 def _mean_distance(points: Array) -> Array:
-    """Return the mean distance () [m] between neighbouring points of a path."""
     return jnp.mean(jnp.linalg.norm(points[1:] - points[:-1], axis=1))
 
 
 def _nearest(points: Array, walls: Obstacles) -> Array:
-    """Return the distances (n,) [m] of points from their nearest walls.
+    """Return the distances (n,) [m] of n points from their nearest walls.
 
-    The gradient is the unit vector away from the nearest wall. It is known in closed form, so that
-    the distance itself is not differentiated.
+    The gradient of a distance is the unit vector away from the nearest wall.
     """
     fixed = lax.stop_gradient(points)
     x, y = fixed.T
@@ -302,7 +302,7 @@ def _spline(control: Array, place: Array) -> tuple[Array, Array, Array]:
 
     Args:
         control: (n + 3, 2), control points of the knots -1, 0, ..., n + 1.
-        place: (M,), positions in units of knots, from 0 to n.
+        place: (M,), positions on the spline from 0 to n; knot k is at position k.
     """
     k = jnp.clip(place.astype(jnp.int32), 0, control.shape[0] - 4)
     u = (place - k)[:, None]

@@ -26,7 +26,7 @@ from planner_jax.task.intercept.searches import Search, make_grid
 
 @dataclasses.dataclass(frozen=True)
 class SpeedStep:
-    """Settings of the second step, which plans a speed along a given path; static."""
+    """Settings of the second step, which plans a speed along a given path."""
 
     # The speed planner. With None the car drives at constant speed and ignores moving obstacles.
     speed: SpeedPlanner | None = dataclasses.replace(SPEED_PLANNERS["trapezoid"], pieces=20)
@@ -36,7 +36,7 @@ class SpeedStep:
     checked: int = 2  # number of samples per piece at which obstacle distances are computed
 
     def problem(self, case: InterceptCase, path: Path) -> StationTimeProblem:
-        """Return the problem of reaching a path's end in time, as stations over time."""
+        """Return the problem of reaching a path's end at the case's time, past moving obstacles."""
         return station_time_problem(
             path,
             case.movers,
@@ -49,7 +49,7 @@ class SpeedStep:
         )
 
     def drive(self, case: InterceptCase, path: Path, problem: StationTimeProblem) -> InterceptPlan:
-        """Plan the speed along one path, and return it with the path's curvature as a plan."""
+        """Plan the speed along one path, and return the plan that follows this path."""
         times = jnp.linspace(0.0, 1.0, self.pieces + 1) * case.time
         if self.speed is None:
             station, speed = ramp_and_cruise(problem, times)
@@ -76,11 +76,11 @@ class SpeedStep:
 
 
 def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, Array]:
-    """Return station [m] and speed [m/s] at times (M,) for a short ramp to a constant speed.
+    """Return stations (M,) [m] and speeds (M,) [m/s] at M times: a ramp, then constant speed.
 
-    The ramp has the greatest acceleration a. Its speed change d is chosen so that the car reaches
-    the end of the path at the horizon T if possible: (path length) = v0 T + d T - d |d| / (2 a).
-    [Qu2022] compares with constant speed (Fig. 4) and leaves out the ramp.
+    A station is a distance along the path. During the ramp the car has its greatest acceleration a.
+    The speed changes by d from v0, such that the car reaches the end of the path at the horizon T
+    if possible: (path length) = v0 T + d T - d |d| / (2 a).
     """
     limit, horizon = problem.acceleration_limit, problem.horizon
     missing = problem.end_station - problem.initial_speed * horizon
@@ -96,14 +96,14 @@ def ramp_and_cruise(problem: StationTimeProblem, times: Array) -> tuple[Array, A
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathThenSpeed(Planner):
-    """A planner that reaches the target at the case's time, on the best of several paths."""
+    """A planner that meets the target at the case's time, on the best of several paths."""
 
     case_type: ClassVar[type] = InterceptCase
     is_sequential: ClassVar[bool] = True
     source: PathSource = PathSource()
     step: SpeedStep = SpeedStep()
-    # Number of paths for which a speed is planned; None: all paths. Paths are ranked by the cost of
-    # the line that dynamic programming finds in their station-time graphs.
+    # Number of paths for which a speed is planned; None for all paths. The paths on which dynamic
+    # programming finds a drive with little acceleration are selected.
     tries: int | None = None
     searches: tuple[Search, ...] = (Search(8),)
 
@@ -114,7 +114,7 @@ class PathThenSpeed(Planner):
 
     @property
     def attempts(self) -> tuple[Search, ...]:
-        """The searches; the field `paths` of a search is the number of paths to try."""
+        """The attempts; the field `paths` of an attempt is the number of paths to try."""
         return self.searches
 
     def solve(self, case: InterceptCase, attempt: Search) -> InterceptPlan:
@@ -130,7 +130,10 @@ class PathThenSpeed(Planner):
     def solve_in_layers(
         self, case: InterceptCase, attempt: Search, layers: Array | None
     ) -> InterceptPlan:
-        """Return the plan of one case; `layers` () is the number of time layers of the search."""
+        """Return the plan of one case.
+
+        `layers` () is the number of equal time steps into which the search for paths divides time.
+        """
         found = self.source.paths(case, attempt, layers)
         plan = self.best_drive(case, found)
         reason = jnp.where(found.is_reached, plan.status, Status.NO_PATH)
@@ -152,7 +155,10 @@ class PathThenSpeed(Planner):
         return jax.tree.map(lambda leaf: leaf[best_of(drives)], drives)
 
     def rank_paths(self, problems: StationTimeProblem, violation: Array) -> Array:
-        """Return the indices of the paths (P,), sorted by acceleration, violating paths last."""
+        """Return the indices (P,) of P paths, sorted by the least acceleration that they need.
+
+        Paths that violate a limit come last.
+        """
         grid = (self.step.speed or SPEED_PLANNERS["trapezoid"]).grid
         lines = jax.vmap(lambda problem: reference_line(problem, grid))(problems)
         cost = jnp.where(lines.found, lines.cost, 1e6) + jnp.where(violation > 0.0, 1e3, 0.0)
@@ -162,8 +168,8 @@ class PathThenSpeed(Planner):
 def best_of(plans: InterceptPlan) -> Array:
     """Return the index of the best of several plans of one case.
 
-    The best plan is the solved plan of least cost, or else the plan with the smallest violation. A
-    path without any free line through its station-time graph comes last.
+    The best plan is the solved plan of least cost, or else the plan with the smallest violation.
+    Plans with the status NO_PATH come last.
     """
     cost = jnp.where(is_solved(plans.status), plans.cost - 1e6, plans.violation)
     cost = jnp.where(jnp.isfinite(cost), cost, 1e6)
@@ -176,9 +182,9 @@ def lattice(**fields: object) -> PathThenSpeed:
 
 
 def em(**fields: object) -> PathThenSpeed:
-    """Create the planner `em`: the best path, with the speed step of the EM planner [Fan2018].
+    """Create the planner `em`: the best path, with the speed planner of the EM planner [Fan2018].
 
-    The speed step has the pieces and sample times of `lattice`; `fields` are the planner's options.
+    The speed has as many polynomial pieces as in `lattice`; `fields` are the planner's options.
     """
     speed = dataclasses.replace(SPEED_PLANNERS["em"], pieces=20, samples=5)
     return PathThenSpeed(**{"tries": 1, "step": SpeedStep(speed=speed), **fields})

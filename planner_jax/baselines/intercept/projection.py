@@ -1,12 +1,11 @@
 """Projection of moving obstacles onto a path: quadrangles in the plane of station and time.
 
 A station is a distance along the path. The car's body at a point of the path and a polygon in
-uniform motion overlap during one time interval. The separating axis theorem gives this interval
-exactly: along the normal of each edge, body and polygon cover intervals, and the polygon's interval
-moves uniformly. The time interval is the intersection over all axes. Along the path these time
-intervals form a region. On a curved path the region can have several runs of consecutive points.
-Each run is divided into slabs of equal duration, and a quadrangle covers each slab. [Qu2022,
-Section IV-A] has parallelograms, which is the shape on a straight path.
+uniform motion overlap during one time interval, which follows from the separating axis theorem.
+These intervals of all points form a region in the plane of station and time. On a curved path the
+region may consist of several runs, that is sequences of consecutive points. Each run is divided
+into slabs of equal duration, and a quadrangle covers each slab. [Qu2022, Section IV-A] has
+parallelograms, which is the shape on a straight path.
 """
 
 import dataclasses
@@ -21,18 +20,18 @@ from planner_jax.baselines.intercept.station_time import Blocked, StationTimePro
 from planner_jax.plane.obstacles import Obstacles
 from planner_jax.robot.car import CarBody, CarLimits
 
-# Candidate slopes of a quadrangle's edge, in (height of the slab) / (duration of the slab).
+# Slopes that are tried for the edges of a quadrangle, in units of (range of stations) / (duration).
 _SLOPES = np.linspace(-2.0, 2.0, 17)
-_BEFORE = 0.05  # fraction of the horizon that is projected before its start and after its end
+_BEFORE = 0.05  # fraction of the horizon by which the projected time is extended at both ends
 
 
 @dataclasses.dataclass(frozen=True)
 class Projection:
-    """Numbers of runs and slabs that cover an obstacle's blocked region; its margin; static."""
+    """Settings of the projection: how finely quadrangles cover what an obstacle blocks."""
 
-    runs: int = 2  # runs of consecutive blocked points per obstacle; further runs join the last
-    slabs: int = 4  # number of slabs of equal duration in one run
-    margin: float = 0.01  # [m], distance of the body from obstacles
+    runs: int = 2  # number of sequences of blocked points per obstacle; later ones join the last
+    slabs: int = 4  # number of quadrangles of equal duration for one sequence
+    margin: float = 0.01  # [m], least distance of the body from obstacles
 
 
 def station_time_problem(
@@ -50,13 +49,13 @@ def station_time_problem(
     The car starts without acceleration [Qu2022, Section V-C].
 
     Args:
-        path: path of the rear axle, N points.
+        path: path of the rear axle.
         movers: moving obstacles.
         body: body of the car.
         limits: limits of the car.
         horizon: () [s], when the car must be at the end of the path.
-        speed: () [m/s], at time 0.
-        projection: numbers of runs and slabs, and the margin.
+        speed: () [m/s], speed of the car at time 0.
+        projection: settings of the projection.
         slack: fraction of every limit that stays unused.
     """
     return StationTimeProblem(
@@ -73,14 +72,15 @@ def station_time_problem(
 def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
     """Return the greatest speed between every two neighbouring points of a path, (N - 1,) [m/s].
 
-    It is the least of three limits: the car's speed limit, sqrt(a / |kappa|) for its lateral
-    acceleration [Qu2022, eq. 23], and the speed at which the steering angle changes at its greatest
-    rate.
+    It is the least of three: the car's speed limit; the speed at which the lateral acceleration
+    reaches its limit on this curvature [Qu2022, eq. 23]; and the speed at which the steering angle
+    changes at its greatest rate.
     """
     step = path.length / (path.curvature.shape[0] - 1)
     bend = jnp.maximum(jnp.abs(path.curvature[1:]), jnp.abs(path.curvature[:-1]))
     lateral = jnp.sqrt(limits.lateral_acceleration / jnp.maximum(bend, 1e-6))
-    # d atan(L kappa) / d kappa = L / (1 + L^2 kappa^2) is greatest at the smallest |kappa|.
+    # The steering angle is atan(L kappa) for wheelbase L and curvature kappa. Its derivative by
+    # kappa, L / (1 + L^2 kappa^2), is greatest at the smallest |kappa|.
     before, after = path.curvature[:-1], path.curvature[1:]
     least = jnp.where(before * after > 0.0, jnp.minimum(before**2, after**2), 0.0)
     gain = body.wheelbase / (1.0 + body.wheelbase**2 * least)
@@ -91,7 +91,10 @@ def speed_limits(path: Path, body: CarBody, limits: CarLimits) -> Array:
 def project_obstacles(
     path: Path, movers: Obstacles, body: CarBody, horizon: Array, projection: Projection
 ) -> Blocked:
-    """Return P = M * runs * slabs quadrangles that cover everything that M obstacles block."""
+    """Return the quadrangles that cover everything that M moving obstacles block on a path.
+
+    There are `projection.runs * projection.slabs` quadrangles for each obstacle.
+    """
     half_step = 0.5 * path.length / (path.curvature.shape[0] - 1)
     begin, finish = overlap(path, movers, body, half_step, projection.margin)
     first, last = -_BEFORE * horizon, (1.0 + _BEFORE) * horizon
@@ -115,9 +118,9 @@ def overlap(
 ) -> tuple[Array, Array]:
     """Return when the body overlaps M obstacles at N path points: start and end [s], (M, N) each.
 
-    The body is enlarged by the margin [m]. It is enlarged further so that each interval holds for
-    half a step () [m] of the path before and after its point. Without an overlap the interval
-    starts after its end. For an obstacle at standstill the interval may be infinite.
+    The body is enlarged by `margin` [m], and so far that an interval holds for all points of the
+    path within `half_step` () [m] of its point. Without an overlap the interval starts after its
+    end. For an obstacle at standstill the interval may be infinite.
     """
     turned = half_step * jnp.abs(path.curvature)
     ahead, behind = body.length - body.rear_overhang, body.rear_overhang
@@ -142,7 +145,7 @@ def overlap(
     finish = -begin
 
     def narrow(interval: tuple, x: Array, y: Array, is_axis: Array) -> tuple:
-        """Intersect time intervals (M, N) with the times of overlap along the axes (x, y)."""
+        """Intersect time intervals with the times at which the projections onto an axis overlap."""
         mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
@@ -180,10 +183,10 @@ def _least(values: list[Array]) -> Array:
 def _cover_run(
     own: Array, begin: Array, finish: Array, station: Array, half_step: Array, slabs: int
 ) -> Blocked:
-    """Cover a run, the consecutive blocked points of a path, with quadrangles (slabs,).
+    """Cover what an obstacle blocks on consecutive points of a path with `slabs` quadrangles.
 
-    The run consists of the path points where `own` (N,) bool is True. An obstacle blocks each point
-    from `begin` to `finish` (N,) [s].
+    The points, of N points of the path, are those where `own` (N,) bool is True. The obstacle
+    blocks each point from `begin` to `finish` (N,) [s].
     """
     any_own = jnp.any(own)
     first = jnp.min(jnp.where(own, begin, jnp.inf))

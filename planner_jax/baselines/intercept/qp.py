@@ -2,13 +2,12 @@
 
     minimise x' Q x / 2   subject to   E x = e,   lower <= R x <= upper
 
-with Q, E and R constant; e, lower and upper differ between programs. All work that depends only on
-the matrices is done once, in double precision on the host. The substitution x = base e + Z y with
-Z' Q Z = 1 turns the program into finding the shortest y between pairs of parallel planes. The start
-y = 0 is the optimum without bounds. The dual method of [Goldfarb1983] adds one plane after another
-to its working set. The number of steps is the number of active planes at the optimum, plus two for
-each plane that leaves the working set again. The linear algebra consists of matrix products without
-factorisations, so that a batch of programs is computed as batched products.
+The matrices Q, E and R are constant; e, lower and upper differ between programs. All work that
+depends only on the matrices is done once, in double precision on the host. With the substitution
+x = base e + Z y, where Z' Q Z = 1, the program is to find the shortest vector y between pairs of
+parallel planes. The start y = 0 is the optimum without bounds. The dual method of [Goldfarb1983]
+adds one violated bound (plane) after another to its working set, and drops planes that are no more
+active. Steps are matrix products without factorisations, which a batch computes together.
 """
 
 import dataclasses
@@ -27,34 +26,39 @@ from planner_jax.core.protocol import Status
 
 @struct.dataclass
 class QpTemplate:
-    """The arrays that programs with equal matrices share, computed by `qp_template`."""
+    """The arrays that programs with equal matrices share, computed by `qp_template`.
+
+    A program has n unknowns x = base e + Z y, q equalities E x = e and M bounded rows R x. If the
+    equalities fix a row of R x, its row of `normals` is 0 and its scale 1.
+    """
 
     base: Array | np.ndarray  # (n, q), maps e to the optimum without bounds
     base_cost: Array | np.ndarray  # (q, q), the cost of this optimum is e' base_cost e
-    directions: Array | np.ndarray  # (n, d), Z
+    directions: Array | np.ndarray  # (n, d), the matrix Z, of d free directions
     reach: Array | np.ndarray  # (M, q), maps e to R x at the optimum without bounds
-    normals: Array | np.ndarray  # (M, d), unit rows of R Z; 0 if the equalities fix the row of R x
-    scales: Array | np.ndarray  # (M,), lengths of the rows of R Z; 1 if the equalities fix the row
+    normals: Array | np.ndarray  # (M, d), rows of R Z, divided by their lengths
+    scales: Array | np.ndarray  # (M,), lengths of the rows of R Z
 
 
 @struct.dataclass
 class QpSolution:
     """The solution of one program, or a batch of solutions with a leading axis on every leaf."""
 
-    point: Array  # (n,), x
-    cost: Array  # (), x' Q x / 2
-    multiplier: Array  # (M,), derivative of the cost by a bound: > 0 lower, < 0 upper, 0 inactive
+    point: Array  # (n,), the n unknowns
+    cost: Array  # ()
+    # (M,), derivative of the cost by each bound: > 0 lower, < 0 upper, 0 if neither is active.
+    multiplier: Array
     violation: Array  # (), the largest excess over a bound, relative to 1 + |bound|
-    steps: Array  # () int32, number of planes added and dropped
+    steps: Array  # () int32, number of steps that added or dropped an active bound
     status: Array  # () int32: CONVERGED, INFEASIBLE, MAX_STEPS or NON_FINITE of `Status`
 
 
 @dataclasses.dataclass(frozen=True)
 class QpConfig:
-    """Sizes of the dual method; a program that exceeds them gets the status MAX_STEPS."""
+    """Limits of the dual method; a program that needs more gets the status MAX_STEPS."""
 
-    active: int = 64  # greatest number of active bounds; at most the number d of unknowns
-    max_steps: int = 60
+    active: int = 64  # greatest number of active bounds
+    max_steps: int = 60  # greatest number of steps; a step adds or drops one active bound
 
 
 def qp_template(
@@ -62,13 +66,14 @@ def qp_template(
 ) -> QpTemplate:
     """Compute the arrays that all programs with these matrices share, in double precision.
 
-    A term linear in x can be written as a product with an unknown that an equality fixes to 1.
+    The cost x' Q x / 2 of n unknowns x is minimised. A linear term of the cost can be written as
+    the product with an unknown that an equality fixes to 1.
 
     Args:
-        hessian: (n, n) Q, symmetric, positive definite on the null space of E.
-        equalities: (q, n) E, independent rows.
-        rows: (M, n) R, bounded rows.
-        zeros: (z, n), more rows of equalities, whose right sides are always 0.
+        hessian: (n, n), the matrix Q, symmetric and positive definite where the equalities hold.
+        equalities: (q, n), left sides of q independent equalities.
+        rows: (M, n), matrix whose product with x is bounded.
+        zeros: (z, n), left sides of z more equalities, whose right sides are always 0.
 
     Raises:
         ArgumentError: the equalities are not independent, or the minimum is not unique.
@@ -108,18 +113,21 @@ def qp_template(
 
 @struct.dataclass
 class _Search:
-    """State of the dual method: a point, and the working set of planes for which it is optimal."""
+    """State of the dual method: a point, and its working set of at most A active bounds.
 
-    point: Array  # (d,), y
-    excess: Array  # (M,), distance beyond the nearer plane of each pair, less the tolerance
-    maps: Array  # (d + A, d): projector orthogonal to the working set, and its pseudo-inverse
-    rows: Array  # (A,) int32, planes of the working set
+    The point is optimal if only these bounds count. Each of M bounded rows has two parallel planes.
+    """
+
+    point: Array  # (d,), coordinates of the point along d free directions
+    excess: Array  # (M,), distance beyond the nearer plane of each row, less the tolerance
+    maps: Array  # (d + A, d): projector orthogonal to the active planes, and their pseudo-inverse
+    rows: Array  # (A,) int32, indices of the active rows
     sides: Array  # (A,), 1 for a lower bound, -1 for an upper bound, 0 for an unused entry
-    multipliers: Array  # (A,), Lagrange multipliers of the working set
-    held: Array  # (M,) bool, whether a row is in the working set
-    entering: Array  # () int32, the plane that is being added; -1 if none is selected
-    pressure: Array  # (), multiplier of the entering plane
-    steps: Array  # () int32, number of planes added and dropped
+    multipliers: Array  # (A,), Lagrange multipliers of the active bounds
+    held: Array  # (M,) bool, whether a row is active
+    entering: Array  # () int32, index of the row that is being added; -1 if none is selected
+    pressure: Array  # (), Lagrange multiplier of the row that is being added
+    steps: Array  # () int32, number of bounds added and dropped
     status: Array  # () int32: MAX_STEPS, or INFEASIBLE if no step is possible
     is_stuck: Array  # () bool, whether no step is possible or the working set is full
 
@@ -133,24 +141,23 @@ def solve_qp(
 ) -> QpSolution:
     """Return the optimum of one program; differentiable by the right side and the bounds.
 
-    Derivatives hold the working set fixed. They are exact unless an active bound has a multiplier
-    of zero. In single precision the relative error of the cost is about 1e-6.
+    Derivatives assume that the set of active bounds does not change. In single precision the
+    relative error of the cost is about 1e-6.
 
     Args:
         template: the arrays from `qp_template`.
-        right_side: (q,) e.
-        lower: (M,), -inf for no bound.
-        upper: (M,), inf for no bound.
-        config: sizes of the method.
+        right_side: (q,), right sides of the q equalities.
+        lower: (M,), lower bounds of the M bounded rows, -inf for no bound.
+        upper: (M,), upper bounds, inf for no bound.
+        config: limits of the method.
 
     Returns:
-        The solution, or the best point found if the program has no solution. A row whose value the
-        equalities alone decide also counts in `violation`, and can make the program infeasible.
+        The solution, or the best point found if the program has no solution.
     """
     dtype = lower.dtype
     t: QpTemplate = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), template)
     unbounded = _product(t.reach, right_side)
-    # Bounds on y along unit normals, and their tolerance for rounding.
+    # Bounds on the point along unit normals, and `slack`, their tolerance for rounding errors.
     low, high = (lower - unbounded) / t.scales, (upper - unbounded) / t.scales
     eps = jnp.finfo(dtype).eps
     slack = 16.0 * eps * (1.0 + jnp.where(jnp.isfinite(low), jnp.abs(low), 0.0))
@@ -193,7 +200,7 @@ def solve_qp(
 def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """Run the dual method from the empty working set until the point is optimal or stuck."""
+    """Run the dual method, from no active bounds, until the point is optimal or no step is left."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype
@@ -212,7 +219,8 @@ def _search(
         reached = jnp.sum(normal * s.point)
         side = jnp.where(low[row] - reached > reached - high[row], 1.0, -1.0).astype(dtype)
         gap = jnp.maximum(low[row] - reached, reached - high[row])
-        # Direction of the point while the plane is added, and the rates at which multipliers fall.
+        # Direction in which the point moves while the bound is added, and the rates at which the
+        # multipliers decrease.
         both = _product(s.maps, side * normal)
         move, fall = both[:size], both[size:]
         freedom = jnp.sum(move**2)
@@ -228,7 +236,7 @@ def _search(
         is_stuck = is_hopeless | (is_added & taken[place])
         length = jnp.where(is_stuck, 0.0, length)
 
-        # Adding or dropping a plane changes the maps by an outer product of two vectors.
+        # Adding or dropping a bound changes the matrices by an outer product of two vectors.
         lost = s.maps[size + loser]
         other = jnp.where(is_added, both, _product(s.maps, lost))
         axis = jnp.where(is_added, move, lost)

@@ -1,9 +1,9 @@
 """Speed along a known path: the second half of [Qu2022] (Section IV), and its baselines.
 
-The station is the distance along the path. Dynamic programming finds a line through the graph of
-station over time. A quadratic program then finds the curve of least acceleration that passes every
-blocked polygon on the same side as the line. The planners of this module differ in the bounds that
-they derive from the polygons.
+The station is the distance along the path. In the graph of station over time, moving obstacles
+block polygons. Dynamic programming finds a line between the polygons. A quadratic program then
+finds the curve of least acceleration that passes every polygon on the same side as the line. The
+planners of this module derive different bounds from the polygons.
 """
 
 import dataclasses
@@ -37,10 +37,11 @@ from planner_jax.core.protocol import Plan, Status
 
 @struct.dataclass
 class SpeedPlan(Plan):
-    """The station over time along one path, or a batch of plans with a leading axis on every leaf.
+    """The station (distance along a path) over time; a batch of plans has one more leading axis.
 
-    The cost is [Qu2022, eq. 19] divided by w_1: the integral of the squared acceleration [m^2/s^3],
-    plus the end term if the end is soft. The violation is relative to path length and horizon.
+    The cost is the integral of the squared acceleration [m^2/s^3], plus a weighted squared distance
+    from the end of the path if the planner has an `end_weight` [Qu2022, eq. 19]. The violation is
+    the largest excess over a bound, in units of path length and total time.
     """
 
     curve: BezierCurve  # station [m] as a function of time [s]
@@ -49,27 +50,28 @@ class SpeedPlan(Plan):
 
 @dataclasses.dataclass(frozen=True)
 class SpeedPlanner:
-    """Settings of a speed planner; static under jit.
+    """Settings of a speed planner.
 
     `SPEED_PLANNERS` holds the planners of [Qu2022, Table II] by name.
     """
 
     pieces: int = 10  # number of Bezier pieces of a curve
     degree: int = 5  # degree of the pieces
-    lines: Literal["tilted", "edges", "flat"] = "tilted"  # bounds from polygons, see `corridor`
+    lines: Literal["tilted", "edges", "flat"] = "tilted"  # slope of bounds, see `corridor`
     # With None the bounds apply to the control points of each piece, so that they hold everywhere.
     # With a number they apply to that many samples of each piece, including its end.
     samples: int | None = None
-    margin: float = 1e-3  # [m], distance from polygons
-    # w_2 T^3 / w_1 of a soft end, 300 for the paper's weights and T = 10 s. None: an exact end.
+    margin: float = 1e-3  # [m], least distance from polygons
+    # Weight of the squared distance from the path's end at the end, 300 in the paper for a horizon
+    # of 10 s. With None the curve ends exactly there.
     end_weight: float | None = None
     grid: StationTimeGrid = StationTimeGrid()
     solver: QpConfig = QpConfig()
 
 
-# "tilted" lines are this library's choice, "edges" are the choice of [Qu2022]. "em" is the speed
-# step of [Fan2018]. Its bounds apply to samples, every 0.1 s of a horizon of 10 s, and come from
-# stations that are free for a whole piece.
+# Speed planners by name. "trapezoid" has tilted bounds, which are this library's choice;
+# "trapezoid-edges" has the bounds of [Qu2022]. "rectangle" and "em" use only stations that are free
+# during a whole piece. "em" is the speed planner of [Fan2018], whose bounds apply to samples.
 SPEED_PLANNERS = {
     "trapezoid": SpeedPlanner(),
     "trapezoid-edges": SpeedPlanner(lines="edges"),
@@ -79,10 +81,10 @@ SPEED_PLANNERS = {
 
 
 def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner()) -> SpeedPlan:
-    """Return the station curve of least acceleration [Qu2022, eqs 17-24]; pure, for one problem.
+    """Return the curve of station over time with the least acceleration [Qu2022, eqs 17-24].
 
-    The status is NO_PATH if no line on the grid is collision-free, and INFEASIBLE if no curve fits
-    the bounds around the line.
+    The status is NO_PATH if dynamic programming finds no collision-free line, and INFEASIBLE if no
+    curve keeps the bounds around the line.
     """
     reference = reference_line(problem, planner.grid)
     bounds = speed_bounds(problem, reference, planner)
@@ -104,10 +106,10 @@ def plan_speed(problem: StationTimeProblem, planner: SpeedPlanner = SpeedPlanner
 def speed_matrices(planner: SpeedPlanner) -> dict[str, np.ndarray]:
     """Return the matrices of a planner's quadratic program, the arguments of `qp_template`.
 
-    The matrices are scaled to a path length of 1 and a horizon of 1. The unknowns are the control
-    points of all pieces; a soft end adds the target station as an unknown. The right sides are the
-    initial speed, the initial acceleration and the final station. The bounded rows are stations,
-    then speeds, then accelerations, each at control points or at samples.
+    The path has length 1 and the horizon is 1. The unknowns are the control points of all pieces;
+    with an `end_weight`, also the station at which the curve should end. The right sides of the
+    equalities are initial speed, initial acceleration and final station. The bounded rows are
+    stations, then speeds, then accelerations, each at control points or at samples.
     """
     pieces, degree = planner.pieces, planner.degree
     size = pieces * (degree + 1)
@@ -135,7 +137,10 @@ def speed_template(planner: SpeedPlanner) -> QpTemplate:
 
 
 def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
-    """Return the matrix from a piece's control points to the bounded values of a derivative."""
+    """Return the matrix from a piece's control points to bounded values of a derivative.
+
+    The derivative has the given order: 0 station, 1 speed, 2 acceleration.
+    """
     rows = hodograph(planner.degree, order, planner.pieces)
     if planner.samples is None:
         return rows
@@ -145,9 +150,8 @@ def _rows_of_piece(planner: SpeedPlanner, order: int) -> np.ndarray:
 def _shares(planner: SpeedPlanner) -> np.ndarray:
     """Return the positions in a piece, as fractions from 0 to 1, at which stations are bounded.
 
-    If control points are bounded, the position of control point i of n + 1 is i / n. A curve lies
-    on one side of a straight line if each control point lies on that side of the line's value at
-    the control point's position.
+    If control points are bounded, control point i of a piece of degree n is at i / n. A curve lies
+    above a straight line if each control point lies above the line at its position.
     """
     num = planner.samples or planner.degree
     return np.arange(num + 1) / num
@@ -156,7 +160,7 @@ def _shares(planner: SpeedPlanner) -> np.ndarray:
 def speed_bounds(
     problem: StationTimeProblem, reference: ReferenceLine, planner: SpeedPlanner
 ) -> tuple[Array, Array, Array]:
-    """Return the right sides (3,), lower and upper bounds (M,) of one problem's program.
+    """Return the right sides (3,) of the equalities, and lower and upper bounds (M,) of M rows.
 
     Lengths are in units of the path length, times in units of the horizon. The bounds keep the
     curve on the reference line's side of each polygon.

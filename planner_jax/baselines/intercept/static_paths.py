@@ -2,11 +2,10 @@
 
 The paths are planned by the parts of the planner `spacetime`, for a case without moving obstacles
 and with a target that stands at the meeting point. Random paths are drawn through the reach set,
-the cells that the car can reach at each time. Two paths are compared by the side on which they pass
-each wall. The angle by which a path turns around a wall's centre differs by whole turns between two
-paths if and only if the wall lies between the paths. The paths that differ most are refined by
-least squares, each with its own arrival time; their speeds are then discarded. Some paths are
-longer than necessary on purpose, because moving obstacles may block all short paths.
+the cells that the car can reach at each time. Two paths pass a wall on different sides if they turn
+by different angles around the wall's centre. The paths that differ most are refined by least
+squares, each with its own arrival time; their speeds are then discarded. Some paths are longer than
+necessary on purpose, because moving obstacles may block all short paths.
 """
 
 import dataclasses
@@ -33,10 +32,10 @@ _OTHER_SIDE = 8.0  # [m], added to the distance of two paths that pass a wall on
 
 @struct.dataclass
 class StaticPaths:
-    """P paths of one case, and the largest violation of the refined motion along each path."""
+    """P different paths of one case, each refined by least squares."""
 
     paths: Path  # leaves (P, ...)
-    violation: Array  # (P,), largest relative excess of the refined motion; <= 0 keeps all limits
+    violation: Array  # (P,), largest relative excess over a limit; <= 0 if all limits hold
     is_reached: Array  # () bool, whether a sequence of cells reaches the meeting point in time
     steps: Array  # () int32, greatest number of least-squares steps of any path
 
@@ -44,11 +43,11 @@ class StaticPaths:
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class PathSource:
-    """Settings of the search for several different paths; an `attempt` sets their number."""
+    """Settings of the search for several different paths."""
 
     problem: MotionProblem = MotionProblem()
     drawn: int = 8  # number of random paths per returned path; the most different are refined
-    later: int = 10  # number of arrival times after the earliest over which random paths cycle
+    later: int = 10  # number of arrival times, after the earliest, that random paths have in turn
     points: int = 129  # number of points of a path
 
     def paths(
@@ -56,7 +55,7 @@ class PathSource:
     ) -> StaticPaths:
         """Find several paths of one case; the attempt's field `paths` is their number.
 
-        `layers` is the number of time layers of the reach set; see `search_reach`.
+        `layers` () is the number of equal time steps of the search, see `search_reach`.
         """
         still = without_movers(case)
         found = search_reach(still, attempt, is_time_free=True, layers=layers)
@@ -93,7 +92,7 @@ class PathSource:
     def guess(
         self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
-        """Draw a random path that ends at a time layer; return arrival time [s] and its guess."""
+        """Draw a random path that arrives in time step `layer`; return its time [s] and motion."""
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step
@@ -103,11 +102,11 @@ class PathSource:
     def select_different(
         self, case: InterceptCase, times: Array, guesses: Guess, num: int
     ) -> Array:
-        """Return the indices of the `num` guesses, of D guesses, that differ most.
+        """Return the indices of the `num` motions, of all `guesses`, whose paths differ most.
 
-        The shortest guess comes first. Each next guess is the guess farthest from all selected
-        guesses. The distance of two paths is the mean distance of their points at equal fractions
-        of their lengths, plus a large constant if they pass a wall on different sides.
+        The shortest path comes first. Each next path is the path farthest from all selected paths.
+        The distance of two paths is the mean distance of their points at equal fractions of their
+        lengths, plus a large constant if they pass a wall on different sides.
         """
         goal = case.target.at(case.time).pos
 
@@ -150,12 +149,15 @@ def without_movers(case: InterceptCase) -> InterceptCase:
 
 
 def count_turns(walls: Obstacles, start: Array, pos: Array, goal: Array) -> Array:
-    """Count the turns of a path around every wall's centre, relative to the straight line, (N,).
+    """Count the full turns of a path around every wall's centre, (N,) int32.
+
+    The straight line from start to goal has 0 turns. Paths with different numbers pass the wall on
+    different sides.
 
     Args:
         walls: N walls.
         start: (2,) [m], start of the path.
-        pos: (M, 2) [m], points of the path, so close that no step jumps past a wall's centre.
+        pos: (M, 2) [m], M points of the path, close to each other.
         goal: (2,) [m], end of the path.
     """
     points = jnp.concatenate([start[None], pos, goal[None]])[:, None] - walls.centre[None]

@@ -1,9 +1,9 @@
 """The station-time graph of a path: which stations are blocked when, and lines through the graph.
 
 A car follows a path of known length; its station is the distance travelled along the path.
-Obstacles that cross the path block stations for some time: polygons in the plane of time and
-station [Qu2022, Section IV-A]. This module contains the problem, dynamic programming on a grid (eq.
-17), and corridors of trapezoids beside the line that dynamic programming finds (eq. 22).
+Obstacles that cross the path block stations for some time, that is polygons in the plane of time
+and station [Qu2022, Section IV-A]. This module contains the problem, dynamic programming on a grid,
+which finds a line between the polygons (eq. 17), and bounds beside this line (eq. 22).
 """
 
 import dataclasses
@@ -17,10 +17,10 @@ from jax import Array, lax
 
 @struct.dataclass
 class Blocked:
-    """Up to P quadrangles in the plane of time and station, each between two vertical sides.
+    """Up to P quadrangles in the plane of time and station that obstacles block.
 
-    Quadrangles with parallel edges are the parallelograms of [Qu2022]. An obstacle that blocks a
-    curved path takes several quadrangles.
+    A quadrangle has vertical sides at two times. An obstacle has several quadrangles if the path is
+    curved.
     """
 
     start: Array  # (P,) [s], time of the left side
@@ -60,11 +60,7 @@ class StationTimeProblem:
 
 @dataclasses.dataclass(frozen=True)
 class StationTimeGrid:
-    """Size of the dynamic programming grid: speeds are multiples of (station step) / (time step).
-
-    From start to end a line rises by `stations / steps` station steps a time step on average. It
-    rises by at most `jumps` station steps in one time step.
-    """
+    """Size of the grid of dynamic programming: path and horizon are divided into equal steps."""
 
     stations: int = 60  # number of station steps
     steps: int = 20  # number of time steps
@@ -73,9 +69,9 @@ class StationTimeGrid:
 
 @struct.dataclass
 class ReferenceLine:
-    """The line that dynamic programming finds: straight edges between equally spaced times."""
+    """The line that dynamic programming finds in the plane of time and station."""
 
-    station: Array  # (N + 1,) [m], at times 0, T / N, ..., T
+    station: Array  # (N + 1,) [m], at equally spaced times from 0 to the horizon
     cost: Array  # () [m^2/s^3], sum of (change of speed)^2 / (time step)
     found: Array  # () bool; if False, the stations are the line of constant speed
 
@@ -83,18 +79,18 @@ class ReferenceLine:
 def reference_line(
     problem: StationTimeProblem, grid: StationTimeGrid = StationTimeGrid()
 ) -> ReferenceLine:
-    """Return the line of least acceleration through the free part of the graph [Qu2022, eq. 17].
+    """Return the line of least acceleration between the blocked polygons [Qu2022, eq. 17].
 
-    A state of the search is a station at a time, together with the edge that leads to this station.
-    The cost of an edge can then include the squared change of speed from the previous edge. The
-    stations themselves have no cost. An edge that enters a polygon along its length is forbidden.
+    A state of the search is a station at a time, together with the edge that leads to this station,
+    so that the squared change of speed between two edges is a cost. An edge that enters a polygon
+    is forbidden.
     """
     num, steps, jumps = grid.stations, grid.steps, range(grid.jumps + 1)
     station_step, step = problem.end_station / num, problem.horizon / steps
     speed = jnp.arange(grid.jumps + 1) * (station_step / step)
 
     def charge(before: Array) -> Array:
-        """Return the cost (J + 1, ...) of changing from speeds (...) to each speed of the grid."""
+        """Return the costs of changing from speeds `before` to each speed of the grid."""
         change = (jnp.expand_dims(speed, range(1, 1 + before.ndim)) - before[None]) / step
         is_allowed = jnp.abs(change) <= problem.acceleration_limit * (1.0 + 1e-5)
         return jnp.where(is_allowed, change**2 * step, jnp.inf)
@@ -103,7 +99,10 @@ def reference_line(
     penalty = jnp.where(_find_forbidden_edges(problem, grid), jnp.inf, 0.0)  # (N, J + 1, S + 1)
 
     def shift_to_end(leaving: Array) -> Array:
-        """Shift costs (J + 1, S + 1) from the stations where edges start to where they end."""
+        """Index the costs of edges by the stations where they end, not where they start.
+
+        `leaving` has one row per speed and one column per station.
+        """
         padded = jnp.pad(leaving, ((0, 0), (grid.jumps, 0)), constant_values=jnp.inf)
         return jnp.stack([padded[k, grid.jumps - k : grid.jumps - k + num + 1] for k in jumps])
 
@@ -140,9 +139,9 @@ def reference_line(
 
 
 def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) -> Array:
-    """Return which edges of the grid are forbidden, (N, J + 1, S + 1) bool.
+    """Return which edges of the grid are forbidden, as a mask with three axes.
 
-    Edges are indexed by time step, jump (number of station steps), and the station of their end.
+    The axes are the time step of the edge, its rise in station steps, and the station of its end.
     """
     num, steps = grid.stations, grid.steps
     station_step, step = problem.end_station / num, problem.horizon / steps
@@ -165,7 +164,7 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
     below, above = jnp.where(is_shared, below, jnp.inf), jnp.where(is_shared, above, -jnp.inf)
     is_met = (station > below[..., None]) & (station < above[..., None])
 
-    # The least speed limit on the grid's station cells that an edge passes.
+    # Least speed limit on the part of the path along which an edge leads.
     limit = jnp.min(
         problem.speed_limit[_parts_of_cells(num, problem.speed_limit.shape[-1])], axis=1
     )
@@ -178,10 +177,10 @@ def _find_forbidden_edges(problem: StationTimeProblem, grid: StationTimeGrid) ->
 
 
 def _parts_of_cells(num: int, parts: int) -> np.ndarray:
-    """Return the path parts that each station cell overlaps, (num, W).
+    """Return the indices of the parts of the path that each cell overlaps, one row per cell.
 
-    The path is divided into `num` equal cells, and also into `parts` equal parts. A row repeats its
-    last part where a cell overlaps fewer than W parts.
+    The path is divided into `num` equal cells, and also into `parts` equal parts. Rows are filled
+    with their last index.
     """
     cell = np.arange(num)
     first, last = cell * parts // num, -(-(cell + 1) * parts // num) - 1
@@ -190,9 +189,10 @@ def _parts_of_cells(num: int, parts: int) -> np.ndarray:
 
 
 def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
-    """Return whether a line (N + 1,) [m] at equally spaced times passes above each polygon, (P,).
+    """Return whether a line passes above each of P polygons, (P,) bool.
 
-    Above a polygon means that the car passes before the obstacle.
+    Above a polygon means that the car passes before the obstacle. The line has the stations
+    `station` (N + 1,) [m] at equally spaced times.
     """
     blocked = problem.blocked
     begin, finish = (jnp.clip(time, 0.0, problem.horizon) for time in (blocked.start, blocked.end))
@@ -203,31 +203,33 @@ def is_passed_above(problem: StationTimeProblem, station: Array) -> Array:
 
 
 def stations_at_joints(station: Array, pieces: int) -> Array:
-    """Interpolate a line (N + 1,) [m] at the ends of K equal pieces of time, (K + 1,) [m]."""
+    """Interpolate the stations of a line at the ends of K = `pieces` equal time intervals.
+
+    The given and returned stations, (N + 1,) and (K + 1,) [m], are at equally spaced times.
+    """
     times = jnp.linspace(0.0, 1.0, station.shape[-1])
     return jnp.interp(jnp.linspace(0.0, 1.0, pieces + 1), times, station)
 
 
 @struct.dataclass
 class Corridor:
-    """Bounds on a station curve in each of K equal pieces of the horizon, around a line.
+    """Bounds on a curve of station over time, in each of K equal time intervals (pieces).
 
-    A curve within the bounds enters no polygon. If the curve also keeps the speeds of its pieces,
-    it keeps the speed limit of every part of the path. Each polygon contributes one line in each
-    piece, at an infinite station if the polygon does not overlap the piece. The lines and the two
-    vertical sides of the piece bound trapezoids.
+    A curve within the bounds enters none of P polygons. If it also keeps `speed`, it keeps the
+    speed limit of every part of the path. Each polygon is a straight lower or upper bound in each
+    piece. A bound is infinite if the polygon does not overlap the piece.
     """
 
-    lower: Array  # (K, P) [m], lines to stay above, at the start of the piece
-    lower_rise: Array  # (K, P) [m], rise of these lines over the piece
-    upper: Array  # (K, P) [m], lines to stay below, at the start of the piece
-    upper_rise: Array  # (K, P) [m], rise of these lines over the piece
+    lower: Array  # (K, P) [m], lower bounds at the start of the piece
+    lower_rise: Array  # (K, P) [m], rise of the lower bounds over the piece
+    upper: Array  # (K, P) [m], upper bounds at the start of the piece
+    upper_rise: Array  # (K, P) [m], rise of the upper bounds over the piece
     floor: Array  # (K,) [m], below it the path has a lower speed limit than the piece
     ceiling: Array  # (K,) [m], above it the path has a lower speed limit than the piece
     speed: Array  # (K,) [m/s], greatest speed in the piece
 
     def bounds(self, shares: Array) -> tuple[Array, Array]:
-        """Return least and greatest stations (K, S) [m] at fractions (S,) of every piece."""
+        """Return least and greatest stations (K, S) [m] at S positions: fractions of each piece."""
         passed = shares[None, :, None]
         lower = self.lower[:, None] + passed * self.lower_rise[:, None]
         upper = self.upper[:, None] + passed * self.upper_rise[:, None]
@@ -243,19 +245,19 @@ def corridor(
     pieces: int,
     lines: Literal["tilted", "edges", "flat"] = "tilted",
 ) -> Corridor:
-    """Return the corridor around a line that enters no polygon [Qu2022, Section IV-C].
+    """Return bounds around a line that enters no polygon [Qu2022, Section IV-C].
 
-    A piece that a polygon covers completely is bounded by the polygon's edge. If a polygon starts
-    or ends within the piece, any line through the polygon's corner is a valid bound. The paper
-    continues the edge, which excludes much free space. A line parallel to the curve would exclude
-    least. The curve is not known yet, but the slope of the reference line is close to its slope.
+    Time is divided into equal pieces. If a polygon covers the whole duration of a piece, the
+    polygon's edge is the bound. If a polygon starts or ends within the piece, the bound is a line
+    through the polygon's corner. The paper continues the edge, which excludes much free space. A
+    bound with the slope of the reference line ("tilted") excludes less.
 
     Args:
         problem: one problem.
         station: (N + 1,) [m], the line, at equally spaced times from 0 to the horizon.
-        pieces: K, number of pieces.
-        lines: slope of the bounds: "tilted", of the reference line where that is valid; "edges", of
-            the polygon's edge; "flat", 0, so that trapezoids are rectangles.
+        pieces: number of pieces.
+        lines: slope of the bounds: "tilted", of the line where this is valid; "edges", of the
+            polygon's edge; "flat", 0.
     """
     blocked = problem.blocked
     length = problem.horizon / pieces
@@ -272,14 +274,14 @@ def corridor(
     at_begin, at_end = blocked.start[None] <= start, blocked.end[None] >= start + length
 
     def line(edge: tuple[Array, Array], side: float) -> tuple[Array, Array]:
-        """Return start and rise [m] of bounds above (side 1) or below (side -1) polygon edges."""
+        """Return bounds above (side 1) or below (side -1) polygon edges: start and rise [m]."""
         own = (edge[1] - edge[0]) / duration
         if lines == "edges":
             chosen = own
         elif lines == "flat":
             chosen = jnp.zeros_like(own)
         else:
-            # If the edge reaches one end of the piece, the line may only turn away from the edge.
+            # If the edge reaches one end of the piece, the bound may only turn away from the edge.
             turned = side * slope[:, None]
             turned = jnp.where(at_begin, jnp.minimum(turned, side * own), turned)
             turned = jnp.where(at_end, jnp.maximum(turned, side * own), turned)
@@ -302,10 +304,11 @@ def corridor(
 
 
 def _speed_limits(problem: StationTimeProblem, joints: Array) -> tuple[Array, Array, Array]:
-    """Return least station, greatest station and greatest speed (K,) of every piece.
+    """Return least station, greatest station and greatest speed in each of K time intervals.
 
-    The speed is the least limit on the parts of the path that the line, at stations `joints`
-    (K + 1,), passes in the piece. The two stations exclude parts with a lower limit.
+    The speed is the least limit on the parts of the path that the reference line passes in the
+    interval. The two stations exclude parts with a lower limit. `joints` (K + 1,) [m] are the
+    line's stations at the ends of the intervals.
     """
     limit = problem.speed_limit
     edge = jnp.linspace(0.0, 1.0, limit.shape[-1] + 1)[None] * problem.end_station

@@ -2,8 +2,8 @@
 
 Each joint is a double integrator with a velocity limit v and an acceleration limit a. The quickest
 motion by an angle d from an initial rate u accelerates towards the goal, coasts at v if v is
-reached, and brakes. Every other joint than the slowest joint coasts at a lower rate, so that all
-joints arrive together. With the coasting rate p and the duration T,
+reached, and brakes. The joint that needs the longest time T moves in this manner. All other joints
+coast at a lower rate p, which solves the next equation, so that all joints arrive together:
 
     d = (u + p) |p - u| / 2a  +  p (T - |p - u| / a - p / a)  +  p^2 / 2a.
 """
@@ -19,7 +19,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 class _MirroredJoints:
     """Joints whose signs are flipped so that each joint brakes from a rate >= 0."""
 
-    side: Array  # (J,), 1 or -1, the sign
+    side: Array  # (J,), the sign of each of J joints: -1 if it is flipped, else 1
     turn: Array  # (J,) [rad], angle to the goal
     rate: Array  # (J,) [rad/s], rate at the start
 
@@ -39,10 +39,10 @@ def least_times(turn: Array, rate: Array, velocity: Array, acceleration: Array) 
     """Return the shortest time (J,) [s] in which each joint turns by an angle and stops.
 
     Args:
-        turn: (J,) [rad], angle by which each joint turns.
-        rate: (J,) [rad/s], rate at the start, within the limit.
-        velocity: (J,) [rad/s], > 0, limit.
-        acceleration: (J,) [rad/s^2], > 0, limit.
+        turn: (J,) [rad], angle by which each of J joints turns.
+        rate: (J,) [rad/s], rates at the start, within the limits.
+        velocity: (J,) [rad/s], > 0, limits of the rates.
+        acceleration: (J,) [rad/s^2], > 0, limits of the accelerations.
     """
     joints = _mirror(turn, rate, acceleration)
     peak = _root(acceleration * joints.turn + 0.5 * joints.rate**2)
@@ -58,14 +58,15 @@ def bang_bang(
     """Return the motion in which all joints arrive together after `duration`, and stand still.
 
     Args:
-        start: (J,) [rad], angles at the start.
+        start: (J,) [rad], angles of J joints at the start.
         rate: (J,) [rad/s], rates at the start.
         turn: (J,) [rad], angle by which each joint turns.
         duration: () [s], at least the greatest of `least_times`, so that rates keep their limits.
         acceleration: (J,) [rad/s^2], > 0, with which the joints accelerate and brake.
 
     Returns:
-        2 J + 1 pieces of degree 2 with knots where joints start or end coasting; some may last 0 s.
+        2 J + 1 polynomial pieces of degree 2. A new piece starts when a joint starts or ends
+        coasting; pieces may last 0 s.
     """
     joints = _mirror(turn, rate, acceleration)
     u, d, a = joints.rate, joints.turn, acceleration

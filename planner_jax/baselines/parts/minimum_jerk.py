@@ -9,14 +9,15 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> PiecewisePolynomial:
     """Return the quintic that minimises the integral of |jerk|^2 between two states.
 
-    The coefficients are [Yu2023bat, eqs 16-17]. The differences in eq. 17 are taken relative to the
-    state after coasting without jerk, such as Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2. The
-    equation as printed holds only if the motion starts from hovering.
+    The coefficients are [Yu2023bat, eqs 16-17]. As printed, eq. 17 holds only if the motion starts
+    from hovering: its Delta p is the end position minus the start position. Here the motion at
+    constant initial acceleration is subtracted too: Delta p = p_T - p_0 - v_0 T - a_0 T^2 / 2, with
+    position p, velocity v, acceleration a, and duration T; and similarly Delta v and Delta a.
 
     Args:
         head_state: (3, 3) position, velocity, acceleration at the start.
         tail_state: (3, 3) position, velocity, acceleration at the end.
-        duration: () T [s], > 0.
+        duration: () [s], > 0.
 
     Returns:
         One piece of degree 5.
@@ -36,17 +37,17 @@ def minimum_jerk(head_state: Array, tail_state: Array, duration: Array) -> Piece
 def minimum_jerk_after_ramp(
     head_state: Array, tail_state: Array, duration: Array, ease: float
 ) -> PiecewisePolynomial:
-    """Return a minimum-jerk primitive after a linear ramp to its initial jerk.
+    """Return a minimum-jerk polynomial after a ramp that brings the jerk to its initial jerk.
 
-    The primitive alone starts with a jerk that a hovering quadrotor does not have, so that its body
-    rate would jump. Here the jerk first changes linearly from its initial value to the initial jerk
-    J of the primitive, which starts where the ramp ends. J solves J = (initial jerk of the
-    primitive after a ramp to J), which is affine in J.
+    A minimum-jerk polynomial alone starts with a jerk that a hovering quadrotor does not have, so
+    that the body rate would jump. Here the jerk first changes linearly from the jerk of
+    `head_state` to a value J during `ease`. The polynomial starts where this ramp ends. J is
+    computed such that J equals the initial jerk of the polynomial; this is a linear equation.
 
     Args:
         head_state: (4, 3) position, velocity, acceleration, jerk at the start.
         tail_state: (3, 3) position, velocity, acceleration at the end.
-        duration: () [s] > 0, of ramp and primitive together.
+        duration: () [s] > 0, of ramp and polynomial together.
         ease: [s] > 0, duration of the ramp, but at most half of `duration`.
 
     Returns:
@@ -69,8 +70,8 @@ def minimum_jerk_after_ramp(
         return 6.0 * primitive(jerk).coeffs[0, 3]
 
     constant = first_jerk(jnp.zeros_like(j0))
-    # The slope of `first_jerk` is needed in closed form. Finite differences would lose it in
-    # rounding, since both of their jerks are about a thousand times as large as the difference.
+    # Derivative of `first_jerk` in closed form. Finite differences would have large rounding
+    # errors, since the two jerks are about a thousand times as large as their difference.
     share = t / (duration - t)
     slope = -share * (4.5 + share * (6.0 + 2.5 * share))
     jerk = constant / (1.0 - slope)

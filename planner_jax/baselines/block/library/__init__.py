@@ -1,4 +1,5 @@
-"""A library of stored arm motions, one for each pair of box cells that a ball passes.
+"""A library of stored arm motions that block balls [Natarajan2024, Algorithm 1].
 
-The method is [Natarajan2024, Algorithm 1].
+Two boxes around the arm are divided into cells. A motion is stored for each pair of an outer and an
+inner cell that a ball can pass.
 """

@@ -1,13 +1,12 @@
 """The planner that warps stored motions to a given ball, for better blocks than a pure lookup.
 
-A stored motion ends where the nominal ball of its pair of cells passes; a pair is one cell of the
-outer and one cell of the inner box. This planner takes the motions of the pairs around the given
-ball's own pair, and warps each until it ends where the given ball passes. A warp adds a turn times
-a fixed profile in time to the motion. The turn is the new end pose, by inverse kinematics on the
-branch of the stored end pose, minus the stored end pose. Stored motion and warp are steps of
-`planner_jax.task.block.motion`, so that limits at knots stay exact. A warped motion takes all the
-available time. Motions with the smallest warp are evaluated first. If no warped motion is
-collision-free, the warped motions are the initial guesses of the least squares of `OnlineBlock`.
+A ball passes a pair of cells: one cell of the outer and one cell of the inner box around the arm. A
+stored motion ends where a nominal ball of its pair passes. This planner takes the motions stored
+for the cells around the given ball, and warps each until it ends where the given ball passes. A
+warp changes all joint angles by a profile in time, such that the end pose becomes a pose that meets
+the ball (by inverse kinematics). A warped motion lasts until the ball arrives. Motions with the
+smallest warp are evaluated first. If no warped motion is collision-free, the warped motions are the
+initial guesses of the least squares of `OnlineBlock`.
 """
 
 import dataclasses
@@ -41,22 +40,23 @@ _HIGHEST = lax.Precision.HIGHEST
 # Weights of the squared joint changes. The wrist joints have low weights, since they carry little
 # mass; the flange joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-_AWAY = 0.02  # [rad^2], penalty per squared distance, in cells, of the motion from the ball
+# [rad^2], penalty of the squared distance between the motion's cells and the ball, in cell sizes.
+_AWAY = 0.02
 _LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
-_NEAR = 30.0  # [rad^2/m], penalty per metre by which a sample misses the pole margin
+_NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is too small
 
 
 @dataclasses.dataclass(frozen=True)
 class Effort(Attempt):
-    """An attempt: how many stored motions are warped, checked and refined; static."""
+    """An attempt: how many stored motions are warped, checked and refined by least squares."""
 
     neighbours: int = 8  # number of stored motions that are warped, up to 16
     points: int = 6  # number of points of the ball's trajectory to which each motion is warped
     screened: int = 8  # number of warped motions whose distances from the pole are computed
-    samples: int = 12  # number of samples of a motion for its distance from the pole
-    checks: int = 1  # greatest number of motions that are checked closely, least penalty first
-    checked: int = 48  # number of samples of a motion that is checked closely
-    refined: int = 0  # greatest number of least-squares refinements
+    samples: int = 12  # number of samples of a motion at which its distance from the pole is tested
+    checks: int = 1  # greatest number of motions checked for all collisions, least penalty first
+    checked: int = 48  # number of samples of a motion in this check
+    refined: int = 0  # greatest number of motions that are refined by least squares
     solver: LevenbergConfig = LevenbergConfig(
         *(12, 1e-2, 0.25, 6.0), settled=1, tolerance=1.0, trial=4, hope=500.0, fade=0.7
     )
@@ -66,9 +66,10 @@ class Effort(Attempt):
 class Warped:
     """C warped motions, sorted by penalty, the smallest penalty first."""
 
-    points: Array  # (C, 6 K + 1), vectors of unknowns of `OnlineBlock`
+    # (C, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then contact time [s].
+    points: Array
     penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a stored motion
-    is_open: Array  # (C,) bool, whether limits hold at knots and the pole margin at a few samples
+    is_open: Array  # (C,) bool, whether joint limits and the distance from the pole hold
 
 
 @struct.dataclass
@@ -76,9 +77,9 @@ class AdaptBlock(Planner):
     """A planner that meets the ball with a warped stored motion; the cost is its duration [s].
 
     Arm, limits and scene must equal the library's, and the arm must stand at one of the library's
-    homes (start poses). Otherwise the status is BLOCKED, and `check` reports the reason on the
-    host. The status is OUT_OF_REACH for a ball that does not pass through both boxes, and
-    INFEASIBLE if no motion was found.
+    start poses. Otherwise the status is BLOCKED, and the method `check` raises an error. The status
+    is OUT_OF_REACH for a ball that does not pass through both boxes, and INFEASIBLE if no motion
+    was found.
     """
 
     stored: LibraryBlock
@@ -96,7 +97,7 @@ class AdaptBlock(Planner):
 
     @property
     def attempts(self) -> tuple[Effort, ...]:
-        """The attempts: a quick one, then a longer one for the unsolved cases."""
+        """The attempts: a quick search, then a longer search for the unsolved cases."""
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
@@ -104,7 +105,7 @@ class AdaptBlock(Planner):
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:
-        """Return the plan of one case: the first warped motion that passes the close check."""
+        """Return the plan of one case: the first warped motion that is collision-free."""
         flight = flight_of(case)
         home, fits = self.stored.home_of(case)
         poses = end_poses(case, flight, attempt.points, self.online.pieces)
@@ -130,7 +131,7 @@ class AdaptBlock(Planner):
     def warp(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
     ) -> Warped:
-        """Warp the stored motions that start at `home` to end poses along the ball's trajectory."""
+        """Warp motions stored for start pose `home` to end poses along the ball's trajectory."""
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
@@ -173,12 +174,13 @@ class AdaptBlock(Planner):
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Return up to `num` motions stored for the cells around the cells that the ball passes.
+        """Return N = `num` motions stored for the cells around the cells that the ball passes.
 
         Returns:
-            steps: (N, K, 6) [rad], steps of the motions; zero if no motion is stored.
-            away: (N,), squared distance in cells from the ball's crossings to the centres of the
-                motion's two cells, summed.
+            steps: (N, K, 6) [rad], rates of the joints at K knots of the motion, times its
+                duration; zero if no motion is stored.
+            away: (N,), sum of the squared distances between the ball and the centres of the
+                motion's two cells, in cell sizes.
             found: (N,) bool, whether a motion is stored.
         """
         table = self.stored.library.table
@@ -201,9 +203,9 @@ class AdaptBlock(Planner):
         return jnp.where(found[:, None, None], row.steps, 0.0), -away, found
 
     def pole_shortfall(self, case: BlockCase, moves: Array, samples: int) -> Array:
-        """Return by how much motions (C, K, 6) come too close to the pole, (C,) [m].
+        """Return the required minus the least distance from the pole, (C,) [m], for C motions.
 
-        The value is the pole margin minus the least distance, so that <= 0 keeps the margin.
+        `moves` (C, K, 6) [rad] has the joints' rates at K knots, times the duration.
         """
         shares = tuple(np.arange(1, samples + 1) / samples)
         rest = jnp.zeros_like(case.angles)
@@ -218,8 +220,8 @@ def adapt_planner(file: str | os.PathLike) -> AdaptBlock:
     The table is read completely and stored on the default device.
 
     Raises:
-        ArgumentError: the file is not a complete library, or its motions do not have as many
-            pieces as the motions of `OnlineBlock`.
+        ArgumentError: the file is not a complete library, or its motions have another number of
+            pieces than the motions of `OnlineBlock`.
     """
     library, own = load_library(file), OnlineBlock().pieces
     if (pieces := pieces_of(library.table.rows)) != own:

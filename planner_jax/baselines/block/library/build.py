@@ -46,11 +46,11 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.motion import angles_at
 from planner_jax.task.block.scene import Scene
 
-# Indices of the learned starts, which are initial guesses of the least squares. A build tries
-# `STARTS` for pairs of cells that have a motion already, and all starts for pairs without one. A
-# repair starts from the old motion, which is mostly as good, and from one learned start.
+# Indices of stored initial guesses (starts) of the least squares. A build tries `STARTS` for pairs
+# of cells that have a motion already, and all stored guesses for pairs without a motion. A repair
+# starts from the old motion and from `REPAIR_STARTS`.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
-_WORTH = 0.03  # [s], least possible gain that justifies a search for a better motion
+_WORTH = 0.03  # [s], least possible gain of the ball's entry time for which a search is made
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
 
@@ -59,24 +59,26 @@ class Portions:
     """How many pairs of cells are planned at a time on a CPU or on a GPU."""
 
     pairs: int  # number of pairs that are planned and written to disk as one part
-    lanes: tuple[int, int]  # batch sizes per device, small and large, of one planner call
-    # Number of starts of a pair in one call. One start at a time saves work, since the search stops
-    # at the first success. A GPU plans many starts at once, which hardly takes longer there.
+    lanes: tuple[int, int]  # small and large batch size of one planner call, for each device
+    # Number of initial guesses of a pair in one call. A single guess saves work on a CPU, since the
+    # search stops at the first success. A GPU plans from many guesses in nearly the same time.
     starts: int
 
 
 _ON_CPU = Portions(256, (16, 16), 1)
 _ON_GPU = Portions(32768, (512, 8192), 16)
-_FEW = 6  # number of small calls that take about as long as one large call
+_FEW = 6  # number of planner calls of the small size that take as long as one of the large size
 
 
 @dataclasses.dataclass(frozen=True)
 class _Motions:
     """The best motions found so far for P pairs of cells."""
 
-    point: np.ndarray  # (P, 6 K + 1), unknowns of `OnlineBlock`: steps and duration
-    entry: np.ndarray  # (P,) [s], earliest entry of the ball; infinite without a motion
-    quickest: np.ndarray  # (P,) [s], entry time that the quickest motion would allow
+    # (P, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
+    point: np.ndarray
+    # (P,) [s], earliest entry of a ball into the outer box; infinite without a motion.
+    entry: np.ndarray
+    quickest: np.ndarray  # (P,) [s], entry time if no obstacle delayed the motion
 
 
 def build(
@@ -96,12 +98,12 @@ def build(
     Args:
         path: path of the library file.
         setting: arm, limits and scene, with NumPy leaves.
-        homes: (H, 6) [rad], one or more poses at which motions start.
+        homes: (H, 6) [rad], joint angles of one or more poses at which motions start.
         layout: the division of both boxes into cells.
         progress: show a progress bar on the standard error stream.
 
     Raises:
-        ArgumentError: the arm touches something at a home.
+        ArgumentError: the arm touches something at a start pose.
         OSError: the file or the folder cannot be written.
     """
     homes = np.atleast_2d(np.asarray(homes, np.float32))
@@ -142,12 +144,12 @@ def repair(
         progress: show a progress bar on the standard error stream.
 
     Returns:
-        The library with NumPy leaves, and which motions were planned again, (H, P) bool. All other
-        motions are unchanged, bit for bit.
+        The library with NumPy leaves, and which motions from H start poses for P pairs of cells
+        were planned again, (H, P) bool. All other motions are unchanged, bit for bit.
 
     Raises:
         ArgumentError: a box of the scene differs from the library's, or the arm touches something
-            at a home.
+            at a start pose.
     """
     table, setting = library.table, with_scene(library, scene).setting
     _require_free(setting, table.homes)
@@ -171,12 +173,11 @@ def repair(
 
 
 def portions() -> Portions:
-    """Return how many pairs of cells are planned at a time on this process's devices."""
+    """Return how many pairs of cells are planned at a time, on a CPU or on a GPU."""
     return _ON_CPU if jax.default_backend() == "cpu" else _ON_GPU
 
 
 def _require_free(setting: Setting, homes: ArrayLike) -> None:
-    """Raise `ArgumentError` if the arm touches something at a home, where motions start."""
     for k, home in enumerate(np.asarray(homes)):
         near = float(_nearest(setting, home[None, None])[0])
         shown = f"{near:.3g} m to the nearest obstacle at home {k}"
@@ -190,19 +191,21 @@ def plan_pairs(
     pairs: np.ndarray,
     old: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Plan motions from one home for N pairs of cells; return their table rows (N, 6 K + 10).
+    """Plan motions from one start pose for N pairs of cells; return rows of the library's table.
 
-    Straight joint motions are tried first. The least squares of `BentPair` then start from one
-    learned start after another, for pairs of cells that have no motion or might get a motion that
-    allows an earlier entry of the ball. If a pair still has no motion, both steps are repeated with
-    a coarse tolerance.
+    Motions with all joints in proportion are tried first. For pairs without a motion, or whose ball
+    might enter earlier, the least squares of `BentPair` then start from one initial guess after
+    another. If a pair still has no motion, both steps are repeated with a coarse tolerance.
 
     Args:
         setting: arm, limits and scene, with NumPy leaves.
-        home: (6,) [rad], where motions start.
-        tunnel: tunnels of all pairs.
+        home: (6,) [rad], joint angles at which motions start.
+        tunnel: tunnels (spaces between the two cells) of all pairs.
         pairs: (N,), numbers of the pairs to plan for.
-        old: (N, 6 K + 10), the pairs' rows in another scene, used as additional starts.
+        old: (N, W), the pairs' rows of W numbers in another scene, used as initial guesses.
+
+    Returns:
+        (N, W), rows as of `pack_rows`.
     """
     straight = StraightPair(setting, host_leaf(home))
     bent = BentPair(setting, host_leaf(home))
@@ -255,25 +258,25 @@ def plan_pairs(
 
 
 def _groups(starts: Sequence[int]) -> list[Sequence[int]]:
-    """Split the indices of learned starts (initial guesses) into groups, one planner call each."""
+    """Split indices of initial guesses into groups; one planner call tries one group."""
     num = portions().starts
     return [starts[begin : begin + num] for begin in range(0, len(starts), num)]
 
 
 def _plan_batch(planner: PairPlanner, cases: PairCase) -> PairPlan:
-    """Plan a batch in calls of only two sizes, so that only two programs are compiled."""
+    """Plan a batch in calls of two sizes (small, large), so that two programs are compiled."""
     num, devices = len(cases.best), jax.local_device_count()
     few, many = portions().lanes
     lanes = few if num <= _FEW * few * devices else many
     whole = -(-num // (lanes * devices)) * lanes * devices
-    # The last case pads the batch; on a CPU the padding is not solved.
+    # Copies of the last case pad the batch; on a CPU they are not solved.
     filled = jax.tree.map(lambda leaf: leaf[np.minimum(np.arange(whole), num - 1)], cases)
     plans = plan(planner, filled, chunk=lanes)
     return jax.tree.map(lambda leaf: leaf[:num], plans)
 
 
 def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
-    """Convert the best motions to table rows; a row without a motion has an infinite duration."""
+    """Convert motions to rows of the library's table; durations are infinite without a motion."""
     stored = np.isfinite(found.entry)
     pieces = planner.online.pieces
     steps = found.point[:, :-1].reshape(-1, pieces, 6).copy()
@@ -307,7 +310,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which stored motions keep the planner's margin from obstacles, (N,) bool."""
+    """Return which of N stored motions keep the least distance from obstacles, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
@@ -316,26 +319,30 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
     near = [
         _nearest_on_motion(setting, home, some, shares) for some in _in_parts(np.asarray(steps))
     ]
-    # The margin has a tolerance of 1e-5 m for rounding.
+    # Distances may be 1e-5 m less than the margin, because of rounding errors.
     return np.concatenate(near)[: len(rows)] >= online.margin - 1e-5
 
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Return the least distance from obstacles along each of N motions (N, K, 6), (N,) [m]."""
+    """Return the least distance from obstacles along each of N motions, (N,) [m].
+
+    `steps` (N, K, 6) [rad] are joint rates at K knots times the duration, and `shares` the sample
+    times as fractions of the duration.
+    """
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 
 
 @jax.jit
 def _nearest(setting: Setting, angles: Array) -> Array:
-    """Return the least distance from obstacles over S poses (N, S, 6) each, (N,) [m]."""
+    """Return the arm's least distance from obstacles over S poses, for N sequences, (N,) [m]."""
     flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
     return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
 
 
 def _empty_rows(homes: int, layout: Layout, planner: PairPlanner) -> np.ndarray:
-    """Return rows for all homes and pairs of cells, each marked as being without a motion."""
+    """Return the rows of a table without motions; `homes` is the number of start poses."""
     pieces = planner.online.pieces
     rows = np.zeros((homes, layout.num_pairs, 6 * pieces + 10), np.float32)
     rows[..., 6 * pieces] = np.inf
@@ -348,7 +355,7 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    """The planned parts of an unfinished library on disk, one file per part, written atomically."""
+    """The files of an unfinished library; each holds the motions of some pairs of cells."""
 
     def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
         self._folder = folder
@@ -357,7 +364,7 @@ class _Parts:
             "fingerprint": fingerprint(setting),
             "homes": homes.tolist(),
             "layout": dataclasses.asdict(layout),
-            "device": jax.default_backend(),  # the number of pairs in a part depends on the device
+            "device": jax.default_backend(),  # determines the number of pairs in a file
         }
         text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"

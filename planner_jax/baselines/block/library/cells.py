@@ -1,11 +1,11 @@
 """Cells on the faces of the two boxes around the arm, tunnels between cells, and their coverage.
 
 A ball passes one cell of the outer box and then one cell of the inner box. The two cells are a
-pair, with the number `outer * num_inner + inner`, and the space between them is a tunnel.
-[Natarajan2024, Section IV-C] calls the boxes domes. The paper specifies neither the number of cells
-nor the faces that have cells; `LAYOUTS` has the layouts of this library. Cells are numbered face by
-face, and on a face by its two axes in the order x, y, z, the last axis fastest. All positions are
-in the robot's base frame, z up, in SI units.
+pair, with the number `outer * num_inner + inner` from the numbers of the two cells. The space
+between the cells is a tunnel. [Natarajan2024, Section IV-C] calls the boxes domes. The paper
+specifies neither the number of cells nor the faces that have cells; `LAYOUTS` has the layouts of
+this library. Cells are numbered face by face. All positions are in the robot's base frame, z up, in
+SI units.
 """
 
 import dataclasses
@@ -20,13 +20,13 @@ from planner_jax.ball.flight import BallState
 from planner_jax.robot.arm import product
 from planner_jax.task.block.scene import Box
 
-SPEED = 8.0  # [m/s], speed of the nominal balls, each of which represents one tunnel
+SPEED = 8.0  # [m/s], speed of the ball that stands for all balls through one pair of cells
 GRAVITY = 9.81  # [m/s^2]
 
 
 @dataclasses.dataclass(frozen=True)
 class Face:
-    """A face of a box that is divided into equal rectangular cells; static."""
+    """A face of a box that is divided into equal rectangular cells."""
 
     axis: int  # axis of the face's normal: 0 x, 1 y, 2 z
     side: int  # 1 if the normal points along the axis, -1 if against it
@@ -51,7 +51,7 @@ class Face:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """The faces of both boxes that have cells; static."""
+    """The faces of the outer and of the inner box that have cells."""
 
     outer: tuple[Face, ...]
     inner: tuple[Face, ...]
@@ -68,20 +68,19 @@ class Layout:
 
     @property
     def num_pairs(self) -> int:
-        """The number of pairs of an outer and an inner cell, with pairs that no ball can pass."""
+        """The number of pairs of an outer and an inner cell, even if no ball can pass the pair."""
         return self.num_outer * self.num_inner
 
 
 def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
-    """Return faces by names such as "+x +y", each with the same number of cells."""
     return tuple(
         Face("xyz".index(name[1]), 1 if name[0] == "+" else -1, cells) for name in names.split()
     )
 
 
-# The authors of [Natarajan2024] plan for 5,760 pairs of cells (a constant of their code). The
-# layouts A, B and C have this number of pairs. D has cells on all sides that balls from ahead can
-# reach. The default "full" also has cells on the top of the outer box, for lobbed balls.
+# Divisions of the two boxes into cells. A, B and C have 5,760 pairs of cells, as the code of
+# [Natarajan2024]. D has cells on all sides that balls from ahead can reach. The default "full" also
+# has cells on the top of the outer box, for lobbed balls.
 LAYOUTS = {
     "full": Layout(_faces("+x +y -y +z", (8, 8)), _faces("+x +y -y", (4, 7))),
     "A": Layout(_faces("+x +y -y", (8, 8)), _faces("+x +z", (3, 5))),
@@ -92,16 +91,15 @@ LAYOUTS = {
 
 
 def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[Array, Array]:
-    """Return the cell that contains a point of a box's surface, in closed form.
+    """Return the cell that contains a point of a box's surface.
 
-    The point belongs to the face towards which it is farthest from the box's centre, relative to
-    the size of the box. On an edge, where two of these fractions are equal, it belongs to the face
-    of the first axis. A point between two cells belongs to the cell with the greater coordinate.
+    A point on an edge of the box belongs to the face whose normal is the first axis. A point on the
+    border of two cells belongs to the cell with the greater coordinate.
 
     Args:
         faces: faces that have cells.
-        box: the whole box.
-        point: three numbers () [m]; rounding may move the point off the surface.
+        box: the box.
+        point: three coordinates () [m]; rounding errors may move the point off the surface.
 
     Returns:
         cell: () int32, number of the cell; 0 if the face has no cells.
@@ -126,16 +124,16 @@ def cell_of(faces: tuple[Face, ...], box: Box, point: Sequence[Array]) -> tuple[
 def cells_around(
     faces: tuple[Face, ...], box: Box, point: Sequence[Array]
 ) -> tuple[Array, Array, Array]:
-    """Return the cells nearest to a point of a box's surface, up to two in each direction.
+    """Return the four cells whose centres are nearest to a point of a box's surface.
 
     Args:
         faces: faces that have cells.
-        box: the whole box.
-        point: three numbers () [m]; `cell_of` selects the face of the point.
+        box: the box.
+        point: three coordinates () [m] of a point on the surface.
 
     Returns:
         cells: (4,) int32, numbers of the cells; repeated if a face has one cell in a direction.
-        away: (4,), squared distances from the point to the cells' centres, in units of cells.
+        away: (4,), squared distances from the point to the cells' centres; a cell has size 1.
         found: () bool, whether the face has cells.
     """
     own, found = cell_of(faces, box, point)
@@ -159,7 +157,7 @@ def cells_around(
 
 @struct.dataclass
 class Tunnels:
-    """The tunnels between the two cells of each of P pairs, with NumPy float64 leaves."""
+    """The spaces (tunnels) between the two cells of each of P pairs; NumPy, float64."""
 
     outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
@@ -168,12 +166,11 @@ class Tunnels:
 
 
 def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
-    """Return the tunnels, which are the spaces between outer and inner cells that balls pass.
+    """Return the tunnel of every pair of cells: the space between an outer and an inner cell.
 
-    A ball reaches an inner cell only from in front of that cell's face. The outer cell is therefore
-    cut off at the plane of this face, and a rectangle remains. Since both boxes are convex, every
-    straight line from the rectangle to the inner cell stays outside the inner box. If nothing
-    remains of the outer cell, the pair is infeasible: in the paper its tunnel "snaps to zero".
+    A ball reaches an inner cell only from in front of that cell's face. The part of the outer cell
+    behind the plane of this face is therefore cut off. If nothing remains of the outer cell, no
+    ball can pass the pair.
     """
     from_outer, _ = _corners(layout.outer, outer)
     to_inner, of_face = _corners(layout.inner, inner)
@@ -197,7 +194,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
 
 def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Return lowest and highest corners (N, 2, 3) [m] of all cells, and their faces' indices."""
+    """Return lowest and highest corners (N, 2, 3) [m] of N cells, and indices of their faces."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     found, of_face = [], []
     for place, face in enumerate(faces):
@@ -214,15 +211,15 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return the nominal ball that represents a tunnel: it flies from cell centre to cell centre.
+    """Return a ball that flies from the centre of an outer cell to the centre of an inner cell.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.
-        inner: (2, 3) [m], corners of the inner cell.
+        inner: (2, 3) [m], corners of the inner cell, lowest and highest.
 
     Returns:
         ball: state of the ball as it enters the outer box.
-        span: () [s], time from the outer to the inner box, for `SPEED` along a straight line.
+        span: () [s], time from the outer to the inner box: their distance divided by `SPEED`.
     """
     begin = jnp.mean(outer, axis=0)
     path = jnp.mean(inner, axis=0) - begin
@@ -232,13 +229,11 @@ def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
 
 
 def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array) -> Array:
-    """Return how far from a shield's centre the balls of a tunnel cross the shield's plane at most.
+    """Return the largest distance from a shield's centre at which balls cross the shield's plane.
 
-    Consider all straight lines from one rectangle to another, and a plane between the rectangles.
-    The crossings lie in the convex hull of the crossings of the corner-to-corner lines. The reason:
-    for one fixed end, the crossing is a projection of the other end, and projections keep convex
-    sets convex. Balls are assumed to be as far above these straight lines as the nominal ball is
-    above its own line.
+    The balls fly from one rectangle (cell) to another. They cross the plane within the convex hull
+    of the crossings of all straight lines from corner to corner. A ball's height above its straight
+    line is taken from the nominal ball, which flies between the rectangles' centres.
 
     Args:
         outer: (2, 3) [m], corners of an axis-aligned rectangle, lowest and highest.
@@ -247,8 +242,8 @@ def farthest_crossing(outer: Array, inner: Array, middle: Array, rotation: Array
         rotation: (3, 3), orientation of the shield: its normal and its edges are the columns.
 
     Returns:
-        () [m], the maximum over both edge directions of the shield; infinite if the plane is not
-        between the rectangles. A shield whose half edge is longer blocks the whole tunnel.
+        () [m], measured along the edges of the shield; infinite if the plane is not between the
+        rectangles. A shield blocks all balls if half of its edge is longer.
     """
     ball, span = nominal_ball(outer, inner)
     path = jnp.mean(inner, axis=0) - ball.pos

@@ -45,11 +45,12 @@ def build_library(
 
     Args:
         path: path of the library file.
-        layout: a key of `LAYOUTS`, which divides the two boxes into cells.
-        regime: a key of `REGIMES`, which sets the joint limits.
+        layout: a key of `LAYOUTS`, the division of the two boxes around the arm into cells.
+        regime: a key of `REGIMES`, the joint limits, and whether motions end at standstill.
         pole: whether the scene contains the pole.
         arm: path of an MJCF file; by default the IRB 1600.
-        home: joint angles [rad] at which motions start, six for each home; by default the arm's.
+        home: joint angles [rad] at which motions start, six for each start pose; by default one
+            start pose of the arm.
 
     Raises:
         ArgumentError: an argument breaks a rule.
@@ -85,7 +86,10 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print how many pairs of cells have a motion, and draw a map of them at the path `map`."""
+    """Print for which share of the pairs of cells a library has motions.
+
+    With a path `map`, also draw the shares on the faces of both boxes.
+    """
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -95,7 +99,7 @@ def show_library(path: str, *, map: str | None = None) -> None:
 
 
 def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
-    """Let the referee judge stored motions for random balls, `num` balls for each home."""
+    """Let the referee judge stored motions for random balls, `num` balls for each start pose."""
     require_size("num", num)
     require_seed(seed)
     require_memory("num", num, _CASE_BYTES)
@@ -115,7 +119,11 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan again the motions that touch a pole moved to (x, y) [m], and write a new library."""
+    """Plan the motions again that touch a pole at the new position `pole` (x, y) [m].
+
+    The new library is written to `out`. With `retry`, pairs of cells without a motion are planned
+    again, too.
+    """
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")
     require(bool(np.isfinite(pole).all()), "pole", "finite", list(pole))
@@ -134,7 +142,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
-    """Print a library's layout, size, limits, scene and coverage."""
+    """Print a library's cells, size, joint limits, pole, and share of pairs with a motion."""
     table, setting = library.table, library.setting
     faces = [
         " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)
@@ -169,7 +177,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw each face that has cells, coloured by the fraction of feasible pairs with a motion."""
+    """Draw each cell's share of pairs with a motion, among its pairs that a ball can pass."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)
@@ -204,7 +212,6 @@ def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
 
 
 def _ends(face: Face, box: Box) -> tuple[float, float, float, float]:
-    """Return the ends [m] of a face along its two axes: left, right, bottom, top."""
     (left, bottom), (right, top) = (
         (float(side[face.across[0]]), float(side[face.across[1]]))
         for side in (box.lower, box.upper)

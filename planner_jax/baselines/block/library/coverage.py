@@ -1,4 +1,8 @@
-"""Coverage of a library: which pairs of cells have a motion; a check of motions by the referee."""
+"""Coverage of a library of motions, and a check of its motions by the referee.
+
+A ball passes a cell of the outer and a cell of the inner box around the arm; these cells are a
+pair. Coverage is the share of pairs with a stored motion. The referee checks plans independently.
+"""
 
 import dataclasses
 
@@ -20,26 +24,27 @@ from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
 _SPEEDS = (7.0, 10.0)  # [m/s], range of the random balls' mean speed between the two boxes
-# [s], how much longer than the stored motion a random ball takes to reach the outer box.
+# [s], time between the end of the stored motion and the entry of a random ball into the outer box.
 _SPARE = 2e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Properties of all P pairs of cells; arrays (H, P) bool have one row per home."""
+    """Which of P pairs of an outer and an inner cell have stored motions from H start poses."""
 
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
     is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
     found: np.ndarray  # (H, P) bool, whether a motion is stored
-    is_sure: np.ndarray  # (H, P) bool, whether the stored shield pose blocks the whole tunnel
+    # (H, P) bool, whether the shield at the end of the motion blocks all balls through both cells.
+    is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction of the pairs selected by `of` (P,) that have a motion, (H,)."""
+        """Return the fraction (H,) of the pairs in the mask `of` (P,) that have a motion."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
 def coverage(library: Library) -> Coverage:
-    """Compute for which pairs of cells a library has motions, and which block whole tunnels."""
+    """Compute which pairs of cells have motions, and which motions block all balls of a pair."""
     scene, found = library.setting.scene, library.found
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
@@ -56,7 +61,7 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return `farthest_crossing` for the stored shield poses of every home and pair, (H, P) [m]."""
+    """Return `farthest_crossing` of the shield for H start poses and P pairs, (H, P) [m]."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
@@ -68,25 +73,28 @@ def _farthest(outer: Array, inner: Array, row: Row) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Check:
-    """Random balls through cells with a stored motion, which leave just enough time for it."""
+    """B random balls through cells with a stored motion, and the referee's verdict."""
 
     cases: BlockCase
-    pairs: np.ndarray  # (B,) int, number of the pair of cells of each ball
+    pairs: np.ndarray  # (B,) int, index of the pair of cells that each ball passes
     claimed: np.ndarray  # (B,) bool, whether the planner reports that the ball is blocked
     verdict: BlockVerdict
 
 
 def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
-    """Let the referee judge stored motions against random balls through their tunnels.
+    """Let the referee judge whether stored motions block random balls.
+
+    Each ball passes a random pair of cells with a stored motion, and leaves just enough time for
+    this motion.
 
     Args:
         library: the library, with NumPy leaves.
         num: number of balls. Pairs are drawn without replacement until all have been drawn.
         seed: seed of the pairs and of the balls.
-        home: index of the home at which the arm starts.
+        home: index of the library's start pose at which the arm waits.
 
     Raises:
-        ArgumentError: no motion is stored from that home.
+        ArgumentError: no motion is stored from this start pose.
     """
     stored = np.flatnonzero(library.found[home])
     if not stored.size:
@@ -106,7 +114,7 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
 def _throw_balls(
     library: Library, tunnel: Tunnels, pairs: np.ndarray, rng: np.random.Generator, home: int
 ) -> BlockCase:
-    """Return cases with balls from random points of outer cells to random points of inner cells."""
+    """Return cases of balls from random points of outer cells to random points of inner cells."""
     num, setting = len(pairs), library.setting
     ends = []
     for corners in (tunnel.outer[pairs], tunnel.inner[pairs]):
@@ -142,6 +150,6 @@ def _throw_balls(
 
 @jax.jit
 def _move_back(balls: BallState, times: Array) -> BallState:
-    """Return the states of B balls traced back in time by times (B,) [s], without drag."""
+    """Return the states that B balls without drag had `times` (B,) [s] earlier."""
     gravity = jnp.asarray(GRAVITY, times.dtype)
     return jax.vmap(drag_free_flight, (0, 0, None))(balls, -times, gravity)

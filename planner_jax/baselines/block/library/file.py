@@ -4,9 +4,9 @@
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
 The second line is JSON. It holds a hash of arm and scene, the faces of both boxes and their cells,
-the links of the arm's capsules, the file's size, and type, shape and offset of every array by name.
-Blanks pad the second line to the first array. Arrays are little-endian, in C order, and start at
-multiples of 64 bytes.
+the links to which the arm's collision capsules belong, the file's size, and type, shape and offset
+of every array by name. Blanks pad the second line to the first array. Arrays are little-endian, in
+C order, and start at multiples of 64 bytes.
 """
 
 import dataclasses
@@ -30,10 +30,10 @@ from planner_jax.core.plan_files import UNREADABLE, build_tree, leaves_by_name
 from planner_jax.host.files import open_plain, replacing
 
 VERSION = 1
-# Version of the planning method. A build does not continue from parts of another version.
+# Version of the planning method. An interrupted build continues only with the same version.
 BUILD_VERSION = 1
 _MAGIC = "planner-jax block library"
-_ALIGNED, _LONGEST = 64, 1 << 20  # [bytes], alignment of arrays, longest header line
+_ALIGNED, _LONGEST = 64, 1 << 20  # [bytes], alignment of arrays; longest line of the header
 
 
 def save_library(path: str | os.PathLike, library: Library) -> None:
@@ -70,7 +70,7 @@ def save_library(path: str | os.PathLike, library: Library) -> None:
 
 
 def load_library(path: str | os.PathLike) -> Library:
-    """Load a library that `save_library` wrote; its table is memory-mapped and read on access.
+    """Load a library that `save_library` wrote; its motions are memory-mapped, and read when used.
 
     Raises:
         ArgumentError: the file is missing, truncated, of another version, or not a library.
@@ -130,7 +130,6 @@ def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
 
 
 def _to_stored(leaf: ArrayLike) -> np.ndarray:
-    """Convert an array of a setting to the file's type: float32, bool or int32."""
     value = np.ascontiguousarray(leaf)
     return value.astype({"f": "<f4", "b": "|b1"}.get(value.dtype.kind, "<i4")).reshape(
         np.shape(leaf)

@@ -1,11 +1,10 @@
 """Motions of the arm that block the balls of one pair of cells [Natarajan2024, Algorithm 1].
 
-A pair is one cell of the outer and one cell of the inner box that a ball passes. `build` calls
-these planners for every pair. The paper plans to equidistant points of the centreline between the
-two cells and stores the plan of least time. Here a nominal ball flies from cell centre to cell
-centre, and the selected motion is the motion that allows the earliest entry of this ball into the
-outer box. A pose farther inside gives the arm more time. For an infinitely fast ball this criterion
-equals the paper's least time.
+A pair is one cell of the outer and one cell of the inner box around the arm that a ball passes.
+`build` calls these planners for every pair. The paper plans to equidistant points of the line
+between the two cells' centres, and stores the motion of least duration. Here a ball flies from
+centre to centre, and the planners store the motion that still arrives in time if this ball enters
+the outer box as early as possible. Early means a short time after the start of the motion.
 """
 
 import dataclasses
@@ -38,29 +37,31 @@ from planner_jax.task.block.default_planner import OnlineBlock, read_learned_sta
 from planner_jax.task.block.end_poses import EndPoses, Flight, face_ball, frame_of, profile_peaks
 from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 
-# Tolerances of a stored shield pose relative to the nominal ball, [m] and [rad]. The paper allows
-# "a small tolerance". The coarse tolerance is used if no pose is within the fine tolerance, since a
-# shield that blocks a part of the tunnel is better than no shield.
+# Greatest distance [m] between ball and shield centre, and greatest angle [rad] between ball
+# direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps
+# FINE, since a shield that blocks some balls of a pair of cells is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], how much later than for the quickest motion without obstacles a ball's entry may be.
+# [s], greatest entry time of a ball minus the entry time for the quickest motion without obstacles.
 _PATIENCE = 0.8
-_ROLL = np.deg2rad(1.0)  # [rad], greatest roll of a shield that must block a whole tunnel
+# [rad], greatest angle of the shield's edge from horizontal, if it must block all balls of a pair.
+_ROLL = np.deg2rad(1.0)
 _TOUCHING = 10.0  # [s], added to the entry times of poses that collide, so that they come last
 # Least distance of a shield from both cells, as a fraction of the distance between the cells, for
-# fine and coarse tolerances. In an oblique tunnel a closer shield plane would cut the cell.
+# the tolerances FINE and COARSE.
 _NEAREST = (0.1, 0.02)
 
 
 @struct.dataclass
 class PairCase:
-    """A pair of cells to plan for, and an initial guess."""
+    """A pair of an outer and an inner cell to plan a motion for, and an initial guess."""
 
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
-    is_coarse: Array  # () bool, whether blocking a part of the tunnel suffices
+    is_coarse: Array  # () bool, whether blocking some balls of the pair suffices
     best: Array  # () [s], earliest entry time found so far; infinite without a motion
-    start: Array  # () int32, index of a learned start; with -1 the search starts from `given`
-    given: Array  # (6 K + 1,), steps and duration of a motion that may collide
+    start: Array  # () int32, index of a stored initial guess; with -1 the guess is `given`
+    # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
+    given: Array
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -70,9 +71,13 @@ class PairCase:
 
 @struct.dataclass
 class PairPlan(Plan):
-    """A motion to a shield pose; the cost is the earliest entry time [s] of the ball."""
+    """A motion that blocks a ball; its cost is the earliest time [s] at which the ball may enter.
 
-    point: Array  # (6 K + 1,), unknowns of `OnlineBlock`: steps and duration of the motion
+    The time counts from the start of the motion to the ball's entry into the outer box.
+    """
+
+    # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
+    point: Array
     quickest: Array  # () [s], entry time that the quickest motion without obstacles allows
 
 
@@ -80,9 +85,8 @@ class PairPlan(Plan):
 class PairPlanner(Planner):
     """Base class of both planners for pairs of cells: arm, scene, and where motions start.
 
-    One edge of the shield is horizontal, like an edge of every cell on an upright face. A square
-    shield can be rolled by quarter turns without a difference; of these four rolls the planner
-    takes the roll nearest to the arm's roll at its home.
+    The shield ends with a horizontal edge. Quarter turns of a square shield make no difference; the
+    planner selects the one that turns the last joint least from the start pose `home`.
     """
 
     setting: Setting
@@ -94,7 +98,10 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return case and flight of a ball through both cells' centres that enters at `entry`."""
+        """Return case and flight of a ball through both cells' centres.
+
+        `entry` () [s] is the time at which the ball enters the outer box.
+        """
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -116,14 +123,13 @@ class PairPlanner(Planner):
         return case, flight
 
     def poses(self, pair: PairCase) -> EndPoses:
-        """Return eight end poses at each centreline point, and the straight motions to them.
+        """Return eight end poses at each of several points between the cells' centres.
 
         Returns:
-            End poses. Their `time` is the duration of the quickest straight motion [s], and their
-            `effort` is the entry time [s] of the ball that this motion allows. The effort is
-            `_TOUCHING` greater if the arm would touch something in this pose. The effort is
-            infinite if the pose does not exist, or if the shield must block the whole tunnel and
-            does not.
+            End poses. Their `time` [s] is the duration of the quickest motion with all joints in
+            proportion. Their `effort` [s] is the time at which the ball may enter the outer box if
+            the arm moves so. The effort is `_TOUCHING` greater if the arm touches something in this
+            pose, and infinite if the pose does not exist or does not block as required.
         """
         online, arm, limits = self.online, self.setting.arm, self.setting.limits
         ball, span = nominal_ball(pair.outer, pair.inner)
@@ -164,9 +170,9 @@ class PairPlanner(Planner):
     def model(self, pair: PairCase, point: Array, case: BlockCase, flight: Flight) -> Model:
         """Return the quadratic model of a motion's cost and violation, for the least squares.
 
-        The model is `OnlineBlock.model` plus a cost of the shield's roll about its normal, relative
-        to a shield that faces the ball with one horizontal edge. The roll counts modulo quarter
-        turns. It is ignored if blocking a part of the tunnel suffices.
+        The model is `OnlineBlock.model` plus a cost of the shield's roll, the angle modulo quarter
+        turns between its edge and the horizontal. The roll has no cost if blocking some balls of
+        the pair suffices (`is_coarse`).
         """
         online = self.online
         model = online.model(point, case, flight)
@@ -192,7 +198,10 @@ class PairPlanner(Planner):
         )
 
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the motion `point` as a plan, with its excess over limits and tunnel coverage."""
+        """Return the plan of a motion `point` for a ball that enters at `entry` () [s].
+
+        The plan's violation includes balls of the pair that would miss the shield.
+        """
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
         moves, first, _ = self.online.decode(case, point)
@@ -212,14 +221,14 @@ class PairPlanner(Planner):
 
 @struct.dataclass
 class StraightPair(PairPlanner):
-    """A planner that selects the collision-free straight joint motion with the earliest ball entry.
+    """A planner that selects among motions with all joints in proportion (straight motions).
 
-    The planner checks motions one after another, in the order of the ball's entry times.
+    The plan is the first collision-free motion, in the order of the ball's possible entry times.
     """
 
     @property
     def attempts(self) -> tuple[Attempt, ...]:
-        """One attempt, which checks all straight motions in turn."""
+        """The only attempt, which checks all straight motions in turn."""
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
@@ -261,13 +270,13 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """Return the entry time () [s] that a pose allows, without the penalty `_TOUCHING`."""
+    """Remove the penalty `_TOUCHING` of a collision from an entry time () [s]."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """An attempt: rounds of least squares, each with another entry time of the ball; static."""
+    """An attempt: rounds of least squares, each with another entry time of the ball."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -277,22 +286,22 @@ class Bends(Attempt):
 
 @struct.dataclass
 class BentPair(PairPlanner):
-    """A planner that avoids obstacles by the least squares of `OnlineBlock` from a learned start.
+    """A planner that avoids obstacles by the least squares of `OnlineBlock` from an initial guess.
 
-    The planner bisects the entry time of the ball. The lower bound is the entry time of the
-    quickest motion without obstacles. The upper bound is the entry time of the best motion so far,
-    or `_PATIENCE` after the lower bound if no motion has been found.
+    The planner bisects the time at which the ball enters the outer box. The lower bound is the time
+    that the quickest motion without obstacles allows. The upper bound is the entry time of the best
+    motion so far, or `_PATIENCE` after the lower bound if no motion has been found.
     """
 
     search: Bends = struct.field(pytree_node=False, default=Bends())
 
     @property
     def attempts(self) -> tuple[Bends, ...]:
-        """One attempt: the bisection with the settings of `search`."""
+        """The only attempt: the bisection with the settings of `search`."""
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair: the result of the last round that found a motion."""
+        """Return the plan of one pair of cells: the result of the last successful round."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
@@ -307,7 +316,7 @@ class BentPair(PairPlanner):
         learned = online.encode_straight(case, poses, place).at[:-1].add(bump.astype(dtype))
         is_given = pair.start < 0
         start = jnp.where(is_given, pair.given, learned)
-        # A given motion meets the nominal ball approximately in the middle of the tunnel.
+        # A given motion meets the ball approximately in the middle between the two cells.
         span = nominal_ball(pair.outer, pair.inner)[1]
         entry = jnp.where(is_given, pair.given[-1] - 0.5 * span, of_place)
         none = jnp.isinf(pair.best)

@@ -26,21 +26,22 @@ from planner_jax.task.block.motion import polynomial
 from planner_jax.task.block.plan import BlockPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
-_SAME_START = 1e-4  # [rad] and [rad/s], tolerance within which the arm stands at a home
+# [rad] and [rad/s], greatest difference of the arm's joints from a start pose of the library.
+_SAME_START = 1e-4
 
 
 @struct.dataclass
 class LibraryBlock(Planner):
     """A planner that returns the motion stored for the two cells that a ball passes.
 
-    The cost is the motion's duration [s]. The arm must stand at a home, which is a start pose of
-    the library. If the arm must end at standstill, the motion starts as soon as the arm may start,
-    and the shield then waits. Any other motion starts so late that it ends at the contact.
+    The cost is the motion's duration [s]. The arm must stand at a start pose of the library. If the
+    motion must end at standstill, it starts as soon as the arm may start, and the shield then waits
+    for the ball. Otherwise it starts so late that it ends at the contact.
 
-    The status is OUT_OF_REACH if nothing is stored for a ball. It is BLOCKED if the arm does not
-    stand at a home, or if arm, limits or scene differ from the library's; `check` reports these
-    differences on the host. It is INFEASIBLE if the stored motion is too late, or if the ball
-    passes farther from the shield's centre than the case allows.
+    The status is OUT_OF_REACH if no motion is stored for a ball. It is BLOCKED if the arm does not
+    stand at a start pose, or if arm, limits or scene differ from the library's; the method `check`
+    then raises an error. It is INFEASIBLE if the stored motion ends too late, or if the ball passes
+    farther from the shield's centre than the case allows.
     """
 
     library: Library
@@ -66,14 +67,17 @@ class LibraryBlock(Planner):
         require(bool(off <= _SAME_START), "angles", rule, shown=shown)
 
     def solve(self, case: BlockCase, attempt: Attempt) -> BlockPlan:
-        """Return the stored motion of one case as a plan; a pure function."""
+        """Return the plan of one case, with the motion stored for its ball."""
         home, fits = self.home_of(case)
         plan = _plan_from_answer(self.library.table, case, home)
         status = jnp.where(fits, plan.status, Status.BLOCKED)
         return plan.replace(status=status.astype(jnp.int32))  # type: ignore[attr-defined]
 
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
-        """Return the start pose nearest to the arm, and whether the library fits the case."""
+        """Return the index of the start pose nearest to the arm, and whether the library fits.
+
+        The library fits if the arm stands at this pose, and arm, limits and scene are equal.
+        """
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles[None]), axis=1)
         home = jnp.argmin(off)
         fits = (off[home] <= _SAME_START) & (jnp.max(jnp.abs(case.rates)) <= _SAME_START)
@@ -81,7 +85,6 @@ class LibraryBlock(Planner):
 
 
 def _is_same(own: Setting, other: Setting) -> Array:
-    """Return whether arm, limits and scene of two settings are equal; False if shapes differ."""
     mine, theirs = jax.tree.leaves(own), jax.tree.leaves(other)
     if jax.tree.structure(own) != jax.tree.structure(other) or any(
         np.shape(a) != np.shape(b) for a, b in zip(mine, theirs, strict=True)
@@ -102,7 +105,7 @@ def library_planner(file: str | os.PathLike) -> LibraryBlock:
 
 
 def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
-    """Return the plan of a case whose arm stands at a home, from one lookup in the table."""
+    """Return the plan of a case whose arm stands at start pose `home`, by a lookup in the table."""
     answer = lookup(table, case.ball, case.gravity, home)
     row, stored = answer.row, answer.stored
     dtype = case.angles.dtype
@@ -114,7 +117,8 @@ def _plan_from_answer(table: Table, case: BlockCase, home: Array) -> BlockPlan:
     start = jnp.asarray(table.homes)[home].astype(dtype)
     motion = polynomial(start, jnp.zeros_like(start), steps, duration)
     waits = jnp.zeros_like(motion.coeffs[:1]).at[0, 0].set(start)
-    # The motion must arrive in time without a tolerance; limits of the contact have a tolerance.
+    # `status_of` allows a small relative violation. A motion that is late is never allowed, hence
+    # the factor.
     early = (1.0 + FEASIBILITY_TOLERANCE) * duration / jnp.maximum(contact - case.delay, 1e-6)
     beside = jnp.stack(answer.beside)
     angle = jnp.arccos(jnp.clip(answer.cosine, -1.0, 1.0))

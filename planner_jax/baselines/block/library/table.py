@@ -1,9 +1,9 @@
 """The table of a library, with a stored motion for every pair of cells, and the lookup in it.
 
-A lookup intersects the ball's parabola with both boxes. The two crossings give two cells, a pair,
-and the pair gives one row of the table [Natarajan2024, Section IV-D2]. The lookup contains no
-search, so that its time is the same for every ball. In addition to the paper's lookup, this lookup
-computes when and where the ball crosses the plane of the shield.
+A lookup intersects the ball's parabola with the two boxes around the arm. Each crossing lies in a
+cell of its box, and the pair of cells has one row in the table [Natarajan2024, Section IV-D2]. The
+lookup contains no search, so that its time is the same for every ball. In addition to the paper's
+lookup, this lookup computes when and where the ball crosses the plane of the shield.
 """
 
 import dataclasses
@@ -31,7 +31,7 @@ class Setting:
 
     arm: Arm
     limits: ArmLimits
-    ends_at_rest: Array  # () bool
+    ends_at_rest: Array  # () bool, whether motions end at standstill
     scene: Scene
 
 
@@ -55,22 +55,22 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """The arrays of a lookup. Row p of a home has the fields of `Row` for the pair of cells p."""
+    """The stored motions from H start poses for P pairs of an outer and an inner cell."""
 
-    rows: Array | np.ndarray  # (H, P, 6 K + 10) float32
-    homes: Array | np.ndarray  # (H, 6) [rad], where stored motions start, at standstill
+    rows: Array | np.ndarray  # (H, P, 6 K + 10) float32, fields of `Row` for motions of K pieces
+    homes: Array | np.ndarray  # (H, 6) [rad], joint angles at which the motions start
     inner: Box
     outer: Box
     layout: Layout = struct.field(pytree_node=False)
 
 
 class Row(NamedTuple):
-    """A stored motion and the shield's pose at its end; also a batch, with leading axes.
+    """A stored motion and the shield's pose at its end; batches have leading axes.
 
-    `Row` and `Answer` are tuples, since the host creates a tuple ten times as fast as a dataclass.
+    `Row` and `Answer` are tuples, since Python creates a tuple ten times as fast as a dataclass.
     """
 
-    steps: Array | np.ndarray  # (K, 6) [rad], see `planner_jax.task.block.motion`
+    steps: Array | np.ndarray  # (K, 6) [rad], joint rates at K knots, times the duration
     duration: Array | np.ndarray  # () [s]; infinite if no motion is stored
     middle: Array | np.ndarray  # (3,) [m], centre of the shield's face
     normal: Array | np.ndarray  # (3,) unit vector, normal of the shield
@@ -78,12 +78,12 @@ class Row(NamedTuple):
 
 
 def pieces_of(rows: Array | np.ndarray) -> int:
-    """Return K, the number of pieces of each motion, from table rows (..., 6 K + 10)."""
+    """Return the number K of polynomial pieces of a motion, from table rows (..., 6 K + 10)."""
     return (rows.shape[-1] - 10) // 6
 
 
 def pack_rows(row: Row) -> np.ndarray:
-    """Pack the fields of rows into the table's format (..., 6 K + 10), float32."""
+    """Join the fields of rows into one array (..., 6 K + 10) float32, for motions of K pieces."""
     steps, duration = np.asarray(row.steps), np.asarray(row.duration)
     flat = steps.reshape(*steps.shape[:-2], -1)
     parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
@@ -91,7 +91,7 @@ def pack_rows(row: Row) -> np.ndarray:
 
 
 def unpack_rows(values: Array | np.ndarray) -> Row:
-    """Split rows (..., 6 K + 10) of a table into their fields."""
+    """Split table rows (..., 6 K + 10), for motions of K pieces, into their fields."""
     pieces = pieces_of(values)
     rest = values[..., 6 * pieces :]
     return Row(
@@ -110,7 +110,8 @@ class Answer(NamedTuple):
     pair: Array | int  # () int32, number of the pair of cells; 0 without a pair
     stored: Array | bool  # () bool, whether the ball passes two cells with a stored motion
     time: Array | float  # () [s], when the ball crosses the plane of the shield
-    # () [s], the lesser of the times from the outer box to the crossing and on to the inner box.
+    # () [s], time from the outer box to the shield's plane, or from the plane to the inner box,
+    # whichever is less.
     slack: Array | float
     # Two values () [m], distances of the crossing from the shield's centre along its two edges.
     beside: tuple[Array | float, Array | float]
@@ -118,15 +119,13 @@ class Answer(NamedTuple):
 
 
 def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0) -> Answer:
-    """Look up the motion for one ball, in constant time and without a search; pure.
-
-    All computations are on scalars, so that the compiled program of one ball has few loops.
+    """Look up the motion for one ball, in constant time and without a search.
 
     Args:
         table: table of a library.
         ball: state of the ball at time 0.
         gravity: () [m/s^2], magnitude.
-        home: () int32, index of the home at which the arm stands.
+        home: () int32, index of the start pose at which the arm stands.
     """
     layout = table.layout
 
@@ -186,7 +185,7 @@ class Library:
 
     @property
     def found(self) -> np.ndarray:
-        """Mask of the pairs of cells with a stored motion, one row per home, (H, P) bool."""
+        """Which of P pairs of cells have a stored motion from H start poses, (H, P) bool."""
         return np.isfinite(np.asarray(unpack_rows(self.table.rows).duration))
 
     @property
@@ -198,7 +197,14 @@ class Library:
 def library_of(
     rows: Array | np.ndarray, homes: Array | np.ndarray, layout: Layout, setting: Setting
 ) -> Library:
-    """Return a library from table rows (H, P, 6 K + 10) and start poses `homes` (H, 6) [rad]."""
+    """Create a library from its table's rows and H start poses.
+
+    Args:
+        rows: (H, P, W), for P pairs of cells, as from `pack_rows`.
+        homes: (H, 6) [rad], joint angles at which motions start.
+        layout: the division of the two boxes around the arm into cells.
+        setting: arm, joint limits and scene.
+    """
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
     return Library(table=table, setting=setting)
@@ -208,7 +214,7 @@ def with_scene(library: Library, scene: Scene) -> Library:
     """Return a library with the same motions and another scene that has the same boxes.
 
     Raises:
-        ArgumentError: a box of the new scene differs, so that its cells would differ.
+        ArgumentError: a box of the new scene differs from the library's box.
     """
     own = library.setting.scene
     for name, old, new in (("inner", own.inner, scene.inner), ("outer", own.outer, scene.outer)):
