@@ -63,9 +63,9 @@ def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
     return Regime(limits=limits, ends_at_rest=ends_at_rest)
 
 
-# Joint limits of the arm IRB 1600-6/1.2, and whether a motion must end at rest. R1: limits in the
-# code of [Natarajan2024], any velocity at the end. R2: speeds of the data sheet, and 30 rad/s^2 as
-# an assumption, since the data sheet states no accelerations; at rest. R3: limits of R1; at rest.
+# Joint limits of the arm IRB 1600-6/1.2. R1: limits in the code of [Natarajan2024]; motions may end
+# at any velocity. R2: speeds of the data sheet, and 30 rad/s^2 as an assumption, since the data
+# sheet states no accelerations; motions end at rest. R3: limits of R1; motions end at rest.
 REGIMES = {
     "R1": _regime(2.0, 60.0, ends_at_rest=False),
     "R2": _regime(1.0, 30.0, ends_at_rest=True),

@@ -116,7 +116,7 @@ def body_rate_squared(acc: Components, jerk: Components, gravity: Array) -> Arra
 
 
 def body_rate(acc: Components, jerk: Components, gravity: Array) -> tuple[Array, Array, Array]:
-    """Return the body rate's components (...) [rad/s] in the body frame, at zero heading."""
+    """Return the body rate (three components) [rad/s], body frame, for acceleration and jerk."""
     tx, ty, az = components(acc)
     tz = az + gravity
     jx, jy, jz = components(jerk)

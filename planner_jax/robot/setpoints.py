@@ -14,7 +14,7 @@ from planner_jax.core.errors import ArgumentError
 from planner_jax.core.rules import POSITIVE
 
 _MOST = 10**8  # greatest number of setpoints that one call may compute
-# Numbers of plans and of times in a compiled call, for one plan and for a batch.
+# Numbers of plans and of times in one compiled call, for a single plan and for a batch.
 _ONE, _BATCH = (1, 1024), (64, 64)
 TreeT = TypeVar("TreeT")
 
@@ -60,7 +60,7 @@ def sample_at_rate(
 def _in_tiles(
     leaves: object, times: np.ndarray, setpoint_at: Callable, tile: tuple[int, int]
 ) -> dict[str, np.ndarray]:
-    """Evaluate B plans at K times, at most tile[0] plans and tile[1] times in a compiled call."""
+    """Evaluate B plans at K times, by compiled calls for tile[0] plans and tile[1] times each."""
     num, found = jax.tree.leaves(leaves)[0].shape[0], {}
     for i in range(0, num, tile[0]):
         plans = np.minimum(np.arange(i, i + tile[0]), num - 1)

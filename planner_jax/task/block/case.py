@@ -131,7 +131,7 @@ def case(
             that were planned for another ball.
         scene: obstacles, without batch axes; by default the paper's scene.
         arm: without batch axes; by default an IRB 1600 with a shield.
-        angles: (6,) [rad], joint angles at the start; by default the arm's home angles.
+        angles: (6,) [rad], joint angles at the start; by default those at which the arm waits.
         rates: (6,) [rad/s], joint rates at the start.
         gravity: [m/s^2], magnitude, > 0.
         dtype: type of every floating leaf.

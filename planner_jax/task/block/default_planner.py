@@ -73,7 +73,7 @@ _GROUP, _WIDTH = 4, 2  # starts in a group, and starts that a GPU refines at the
 @with_run_time_numbers("straight", "tries", "first", "kept", "in_turn")
 @dataclasses.dataclass(frozen=True)
 class Search(Attempt):
-    """An attempt: check some straight motions, then run least squares from some starts."""
+    """An attempt: check some straight motions, then run least squares from starting points."""
 
     starts: int = 8
     straight: int = 48  # number of straight motions
@@ -141,7 +141,7 @@ def _lift_to_unknowns(
         drift: (W, 6), derivatives of the angles at the samples by the time of contact.
         grams: (W, 7, 7), J^T J of the residuals at each sample, by angles and time.
         pushes: (W, 7), J^T r of these residuals.
-        joints: terms of the joints' limits and effort.
+        joints: terms of the joints' limits and accelerations.
     """
     grams_q, grams_t = grams[:, :6, :6], grams[:, :6, 6]
     moved = jnp.einsum("wij,wj->wi", grams_q, drift, precision=_HIGHEST) + grams_t
@@ -295,7 +295,7 @@ class OnlineBlock(Planner):
                 some = jax.tree.map(lambda leaf: leaf[lanes], searches)
                 later = refine(some, jnp.where(is_trial, solver.trial, solver.max_steps))
                 searches = jax.tree.map(lambda old, new: old.at[lanes].set(new), searches, later)
-                # The refined searches of the last turn are moved to the front.
+                # Move the searches that the last turn refines to the front, where they are read.
                 moved = jax.tree.map(lambda old, new: old.at[:_WIDTH].set(new), searches, later)
                 return jax.tree.map(lambda a, b: jnp.where(is_trial, a, b), searches, moved)
 
@@ -382,7 +382,7 @@ class OnlineBlock(Planner):
         lifts, short = lax.optimization_barrier((slopes * active[:, None], short))
         grams = jnp.einsum("riw,rjw->wij", lifts, lifts, precision=_HIGHEST)
         pushes = jnp.einsum("riw,rw->wi", lifts, short, precision=_HIGHEST)
-        # Distances do not depend on the time of contact.
+        # The derivatives by the time of contact are zero: distances do not depend on it.
         grams, pushes = jnp.pad(grams, ((0, 0), (0, 1), (0, 1))), jnp.pad(pushes, ((0, 0), (0, 1)))
         rows, row_slopes, contact_excess = contact_terms(
             case, flight, angles[-1], point[-1], self.weights

@@ -140,7 +140,7 @@ def bump_steps(height: Array, pieces: int) -> Array:
 
 
 def polynomial(start: Array, first: Array, steps: Array, duration: Array) -> PiecewisePolynomial:
-    """Convert a motion, given as for `angles_at`, to a polynomial with K pieces of degree 2."""
+    """Convert a motion (see `angles_at`) of `duration` [s] to K polynomial pieces of degree 2."""
     pieces = steps.shape[0]
     step = duration / pieces
     rates = jnp.concatenate([first[None], steps]) / jnp.maximum(duration, 1e-9)

@@ -45,7 +45,7 @@ def paper_scene(*, has_pole: bool = True) -> Scene:
     """Return the scene of the simulations in [Natarajan2024, Fig. 5], with NumPy float32 leaves.
 
     The sizes are from the model in the authors' repository. The model's box around the camera is
-    left out, since the arm touches this box in the authors' home pose.
+    left out, since the arm touches this box in the pose in which the authors let it wait.
     """
 
     def leaf(value: ArrayLike) -> Array:

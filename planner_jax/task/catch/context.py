@@ -1,4 +1,4 @@
-"""Functions that all catch planners use: order of targets, axes of the net, targets too far."""
+"""Functions that all catch planners use: order of targets, axes of the net, reach of targets."""
 
 import jax
 import jax.numpy as jnp

@@ -22,7 +22,7 @@ class CatchPlan(QuadrotorPlan):
 
     @property
     def num_taken(self) -> Array:
-        """Number of targets that the plan catches, (...)."""
+        """Number of targets that the plan catches: (), or (B,) for a batch of B plans."""
         return jnp.sum(self._is_catch, axis=-1)
 
     @property

@@ -43,7 +43,7 @@ _TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as 
 
 @struct.dataclass
 class ReplanContext:
-    """Data of a re-plan: context of the remaining catches, previous plan, starting point."""
+    """Data of a re-plan: the remaining catches, the previous plan, and the starting point."""
 
     catch: CatchContext
     task: Replanning
@@ -180,11 +180,11 @@ class ReplanCatch(OptimisedPlanner):
         return jnp.concatenate([first, self.planner.guesses(context.catch, num - 1)])
 
     def objective(self, point: Array, context: ReplanContext) -> Evaluation:
-        """Return cost and violation at `point`; with `context.keep`, of the previous plan."""
+        """Return cost and violation at `point`, or of the previous plan if `context.keep`."""
         return self.planner.objective(jnp.where(context.keep, context.start, point), context.catch)
 
     def decode(self, point: Array, context: ReplanContext) -> CatchPlan:
-        """Return the plan of decision variables, or, with `keep`, the previous plan's remainder."""
+        """Return the plan at `point`, or the previous plan's remainder if `context.keep`."""
         plan = self.planner.decode(point, context.catch)
         return jax.lax.cond(
             context.keep, lambda: _remainder(context.task, context.catch), lambda: plan

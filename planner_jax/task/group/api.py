@@ -38,7 +38,7 @@ def planner(
 
 
 def judge(cases: InterceptGroup, plans: GroupPlan, **settings: object) -> InterceptVerdict:
-    """Judge plans of groups: an independent check, the referee, of the drive to every target.
+    """Judge plans of groups by the referee, an independent check of the drive to every target.
 
     Arguments, result and errors are as for `pj.hit.judge`. The settings are keyword arguments of
     `referee_intercepts`, which judges each drive as one interception.

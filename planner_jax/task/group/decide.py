@@ -55,7 +55,10 @@ def _timetable(group: InterceptGroup) -> tuple[Array, Array]:
 def _next(
     group: InterceptGroup, table: tuple[Array, Array], last: _Meeting, target: Array
 ) -> _Meeting:
-    """Estimate the earliest meeting with one target after the meeting `last`, from `_timetable`."""
+    """Estimate the earliest meeting with a target after the meeting `last`.
+
+    `table` has times and the positions of all targets at these times, from `_timetable`.
+    """
     times, positions = table[0], table[1][target]
     limits = group.shared.limits
     away = positions - last.position[None]
@@ -99,7 +102,7 @@ MOST_PERMUTED = 8  # greatest number N of targets for which all N! orders are es
 @jax.tree_util.register_static
 @dataclasses.dataclass(frozen=True)
 class Best(Decision):
-    """Decision on the order of targets that proposes those estimated to end earliest.
+    """Decision that proposes the orders of targets that are estimated to end earliest.
 
     All N! orders of the N <= 8 targets are estimated. The planner plans each of the best orders,
     the finalists, and selects the plan whose last meeting is earliest.

@@ -68,7 +68,7 @@ class GroupIntercept(Planner):
         return jax.device_get(_join(cases, begins, legs))
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
-        """Plan those of B legs (drives) for which `needed` is true, (B,); ignore other results."""
+        """Plan the legs (drives) for which `needed` (B,) is true; other plans have no meaning."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
@@ -89,7 +89,7 @@ class GroupIntercept(Planner):
 
 
 def _is_open(status: Array) -> Array:
-    """Return whether the planner `patient` may still solve a leg that has this status."""
+    """Return whether a leg with this status is unsolved and worth a second try, by `patient`."""
     return is_unsolved(status) | (status == Status.NO_PATH)
 
 
@@ -113,7 +113,7 @@ def _make_legs(
 
 @jax.jit
 def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -> InterceptPlan:
-    """Replace the plans of those of B legs that are not needed by plans that take no time."""
+    """Replace the plans of legs (drives) that are not needed, (B,), by plans that take no time."""
     num = plans.speed.shape[1]
     zero = jnp.zeros_like(plans.time)
     empty = InterceptPlan(

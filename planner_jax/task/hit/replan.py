@@ -32,7 +32,7 @@ _TRIALS = (1.0, 0.2, 0.04)  # step lengths; the first direction is too long, as 
 
 @struct.dataclass
 class ReplanHitContext:
-    """The context of the remaining hit, and the starting point made from the previous plan."""
+    """Data of a re-plan: the remaining hit, and the starting point from the previous plan."""
 
     hit: HitContext
     start: Array  # (n,), values of the n decision variables for the previous plan's impact

@@ -1,4 +1,4 @@
-"""Serves: read from the trial files of [Yu2023bat], or drawn from a distribution fitted to them."""
+"""Serves for hits, read from files published with [Yu2023bat], or drawn at random like these."""
 
 import dataclasses
 import functools
@@ -161,7 +161,7 @@ def _draw(scenario: np.ndarray, random: np.random.Generator):
 
 
 class _AimTable(NamedTuple):
-    """Splines that interpolate serves by horizontal distance [m] and vertical speed [m/s]."""
+    """Splines over a serve's horizontal distance [m] and vertical speed [m/s]."""
 
     speed: RectBivariateSpline  # [m/s], horizontal speed that reaches the distance
     density: RectBivariateSpline  # [1/s^2], |d horizontal velocity / d landing point|
@@ -184,7 +184,7 @@ def _aim_table() -> _AimTable:
 
 
 def _aim(distance: np.ndarray, rise: np.ndarray):
-    """Return horizontal speeds [m/s] of serves that land at a distance [m], by vertical speed.
+    """Return the horizontal speeds [m/s] of serves with vertical speeds `rise` for `distance` [m].
 
     The other results are the derivatives of the speeds by distance [1/s], and flight times [s].
     """

@@ -86,7 +86,7 @@ def motion(start: Array, time: Array, speed: Array, curvature: Array, samples: i
         time: () [s], of the last knot; the first knot is at time 0.
         speed: (K + 1,) [m/s], at the knots.
         curvature: (K + 1,) [1/m], at the knots.
-        samples: number S of samples on each piece, static.
+        samples: number S of samples on each piece.
     """
     num, dtype = speed.shape[0] - 1, speed.dtype
     turned, weights = (jnp.asarray(each, dtype) for each in _weights(samples))

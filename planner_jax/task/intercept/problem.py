@@ -88,7 +88,7 @@ class MotionProblem:
 
     @property
     def weights(self) -> Weights:
-        """Weights of the cost in the last stage, which reduces the meeting time or the effort."""
+        """Weights of the last stage, which reduces the meeting time or the squared acceleration."""
         return _HURRYING if self.meet == "early" else _SETTLING
 
     def pack(self, speed: Array, curvature: Array, time: Array) -> Array:

@@ -1,6 +1,6 @@
 """Terms of an interception's cost, with derivatives: weighted squares of residuals.
 
-The residuals are the distance from the target at the end, the effort, and hinges: one-sided
+The residuals are the distance from the target at the end, the acceleration, and hinges: one-sided
 penalties max(excess, 0) on limits and on distances from obstacles.
 """
 
