@@ -95,7 +95,7 @@ def _car(world: World) -> Car:
 
 
 def dead_reckon(pose: Array, speed: Array, curvature: Array, span: Any) -> Array:
-    """Return the pose (3,) after a short time [s] at constant speed () and path curvature ()."""
+    """Return the pose (3,) after `span` [s] at constant speed [m/s] and path curvature [1/m]."""
     turned = speed * curvature * span
     middle = pose[2] + 0.5 * turned
     way = speed * span
@@ -206,7 +206,7 @@ def _advance_estimate(
 def drive_on(
     world: World, drives: DriveState, until: Array, *, num_frames: int
 ) -> tuple[DriveState, Frame]:
-    """Simulate a batch of B drives for some frames of 20 ms.
+    """Simulate a batch of B drives for `num_frames` frames of 20 ms.
 
     Args:
         world: a world with a car.

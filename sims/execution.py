@@ -61,7 +61,7 @@ class _Setting:
 class Executed:
     """The result of executing B courses (timed joint motions), in float64 arrays (B, ...).
 
-    Errors and torques are evaluated from the time at which the arm may start until its contact.
+    Errors and torques are evaluated from the time at which an arm may start until its contact time.
     """
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
@@ -90,7 +90,7 @@ def _one_frame(
     key, noise_key = jax.random.split(state.key)
     noise = jax.random.normal(noise_key, (_STEPS, *robot.noise_shape), dtype)
     times = state.time + span * jnp.arange(_STEPS, dtype=dtype)
-    # The torques lag behind the commands. The planned acceleration of one lag later compensates it.
+    # The torques lag behind the commands. Planned accelerations are therefore taken one lag ahead.
     references = robot.references(setting.course, times, world)
     ahead = robot.references(setting.course, times + setting.lag, world)
     references = dataclasses.replace(references, accelerations=ahead.accelerations)
@@ -130,7 +130,7 @@ def _frames(world: World, setting: _Setting, state: ArmState) -> tuple[ArmState,
 
 
 def _start(world: World, setting: _Setting, key: Array) -> ArmState:
-    """Return an arm at time 0 of its course, a joint motion, with torques that keep it there."""
+    """Return an arm at the start of its course (a timed motion), with torques that hold it."""
     robot, zero = _arm(world), jnp.zeros_like(setting.course.begin)
     reference = jax.tree.map(
         lambda leaf: leaf[0], robot.references(setting.course, zero[None], world)

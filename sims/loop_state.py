@@ -76,7 +76,7 @@ def shapes_of_plans(planner: OptimisedPlanner, cases: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Loop:
-    """The settings that determine a flight's compiled program; static under jit.
+    """The settings that determine a flight's compiled program; static under `jax.jit`.
 
     Raises:
         ValueError: the planning period is no multiple of the period of observations, or this period

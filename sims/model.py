@@ -149,7 +149,7 @@ def step(world: World, physics: Physics, command: Array, drag: Array) -> Physics
         ctrl=controls,
         qfrc_applied=jnp.concatenate([forces, drags]),
     )
-    # MJX combines arrays of different ranks, which the tests of this library forbid elsewhere.
+    # MJX combines arrays of different ranks, which this library's tests forbid in other code.
     with jax.numpy_rank_promotion("allow"):
         data = mjx.step(model, data)
     return Physics(qpos=data.qpos, qvel=data.qvel, act=data.act)

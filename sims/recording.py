@@ -28,7 +28,7 @@ _LONGEST = 3.0  # [s], longest flight of a returned ball that is recorded
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """F recorded flights of N balls at K samples each; NumPy leaves, world frame, z up.
+    """F recorded flights of N balls at K samples each; NumPy arrays, world frame, z up.
 
     The robot has R joint positions. For a quadrotor these are the position of the propeller plane's
     centre [m] and the quaternion w x y z. A target that drives counts as a ball. Times count from
@@ -79,7 +79,7 @@ class Frame(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Launches:
-    """The states of N balls of F flights before and after their simulation; NumPy leaves."""
+    """The states of N balls of F flights before and after their simulation, in NumPy."""
 
     balls: BallState  # leaves (F, N, 3), each at the start of the plan for it
     drag: Any  # (F, N), true drag coefficient K_D [1/m]
@@ -132,8 +132,8 @@ def make_recording(
         world: the simulated world.
         flown: F simulated flights with their records.
         launches: states of the balls before and after the simulation.
-        index: (F,) indices in the run.
-        success: (F,) bool.
+        index: (F,) indices of the flights in the run.
+        success: (F,) bool, whether each flight succeeded.
     """
     record: Any = flown.record
     balls, drag, seen, returned = launches.balls, launches.drag, launches.seen, launches.returned

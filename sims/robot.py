@@ -1,6 +1,6 @@
 """The protocol of a robot, by which the simulated world, the closed loop and pictures use it.
 
-A robot is a frozen dataclass, static under jit. The quadrotor in `robots/quadrotor/robot.py`
+A robot is a frozen dataclass, static under `jax.jit`. The quadrotor in `robots/quadrotor/robot.py`
 carries a tool; the car and the arm in `robots/car/robot.py` and `robots/arm/robot.py` do not. The
 robot's part of MuJoCo's state comes first in `qpos` and `qvel`, before the balls. All of `act`
 belongs to the robot.

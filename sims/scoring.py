@@ -78,7 +78,7 @@ def passage(
         before: tool and balls at `time`.
         after: tool and balls one step later.
         time: () [s], start of the step.
-        planned: (N,) [s], planned contact times.
+        planned: (N,) [s], planned contact times of the balls.
         reference: (3,) [m], planned position of the robot at `time`.
 
     Returns:

@@ -53,7 +53,7 @@ def rls_update(state: RlsState, regressor: Array, measurement: Array) -> RlsStat
     """
     usable = jnp.isfinite(measurement)
     y = jnp.where(usable, measurement, 0.0)
-    # Of variance P, regressor h and gain K, textbooks compute the new variance (1 - K h) P. The
+    # From variance P, regressor h and gain K, textbooks compute the variance (1 - K h) P. The
     # equal formula P / (1 + h^2 P) is used here, since it has no rounding error of a difference.
     variance = state.variance / (1.0 + regressor**2 * state.variance)
     error = y - regressor * state.estimate
@@ -66,9 +66,9 @@ class Estimate:
     """The estimated state and drag of one ball."""
 
     belief: EkfState  # Gaussian estimate of position and velocity, one latency ago
-    energy: Array  # () [m^2/s^2], energy per unit mass at the first good estimate
+    energy: Array  # () [m^2/s^2], energy per unit mass at `anchor_energy`
     energy_variance: Array  # () [m^4/s^4], variance of that energy
-    lever: Array  # () [m^3/s^2], integral of |v|^3 since the first good estimate
+    lever: Array  # () [m^3/s^2], integral of |v|^3 since `anchor_energy`, speed |v|
     prior: RlsState  # estimate of K_D [1/m] before any energy loss is observed
     drag: Array  # () [1/m], current estimate of K_D
 

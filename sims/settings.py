@@ -90,7 +90,7 @@ class FlySettings:
         self.check_rate()
 
     def require_memory(self) -> None:
-        """Raise `ArgumentError` unless a batch and the rows of all flights fit into memory."""
+        """Raise `ArgumentError` unless a batch and the results of all flights fit into memory."""
         if self.batch is None:
             require_memory("num", min(self.num, _AT_ONCE), _FLIGHT_BYTES)
         else:

@@ -117,7 +117,7 @@ class FlightTask(abc.ABC):
 
     @abc.abstractmethod
     def parameters(self) -> dict[str, Any]:
-        """Return all parameters of the simulation, as plain values for the manifest."""
+        """Return all parameters of the simulation, as plain values for the run's manifest."""
 
     def every_column(self) -> Sequence[Column]:
         """Return all columns that this task adds to the table with one row per flight."""

@@ -1,7 +1,7 @@
 """A viewer of recorded flights in a web browser, with sliders for time and playing speed.
 
 The viewer needs the extra `view`. `recording.frame` computes which objects are visible at a sample,
-and this module displays them by the package viser. A flight also plays without a browser.
+and this module displays them by the package viser. Flights play even if no browser is connected.
 """
 
 import errno
@@ -246,7 +246,7 @@ class Viewer:
         return drawn
 
     def _draw_flight(self) -> None:
-        """Draw the fixed objects of the selected flight, and then its first sample."""
+        """Draw the standing objects of the selected flight, and then its first sample."""
         with self._lock, self._server.atomic():
             recording, row = self.recording, self._row
             for part in self._drawn:

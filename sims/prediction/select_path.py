@@ -32,7 +32,7 @@ class TurnPrior:
     magnitude is log-normal. The default numbers are for targets of 0.2 to 0.5 m/s that turn at 0.03
     to 0.1 rad/s. Predictions of faster turns are hardly worse. Slower turns are mistaken for
     straight paths more often than the predicted errors state. For such targets use a wider prior,
-    such as `TurnPrior(0.5, 0.03, 1.0)`, which predicts straight targets less well.
+    such as `TurnPrior(chance=0.5, typical=0.03, spread=1.0)`; it predicts straight paths less well.
     """
 
     chance: ArrayLike = 0.4  # (), probability that a target turns, between 0 and 1
@@ -49,7 +49,7 @@ class TurnPrior:
 
     @property
     def variance(self) -> Array:
-        """The variance of the turn rate, given a turn, () [rad^2/s^2]."""
+        """The variance of a turning target's turn rate, () [rad^2/s^2]."""
         return jnp.square(self.typical) * jnp.exp(2.0 * jnp.square(self.spread))
 
 
@@ -79,7 +79,7 @@ class Alternatives:
 
 @struct.dataclass
 class Prediction:
-    """The predicted path of a target, and an estimate of the prediction's error."""
+    """The predicted path of a target, with alternative paths that express the uncertainty."""
 
     path: TurningPath  # with turn rate 0 if it is straight
     is_turning: Array  # () bool, which of the two models was selected

@@ -177,7 +177,7 @@ class BlockFlight(FlightTask):
 
     @property
     def conditions(self) -> str:
-        """Times for sensing and planning, drives and encoders, as a part of a sentence."""
+        """Times for sensing and planning, drives and encoders, as the beginning of a sentence."""
         settings = self.settings
         meeting = "wide" if settings.wide else "strict"
         return (

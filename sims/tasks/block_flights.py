@@ -159,9 +159,9 @@ def fly_blocks(
         cases: the thrown balls.
         seed: random seed of the encoders' noise, >= 0.
         drives: limits and errors of the drives.
-        planner: planner of all plans, by default `online`.
+        planner: planner of all plans, by default the planner named `online`.
         planning_budget: [s], time for planning at the end of the delay. A plan that takes longer
-            starts late by the excess. With None, planning takes no time.
+            starts late by the excess. If it is None, planning takes no time.
         plan: plans of the cases; by default plans are made here.
         seconds: (B,) [s], wall times of the passed plans.
         decided: motions that were planned from observations of the balls, used instead of plans;
@@ -253,13 +253,12 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
     """Score B simulated motions: which balls are blocked, misses, and obstacle clearances.
 
     A ball is blocked if it reaches the face of the shield from in front, with its centre over the
-    face. This must happen before its centre enters the inner box and before it touches the arm. The
-    miss is the distance of a blocked ball from the shield's centre. For other balls the miss is
-    this distance where the ball crosses the shield's plane; it is NaN if the ball does not cross
-    the plane in time. All computations are in float64.
+    face, before the ball's centre enters the inner box around the arm and before the ball touches
+    the arm. The miss is the distance of a blocked ball from the shield's centre. For other balls it
+    is the distance where the ball crosses the shield's plane, or NaN if no crossing is in time.
 
     Args:
-        cases: leaves (B, ...).
+        cases: the cases of B flights, leaves (B, ...).
         plans: the plans of the cases.
         flown: the simulated motions.
         budget: the parts of the times of flight.
@@ -337,9 +336,9 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least clearances (B,) [m] of B arms in included frames; link and obstacle.
+    """Return the least clearances (B,) [m] of B arms from obstacles in the included frames.
 
-    The clearance is infinite if no frame is included.
+    Names of the nearest link and obstacle are returned, too. Without frames, the clearance is inf.
     """
     least, names = [], []
     for begin in range(0, len(included), _LANES):

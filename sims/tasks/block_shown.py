@@ -37,7 +37,7 @@ def _around(ends: np.ndarray, radius: float) -> np.ndarray:
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return what is drawn around the arm: two boxes, beams, the arm's pedestal and the pole."""
+    """Return the drawn parts: the two boxes around the arm, beams, pedestal and pole."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):

@@ -60,7 +60,7 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Raise the thrust at catches in first guesses of `exact`; return other planners unchanged."""
+    """Raise the thrust at catches in guesses of the planner `exact`; keep other planners."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)
@@ -96,7 +96,7 @@ def throws(
 
     Args:
         num: B >= 1, number of flights.
-        num_balls: N, number of balls per flight, 1 to 3 in the paper.
+        num_balls: N, number of balls per flight, 1 to 3 in [Yu2023catch].
         seed: >= 0, of the throws and of the signs of the drag's errors.
         drag: true drag coefficient K_D [1/m] of all balls.
         drag_error: relative error of the initial estimate of K_D, of random sign.
@@ -156,7 +156,7 @@ def fly_catches(
         loop: settings of the closed loop: world, sensing and rates.
         cases: the thrown balls.
         seed: random seed of the noise, >= 0.
-        planner: planner of `plan_ahead`, by default `exact` with greedy decisions.
+        planner: planner of `plan_ahead`, by default the planner `exact` with a greedy order.
         pilot: part of the loop that replans remaining catches.
         plan: first plan of each flight, for the first ball; by default it is made here.
 
@@ -253,7 +253,7 @@ class CatchFlight(BallFlightTask):
         )
 
     def fly(self, cases: Throws, record: bool) -> CatchFlights:
-        """Plan and fly some flights by the settings, and return the result."""
+        """Plan and simulate some flights by the settings, and return the result."""
         settings = self.settings
         return fly_catches(
             self.loop(record),
@@ -268,7 +268,7 @@ class CatchFlight(BallFlightTask):
         return {**super().parameters(), "redecide": self.settings.redecide_rate}
 
     def launches(self, cases: Throws, flown: Flown) -> Launches:
-        """Return each ball's state at the start of the plan for it, and that no ball flies back."""
+        """Return each ball's state at the start of the plan for it; there are no returned balls."""
         begins = INTERVAL * np.arange(self.settings.balls)
         return Launches(cases.balls, cases.drag, begins, SEEN)
 

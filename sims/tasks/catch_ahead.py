@@ -28,11 +28,11 @@ from planner_jax.task.catch.plan import CatchPlan
 
 # Fraction of the net's radius within which plans catch; the remainder is a margin for errors.
 _AIM = 0.4
-# Limits of plans, from tight limits to the robot's own. Each pair has a margin above the robot's
-# least thrust, as a fraction of the range up to hover, and a fraction of the robot's body rate
-# limit. Weak thrusts and fast rotations leave little control authority. Plans of the first catch
-# use the first pair, so that the next plan can start within its limits. Plans of later catches use
-# the second pair. If no plan satisfies a pair, the next pair is used.
+# Limits of plans, from tight limits to the robot's own limits. Each pair has a margin above the
+# robot's least thrust, as a fraction of the range up to hover thrust, and a fraction of the robot's
+# body rate limit. Weak thrusts and fast rotations leave little control authority. Plans of the
+# first catch use the first pair, so that the next plan can start within its limits. Plans of later
+# catches use the second pair. If no plan satisfies a pair, the next pair is used.
 LIMITS = ((2.0 / 7.0, 0.6), (1.0 / 7.0, 0.9), (0.0, 1.0))
 
 
@@ -149,7 +149,7 @@ def with_catch(flights: FlightState, found: CatchPlan, new: Array) -> FlightStat
 
 @dataclasses.dataclass(frozen=True)
 class _EveryAttempt(Driver):
-    """A driver that runs all attempts (settings to try) of a planner concurrently."""
+    """A planning driver that runs all attempts (settings to try) of a planner concurrently."""
 
     # A time limit of 0 s: no attempt is followed by another attempt in the same call.
     watch: Watch = dataclasses.field(default_factory=lambda: Watch(0.0))
@@ -184,10 +184,10 @@ def plan_ahead(
 ) -> tuple[CatchCase, CatchPlan]:
     """Plan to catch a ball and, if possible, also the next ball, without an earlier plan.
 
-    Cases without a solved plan for both balls are planned for both balls with wider limits. This is
-    tried first because a plan for the ball alone may leave the quadrotor where it cannot reach the
-    next ball. If even that plan exceeds a limit by more than the loop accepts, the ball is planned
-    alone. If no plan is solved, the plan for the ball with the least violation is returned.
+    Cases without a solved plan for both balls are first planned for both balls with wider limits: a
+    plan for the first ball alone may end where the quadrotor cannot reach the next ball. If a plan
+    still violates a limit by more than 10 %, the first ball is planned alone. If no plan for it is
+    solved, the plan with the least violation is returned.
 
     Args:
         planner: planner of catches, which also decides their order.
@@ -241,7 +241,7 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Return the least thrust [m/s^2] and greatest body rate [rad/s] of a pair of `LIMITS`."""
+    """Convert a pair of `LIMITS` to least thrust [m/s^2] and greatest body rate [rad/s]."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance

@@ -32,13 +32,13 @@ LIFT = 0.1  # thrust at every catch in initial guesses: 0 is hover, 1 the greate
 
 @dataclasses.dataclass(frozen=True)
 class CatchPilot:
-    """The part of the closed loop that replans catches, with the decided or a new order."""
+    """The part of the closed loop that replans catches, with the same or a new order."""
 
     # In the last 0.2 s before a catch the plan is not changed. A change would cost more accuracy
     # than new observations of the ball gain.
     planner: ReplanCatch = ReplanCatch(ExactCatch(lift=LIFT), shortest=0.2)
-    # Greatest relative violation of a limit with which a new plan is flown. The first is for the
-    # last catch, the second for several remaining catches. A new plan with a greater violation is
+    # Greatest relative violation of a limit with which a new plan is flown: first if one catch is
+    # left, then if several catches are left. A new plan with a greater violation is
     # flown only if the old plan's violation is at least as large. While several catches are left,
     # most of the violation lies in later catches, which will be planned again. Rejecting the new
     # plan would miss the first ball.

@@ -170,7 +170,7 @@ def volleys(
 
     Args:
         num: B >= 1, number of serves.
-        names: scenarios out of `court.SCENARIOS`; by default all of them.
+        names: names of scenarios (keys of `court.SCENARIOS`); by default all scenarios.
         seed: >= 0, of the serves and of the signs of the drag's errors.
         drag_error: relative error of the initial estimate of K_D, of random sign.
         robot: a quadrotor with a racket.
@@ -311,7 +311,7 @@ class HitFlight(BallFlightTask):
         )
 
     def fly(self, cases: Volleys, record: bool) -> HitFlights:
-        """Plan and fly some serves by the settings, and return the result."""
+        """Plan and simulate some flights by the settings, and return the result."""
         name = self.settings.planner
         planner = None if name == "exact" else hit_planner(name)
         return fly_hits(self.loop(record), cases, self.settings.seed, planner=planner)
@@ -335,6 +335,6 @@ class HitFlight(BallFlightTask):
         return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return a sentence about the balls within 1 m and the balls that the racket met."""
+        """Return a sentence: shares of balls within 1 m of the target, and of balls hit at all."""
         within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
         return [f"{within} % within 1 m; the racket met the ball in {met} %."]

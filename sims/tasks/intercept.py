@@ -119,7 +119,7 @@ def predict_scene(
 
     Args:
         loop: settings of the loop, with the sensing.
-        meetings: leaves (B, ...).
+        meetings: the B cases with their observations, leaves (B, ...).
         now: () [s], time since the start of the first plan.
         known_target: whether the targets' paths are known (static).
         predict_movers: whether moving obstacles are predicted from observations (static).
@@ -247,7 +247,7 @@ def fly_intercepts(
         cases: targets, obstacles and observations.
         seed: random seed of the noise on the car's pose, >= 0.
         replan: [Hz], rate of replanning; 0 drives the first plan to its end.
-        planner: planner of all plans, by default `spacetime`.
+        planner: planner of all plans, by default the planner named `spacetime`.
         plan: first plan of each drive; by default it is made here.
         known_target: whether the targets' paths are known instead of predicted.
         predict_movers: whether moving obstacles are predicted from observations instead of known.
@@ -306,7 +306,7 @@ def plan_again(
         movers: predicted moving obstacles at their current positions.
 
     Returns:
-        The drives, the cases of their plans, and (B,) bool, which plans are new.
+        The drives, the cases of their plans, and a mask (B,) of the drives with a new plan.
     """
     pose, speed, curvature = jax.vmap(functools.partial(estimate_state, loop))(drive)
     elapsed = drive.time - drive.began
@@ -329,7 +329,7 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Return drives and cases; `found` replaces the old plan of drives in the mask `good`."""
+    """Replace the plans of the drives in the mask `good` by `found`; return drives and cases."""
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -340,7 +340,7 @@ def _replace_plans(
 
 @jax.jit
 def _sample_paths(path: TurningPath, span: Array) -> Array:
-    """Return equally spaced points of paths from now to a time `span` [s], (paths, points, 2)."""
+    """Return points (paths, points, 2) [m], equally spaced in time from now to `span` [s]."""
     shares = jnp.linspace(0.0, 1.0, _POINTS)
     of_one = lambda path, span: jax.vmap(lambda share: path.at(share * span).pos)(shares)  # noqa: E731
     return jax.vmap(of_one)(path, span)
@@ -353,7 +353,7 @@ def _collect_drives(
     seen: list[tuple[Array, int]],
     number: np.ndarray,
 ) -> Driven:
-    """Collect the result of drives at their end, on the host."""
+    """Collect the results of finished drives in NumPy arrays."""
     drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]

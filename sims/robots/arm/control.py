@@ -18,7 +18,7 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, tot
 
 @dataclasses.dataclass(frozen=True)
 class Gains:
-    """Feedback gains of the arm's controller; static under jit."""
+    """Feedback gains of the arm's controller; static under `jax.jit`."""
 
     frequency: float = 50.0  # [rad/s], natural frequency of the error dynamics
     damping: float = 1.0  # damping ratio; 1 for the fastest response without overshoot

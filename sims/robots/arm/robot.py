@@ -51,7 +51,7 @@ def lanes_of(arm: Arm) -> dict[str, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class ShieldArm:
-    """The simulated six-axis arm with a shield; static under jit."""
+    """The simulated six-axis arm with a shield; static under `jax.jit`."""
 
     # MJCF text of the arm, in the form that `read_arm` accepts.
     xml: str = dataclasses.field(default=_IRB1600, repr=False)
@@ -113,7 +113,7 @@ class ShieldArm:
         )
 
     def at_rest(self, place: Array, gravity: float) -> tuple[Array, Array, Array]:
-        """Return the state at standstill in the home position; `place` (3,) [m] is ignored."""
+        """Return the state at standstill at the joint angles `arm.home`; `place` is ignored."""
         home = jnp.asarray(self.arm.home, place.dtype)
         return home, jnp.zeros_like(home), jnp.zeros(0, place.dtype)
 

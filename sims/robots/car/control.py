@@ -3,7 +3,7 @@
 Lateral feedback is a linear-quadratic regulator over distance instead of time. Per metre, the
 lateral error e and the heading error psi obey e' = psi and psi' = (extra curvature). The gains
 minimise the integral over distance of (e / reach)^2 + (psi / turn)^2 + (extra curvature / bend)^2,
-with the weights `reach`, `turn` and `bend` of `Gains`. They do not depend on the speed.
+with the weights `reach`, `turn` and `bend` of `Gains`. The gains do not depend on the speed.
 """
 
 import dataclasses

@@ -27,7 +27,7 @@ _CLEARANCE = 0.03  # [m], clearance of the body above the ground
 
 @dataclasses.dataclass(frozen=True)
 class Car:
-    """The simulated car with rear drive and front steering; static under jit."""
+    """The simulated car with rear drive and front steering; static under `jax.jit`."""
 
     vehicle: Vehicle = Vehicle()
     gains: Gains = Gains()

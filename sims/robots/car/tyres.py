@@ -35,7 +35,7 @@ def tyre_forces(
     """
     dtype, b = vel.dtype, vehicle.mass_ahead
     cos, sin = jnp.cos(pose[2]), jnp.sin(pose[2])
-    # The mass matrix in the body frame; b is the distance of the centre of mass from the rear axle.
+    # Mass matrix in the body frame; b is the distance of the centre of mass from the rear axle.
     coupling, turning = vehicle.mass * b, vehicle.yaw_inertia + vehicle.mass * b**2
     determinant = vehicle.mass * turning - coupling**2
     inverse = np.array(

@@ -31,7 +31,7 @@ class Tyres:
 
 @dataclasses.dataclass(frozen=True)
 class Vehicle:
-    """A car with rear drive and front steering; static under jit."""
+    """A car with rear drive and front steering; static under `jax.jit`."""
 
     mass: float = 3.0  # [kg]
     yaw_inertia: float = 0.055  # [kg m^2], about the centre of mass

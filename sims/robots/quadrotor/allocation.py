@@ -1,4 +1,4 @@
-"""Control allocation: how the limited rotors share a commanded thrust and torque."""
+"""Control allocation: rotor thrusts, within their limits, for a commanded thrust and torque."""
 
 import jax.numpy as jnp
 from jax import Array, lax
@@ -9,10 +9,10 @@ from planner_jax.robot.quadrotor_model import Rotors
 def rotor_thrusts(rotors: Rotors, thrust: Array, torque: Array, spare: float) -> Array:
     """Return rotor thrusts (4,) [N] that produce a thrust and a torque, within the rotors' limits.
 
-    If the rotors cannot produce both completely, roll and pitch have priority over thrust, because
-    without them the thrust would point in a wrong direction. Thrust has priority over yaw, which
-    does not matter for a round tool. Roll and pitch torques are scaled down if they would require
-    that a rotor's thrust is raised by more than `spare`.
+    If the rotors cannot produce thrust and torque completely, roll and pitch have priority over
+    thrust, since otherwise the thrust would point in a wrong direction. Thrust has priority over
+    yaw, which does not matter for a round tool. Roll and pitch torques are scaled down if they
+    would require that a rotor's thrust is raised by more than `spare`.
 
     Args:
         rotors: parameters of the rotors.

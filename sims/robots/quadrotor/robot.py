@@ -25,7 +25,7 @@ _SEGMENTS = 12  # number of capsules of which the drawn hoop consists
 
 @dataclasses.dataclass(frozen=True)
 class Quadrotor:
-    """The simulated quadrotor with a racket or a net; static under jit."""
+    """The simulated quadrotor with a racket or a net; static under `jax.jit`."""
 
     model: QuadrotorModel
     gains: Gains = Gains()
