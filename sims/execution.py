@@ -61,7 +61,7 @@ class _Setting:
 class Executed:
     """The result of executing B courses (timed joint motions), in float64 arrays (B, ...).
 
-    Errors and torques are evaluated from the time at which an arm may start until its contact time.
+    Errors and torques are evaluated from the earliest start of an arm until its planned contact.
     """
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0

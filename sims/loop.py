@@ -181,7 +181,7 @@ def _with_plans(
 
 
 def _record(loop: Loop, pilot: Pilot, flight: FlightState, drag: Array) -> Record:
-    """Record the state of a flight, and the errors of the predicted ball positions."""
+    """Record a flight's state, and errors of ball positions predicted for the planned contacts."""
     world = loop.world
     horizon = flight.began + pilot.times(flight.plan) - flight.time
     now = moment(world, flight.physics)

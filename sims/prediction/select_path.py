@@ -241,8 +241,7 @@ def chance_within(prediction: Prediction, time: ArrayLike, radius: ArrayLike) ->
 def _errors(prediction: Prediction, time: ArrayLike) -> tuple[Array, Array]:
     """Return offsets (K, 2) [m] of K alternative paths from the selected path, and variances.
 
-    The variances (K,) [m^2] do not include the variance of the centre, which is equal for all
-    paths.
+    The position variances (K,) [m^2] are without `centre_variance`, which is equal for all paths.
     """
     among = prediction.alternatives
     time = jnp.asarray(time, among.middle.dtype)

@@ -93,7 +93,7 @@ class BlockFlights(Flights):
     clearance_after: np.ndarray  # (B,) [m], least clearance after the contact, while the arm brakes
     planned: np.ndarray  # (B,) bool, whether there was a plan
     motions: np.ndarray  # (B,) int, number of motions that the arm started
-    # (B,) [m], error of the first fit to the observed ball; NaN if its flight is known exactly.
+    # (B,) [m], error of the first fitted ball flight; NaN if the flight is known without a fit.
     fit_error: np.ndarray
     last_fit_error: np.ndarray  # (B,) [m], error of the last fit of the ball's flight
 
@@ -125,8 +125,8 @@ def throws(
 def courses_of(cases: BlockCase, plans: BlockPlan) -> Course:
     """Return the courses of arms: joint motion, start time, and braking after the motion.
 
-    The motion of a plan starts after the delay. An arm without a plan stands still. Joints brake
-    with the acceleration limit of the plans.
+    The motion of a plan starts at the time `cases.delay`. An arm without a plan stands still.
+    Joints brake with the acceleration limit of the plans.
     """
     coeffs = np.asarray(plans.motion.coeffs)
     solved = np.asarray(is_solved(plans.status))
@@ -160,12 +160,12 @@ def fly_blocks(
         seed: random seed of the encoders' noise, >= 0.
         drives: limits and errors of the drives.
         planner: planner of all plans, by default the planner named `online`.
-        planning_budget: [s], time for planning at the end of the delay. A plan that takes longer
-            starts late by the excess. If it is None, planning takes no time.
+        planning_budget: [s], time for planning, the last part of the cases' field `delay`. A plan
+            that takes longer starts late by the excess. If it is None, planning takes no time.
         plan: plans of the cases; by default plans are made here.
         seconds: (B,) [s], wall times of the passed plans.
         decided: motions that were planned from observations of the balls, used instead of plans;
-            their delays must equal the delays of the cases.
+            the cases must have the same `delay`.
 
     Raises:
         ValueError: the arm of the cases is not the simulated arm, or the planning budget exceeds

@@ -1,4 +1,4 @@
-"""Replanning of catches during a flight: the pilot that the closed loop calls every period."""
+"""Replanning of catches during a flight: the part of the closed loop that plans in every period."""
 
 import dataclasses
 import functools

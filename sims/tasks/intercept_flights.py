@@ -1,4 +1,4 @@
-"""Runs of `planner-jax fly intercept`: the table of results, recordings and report."""
+"""Runs of the command `planner-jax fly intercept`: table of results, recordings and report."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence

@@ -93,7 +93,7 @@ class Car:
         )
 
     def drive(self, physics: Physics, command: Array, timestep: float) -> tuple[Array, Array]:
-        """Return the drive force and the rate of the steering angle, and the tyre forces (3,).
+        """Return MuJoCo's controls (drive force, rate of the steering angle), and tyre forces (3,).
 
         Args:
             physics: state before the step.

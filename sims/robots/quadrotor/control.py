@@ -40,7 +40,7 @@ class Gains:
     share: float = 0.3  # greatest feedback acceleration, as a fraction of the plan's thrust
     correction: float = 10.0  # [rad/s], greatest body rate that corrects an attitude error
     # Greatest increase of a rotor's thrust that serves to produce a torque, divided by the rotor's
-    # greatest thrust. The value is 1 N for the quadrotors of the papers.
+    # greatest thrust. The increase is 1 N for the quadrotors of [Yu2023bat] and [Yu2023catch].
     spare: float = 1.0 / 11.8
 
 
