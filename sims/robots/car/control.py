@@ -45,7 +45,7 @@ class CarState:
 
 @struct.dataclass
 class Reference:
-    """The planned state of the car at one instant, with inputs planned for one actuator lag later."""
+    """The planned state of the car at one instant, with inputs of one actuator lag later."""
 
     pos: Array  # (2,) [m], position of the rear axle's centre
     heading: Array  # () [rad]
