@@ -223,7 +223,7 @@ def require_planner(planner: object) -> None:
 
 
 def require_fit(planner: Planner, cases: object) -> None:
-    """Raise unless the planner is complete, and the cases belong to the class that it plans."""
+    """Raise unless a planner is a pytree with attempts, and the cases are of its `case_type`."""
     require_planner(planner)
     if jax.tree_util.all_leaves([planner]) and planner.kind is not Kind.HOST:
         rule = "a pytree: put @jax.tree_util.register_static over its frozen dataclass, or make it "

@@ -66,7 +66,7 @@ class Task:
 
     @property
     def draw(self) -> "Callable[..., PyTree]":
-        """Function `draw(num, suite=None, seed=0, *, first=0)` that draws cases of a suite."""
+        """Function `draw(num, suite=None, seed=0, *, first=0)`: random cases of a named family."""
         return self._function("draw")
 
     @property
@@ -185,7 +185,7 @@ def all_tasks() -> dict[str, Task]:
 
 
 def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
-    """Return the entry points of other packages for a task by name, without names in use."""
+    """Return the entry points of other packages for a task by name, unless the name is taken."""
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")

@@ -45,7 +45,7 @@ class Along:
     excess: Excess
     margins: tuple[float, ...]  # (E,), added to each excess before the hinge
     hinge_width: float
-    # Cost per second of a case's extras, which need the whole position; kernels do not compute it.
+    # Cost per second that the user defines (extras of a case). With it no CUDA kernel is used.
     rate: Rate | None = None
     # 4 if the excess depends on position, velocity, acceleration and jerk; 5 if also on the snap.
     orders: int = 4
@@ -198,7 +198,7 @@ def _slopes_by_all(along: Along, columns: Array, durations: Array, parameters: P
 
 
 def _curvature(along: Along, primals: tuple, tangents: tuple) -> tuple:
-    """Return the derivative of `_slopes_by_all` along tangents; None stands for zero tangents."""
+    """Return the derivative along tangents of penalties and slopes; None is a zero tangent."""
     moves = 2 if tangents[2] is None else 3
     slopes = lambda *moving: _slopes_by_all(along, *moving, *primals[moves:])  # noqa: E731
     return jax.jvp(slopes, primals[:moves], tangents[:moves])[1]

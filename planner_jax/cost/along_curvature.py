@@ -71,7 +71,7 @@ def curvature_along(
     rates = jnp.stack(powers)[:, None, None]
     order = np.arange(orders)[:, None, None]
     motion, drift, drift_of_drift = unit * rates[None]  # (orders, K, 3) each
-    # First and second derivatives of the motion's samples by theta = log h.
+    # First and second derivatives of the samples by theta, the logarithm of `piece_duration`.
     first = drift - samples(order) * motion
     second = drift_of_drift - samples(2.0 * order) * drift + samples(order**2) * motion
     value, worst, slope, curvature = _at_samples(along, motion, parameters)
@@ -262,7 +262,7 @@ def _constants(along: Along, given: int) -> _Constants:
 def _matrices(
     along: Along, given: int, places: tuple[tuple[int, int], ...]
 ) -> tuple[np.ndarray, ...]:
-    """Return matrices from second derivatives at samples to those by pairs of columns `places`."""
+    """Return matrices that convert second derivatives at samples to derivatives by columns."""
     constants = _constants(along, given)
     first, second = np.array(places).T
     found = []

@@ -202,7 +202,7 @@ def flight_names(limits: QuadrotorLimits) -> tuple[str, ...]:
 
 
 def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Array]:
-    """Convert the excesses that `flight_excess` returns to relative excesses."""
+    """Convert the excesses of `flight_excess`, mostly q^2 / limit^2 - 1, to q / limit - 1."""
     measures = flight_measures(limits)
     return [of.relative(each) for of, each in zip(measures, excess, strict=True)]
 

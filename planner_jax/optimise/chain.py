@@ -118,7 +118,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return jnp.ones(1, bool)
 
     def relative_excess(self, excess: Array) -> Array:
-        """Convert the excess at the ends of a finished plan to fractions of the limits."""
+        """Convert the excess that `meet` returns for a finished plan to fractions of the limits."""
         return excess
 
     def start_network(self, case: PyTree) -> StartNetwork | None:

@@ -82,7 +82,7 @@ class Differentiated(OptimisedPlanner):
     # The differentiated number: a dotted name in the plan, such as "stroke.time", or a function.
     quantity: Quantity = struct.field(pytree_node=False)
     by: tuple[str, ...] = struct.field(pytree_node=False)  # dotted names in the case
-    # Iterations of conjugate gradients; None for the default of the field `curvature`.
+    # Number of iterations of conjugate gradients; by default 40 for "products" and 1 for "whole".
     steps: int | None = struct.field(pytree_node=False, default=None)
     curvature: str = struct.field(pytree_node=False, default="products")  # see `gradient_at`
 
@@ -167,9 +167,9 @@ def gradient_at(
         quantity: dotted name of a number in the plan, or a function of the plan.
         by: dotted names in the case.
         steps: iterations of conjugate gradients, each with one product with the Hessian. They stop
-            early if the Hessian is not positive. 0 leaves the adjoint out, which is correct for
-            "cost": its derivative at an optimum is the derivative at a fixed point (envelope
-            theorem). None stands for the default of `curvature`.
+            early if the Hessian is not positive. 0 sets the adjoint vector to zero, which is
+            correct for "cost": its derivative at an optimum is the derivative at a fixed point
+            (envelope theorem). None: 40 for "products", 1 for "whole".
         curvature: "products" uses products and preconditioner of the planner's `curvature_at`;
             "whole" uses the inverse of the full Hessian as preconditioner, which takes one product
             for each of n variables.
@@ -236,7 +236,7 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    """Return a function that multiplies by the Hessian's `positive_inverse`, and `product`."""
+    """Return functions that multiply by the Hessian's inverse (positive pivots), by the Hessian."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
     return lambda right: jnp.sum(inverse * right[None], axis=1), product

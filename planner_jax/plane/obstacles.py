@@ -41,8 +41,9 @@ def obstacles(
     """Make the obstacles of one case from lists of corners.
 
     Args:
-        polygons: corners (V_k, 2) [m] of each obstacle at time 0, convex, in either orientation.
-        velocities: (2,) [m/s] for all obstacles, or (N, 2) with one velocity per obstacle.
+        polygons: a sequence with an array of corners (V, 2) [m] at time 0 for each obstacle. Each
+            obstacle is convex and has its own number V of corners, in either orientation.
+        velocities: (2,) [m/s] for all obstacles, or (N, 2), one for each of N obstacles.
         room: capacity of the arrays, a pair (number of obstacles, number of corners). By default
             it is what the polygons need. Cases of equal capacity share a compiled program.
         dtype: floating type of the arrays.

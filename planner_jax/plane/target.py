@@ -51,7 +51,7 @@ class TurningPath:
 
 @struct.dataclass
 class PolynomialPath:
-    """A polynomial in time on each axis [Qu2022, eq. 9]."""
+    """Path of a target: a polynomial of degree n in time on each axis [Qu2022, eq. 9]."""
 
     coeffs: Array  # (n + 1, 2) [m/s^k], in ascending powers of the time
     origin: Array  # () [s], the time from which the powers count

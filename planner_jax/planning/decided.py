@@ -44,7 +44,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the best plan of each case, for one case or a batch; it stores its choice, too."""
+        """Return the best plan among the proposed choices, for one case or each case of a batch."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)
@@ -69,7 +69,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return plans.replace(status=status if on_devices else np.asarray(status))
 
     def _plan_all(self, drive: Drive, cases: PyTree, choices: PyTree) -> tuple[PyTree, PyTree]:
-        """Plan every case with every choice; return the decided cases (B,) and their best plans."""
+        """Plan every case with every choice; return the cases with their best choice, and plans."""
         xp = jnp if drive.is_pure else np
         num = len(choices)
         if not drive.is_pure:
@@ -103,7 +103,7 @@ def _split(choices: PyTree, axis: int) -> list[PyTree]:
 
 @jax.jit
 def _propose_all(decision: Decision, cases: PyTree) -> list[PyTree]:
-    """Return a list of proposals, best first; an entry has one choice for each of the cases."""
+    """Return a list of proposals, best first; for a batch, each entry has one choice per case."""
     if cases.batch_shape == ():
         return _split(decision.propose(cases), 0)
     return _split(jax.vmap(decision.propose)(cases), 1)

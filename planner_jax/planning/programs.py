@@ -77,7 +77,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
         return Sizes(chunk, busy)
     if mesh.devices[0].platform != "cpu":
         return Sizes(max(_GPU_LEAST, _GPU_CHUNK // attempt.starts), busy, _GPU_LEAST)
-    # Small chunks are enough for sequential solving, and keep all cores busy until the end.
+    # If a core solves one case after another, small chunks keep all cores busy until the end.
     if planner.is_sequential:
         return Sizes(BUCKETS[0], busy)
     starts = 1 << (attempt.starts - 1).bit_length()  # number of starts, up to a power of two
@@ -85,7 +85,7 @@ def sizes_of(planner: Planner, attempt: Attempt, chunk: int | None, mesh: Mesh) 
 
 
 def on_devices(planner: Planner, devices: Sequence[jax.Device] | None) -> tuple[Planner, Mesh]:  # pyright: ignore[reportInvalidTypeForm]
-    """Return the planner with its arrays on the devices, by default all local ones, and a mesh."""
+    """Return the planner with its arrays on all devices, and a mesh of the devices; None: local."""
     mesh = Mesh(np.array(jax.local_devices() if devices is None else devices), ("lanes",))
     if jax.tree.leaves(planner):
         planner = jax.device_put(planner, replicated_sharding(mesh))

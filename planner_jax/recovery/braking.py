@@ -23,7 +23,7 @@ _SPARE = 0.98  # fraction of each limit that braking uses
 _SAMPLES = 400  # number of times at which distances are computed
 _GAP = 1e-3  # [m] least distance at these times, since it may be smaller in between
 _DECELERATIONS = (1.0, 0.7, 0.4)  # tried decelerations / the car's greatest deceleration
-# Final curvatures to try, as fractions of the greatest curvature, after the plan's last one.
+# Final curvatures to try after the curvature at the plan's end, as fractions of the greatest one.
 _CURVATURES = (0.0, 0.5, -0.5, 1.0, -1.0)
 _USUAL = 1.0  # [m/s^2] or [1/m], value that replaces an infinite limit
 _SLOWER = (1.5, 2.0, 3.0)  # tried durations / the shortest in which all joints can stop
@@ -59,7 +59,8 @@ def _car_candidates(case: PyTree, plan: CarPlan) -> Iterator[tuple[np.ndarray, n
         for limit in (limits.acceleration, limits.curvature)
     )
     targets = [bend, *(_SPARE * share * sharpest for share in _CURVATURES)]
-    # The slope d(delta)/d(kappa) = L / (1 + (L kappa)^2) of the steering angle is greatest at 0.
+    # The steering angle is atan(L kappa) for the wheelbase L and the curvature kappa. Its slope is
+    # at most L, so the steering rate / L is a safe bound on the rate of the curvature.
     turn = _SPARE * float(limits.steering_rate) / float(case.body.wheelbase) * step
     for share in _DECELERATIONS:
         num = max(int(np.ceil(first / (_SPARE * share * quickest * step))), 1)

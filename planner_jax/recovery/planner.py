@@ -51,7 +51,8 @@ class RecoveryPlanner(ChainPlanner[RecoveryCase, RecoveryPlan]):
     decode_nodes = (40, 40)
     proportions: tuple[float, ...] = (0.4, 0.8, 1.0, 1.0, 1.0)  # relative durations of the pieces
     to: str = "brake"  # where to stand still: "brake" anywhere, "home" at the case's `home`
-    # The preceding plan may end at its limits, so later rounds reduce the margin below the limits.
+    # The preceding plan may end close to its limits, where the usual margin is exceeded. So later
+    # rounds (attempts) reduce the margin that the search keeps from the limits.
     rounds: tuple[Round, ...] = (
         Round(starts=1, solver=LbfgsConfig(max_steps=25)),
         Round(starts=2, solver=LbfgsConfig(max_steps=80), settings=(("margin", 0.01),)),

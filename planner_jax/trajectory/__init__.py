@@ -1,1 +1,1 @@
-"""Piecewise polynomials and minimum-control splines."""
+"""Trajectories as piecewise polynomials, and splines of least energy, such as minimum snap."""

@@ -67,10 +67,10 @@ class ProportionalMinco:
         return len(self.proportions)
 
     def sample_matrix(self, nodes: int, derivative: int) -> np.ndarray:
-        """Return the matrix (M nodes + 1, C) that samples a derivative, 0 for the position.
+        """Return the matrix that maps C columns to samples of a derivative, 0 for the position.
 
-        There are `nodes` + 1 samples on each of the M pieces, and neighbours share one. The samples
-        are the matrix times [b; y] / h^derivative.
+        Each of M pieces has `nodes` + 1 samples, and neighbours share one, so that the shape is
+        (M nodes + 1, C). The product is divided by h^derivative for a mean piece duration h.
         """
         degree = 2 * self.order - 1
         factors = derivative_factors(degree, derivative)
@@ -311,7 +311,7 @@ class Chain:
 
     @property
     def columns(self) -> Float[Array, "N columns 3"]:
-        """The boundary rows and the offsets, concatenated."""
+        """Columns that define each segment: its boundary rows, then its whitened offsets."""
         return jnp.concatenate([self.rows, self.offsets], axis=1)
 
 
@@ -320,7 +320,7 @@ def chain_rows(
     tail_states: Float[Array, "N 4 3"],
     piece_durations: Float[Array, " N"],
 ) -> Float[Array, "N 8 3"]:
-    """Return the boundary rows of every segment of a chain, from the states at the ends."""
+    """Return the boundary rows (scaled position to jerk at both ends) of N consecutive segments."""
     heads = jnp.concatenate([head_state[None], tail_states[:-1]])
     return jax.vmap(boundary_rows)(heads, tail_states, piece_durations)
 
