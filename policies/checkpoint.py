@@ -22,7 +22,8 @@ from planner_jax.policies.networks import NETWORKS
 from planner_jax.policies.observation import FEATURES
 
 FORMAT = 2  # version number of the format of checkpoints
-# Policies in the package: "catch" is trained on eight families of cases, "rush6" on one of them.
+# Names of the trained policies in the package: "catch" is trained on eight families of cases, and
+# "rush6" on one family.
 SHIPPED = ("catch", "rush6")
 _OF_FLAX = ("parent", "name")  # fields of every Flax module, which are not sizes of the network
 

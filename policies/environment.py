@@ -71,8 +71,8 @@ class CatchEnv(Env):
     def reset(self, rng: Array) -> State:
         """Draw the first cases of B environments, and return their state.
 
-        `rng` are keys (B, 2), of which only the first is used. B must be a multiple of the number
-        of suites.
+        `rng` are B random keys (B, 2). Only the first key is used. B must be a multiple of the
+        number of suites.
         """
         num = rng.shape[0]
         if num % len(self.suites):

@@ -66,7 +66,7 @@ class Attention(nn.Module):
 
 
 class Value(nn.Module):
-    """The value network of PPO: self-attention over the targets, then a mean over those present."""
+    """The value network of PPO: self-attention over targets, then a mean over present targets."""
 
     width: int = 64  # number of features of each target within the network
     heads: int = 4  # number of attention heads

@@ -267,7 +267,7 @@ def _train_part(
     params: Any,
     tell: Callable[[int, Mapping[str, Any]], None],
 ) -> Any:
-    """Train one part and return the parameters after it, NumPy leaves.
+    """Train one part, and return the parameters after the part as NumPy arrays.
 
     Args:
         training: settings of the training.
@@ -275,7 +275,8 @@ def _train_part(
         number: number of the part, from which its seed is computed.
         network: network of the policy, a Flax module.
         params: parameters before the part, in the form of Brax.
-        tell: callback that Brax calls with decisions and metrics for each row of the curve.
+        tell: callback that Brax calls for each row of the learning curve, with the number of
+            decisions and the metrics.
     """
     env = _environment(training, part)
     rows, each = _rows_and_updates(part, training.num_envs)

@@ -19,7 +19,7 @@ _EXAMINED = (
     *(("hit", None), ("catch", "throws"), ("catch", "triangle3")),
     *(("intercept", "hard"), ("block", None)),
 )
-_SMALL = 0.05  # [s] Programs that compile faster are only part of the row "all".
+_SMALL = 0.05  # [s] programs that compile faster have no row, and only count in the sums
 _EVENTS = {  # fields of `Program` that hold the durations of JAX's events
     "/jax/core/compile/jaxpr_trace_duration": "tracing",
     "/jax/core/compile/jaxpr_to_mlir_module_duration": "lowering",

@@ -197,7 +197,7 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
 
 
 def lacks_recovery(plan: Plan) -> bool:
-    """Test whether one plan does not end at standstill; raise `ArgumentError` like `robot_of`."""
+    """Test whether a plan does not end at standstill; raise if it is of no robot known here."""
     robot_of(plan)
     return not is_rested(plan)
 

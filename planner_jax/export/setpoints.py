@@ -59,7 +59,7 @@ ROBOTS = (
 
 
 def robot_of(plan: Plan) -> Robot:
-    """Return the entry of `ROBOTS` for a plan; raise `ArgumentError` if it cannot be exported."""
+    """Return the kind of robot of a plan; raise `ArgumentError` if the plan cannot be exported."""
     robot = next((robot for robot in ROBOTS if isinstance(plan, robot.plan)), None)
     if robot is None:
         names = ", ".join(robot.name for robot in ROBOTS)

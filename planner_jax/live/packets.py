@@ -110,7 +110,7 @@ def request(
 
 
 def read_request(data: bytes) -> Packet | Fault:
-    """Decode and check a request; return its content, or the fault if it is not readable."""
+    """Decode and check a request; return its content, or the reason why it is not readable."""
     if data[:4] != MAGIC:
         return Fault.STRANGE
     if len(data) < _HEADER.size:

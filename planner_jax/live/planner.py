@@ -77,7 +77,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     """Plans for one ball at a time, and answers packets with setpoints.
 
     Args:
-        stroke: the task, such as `HitStroke()`.
+        stroke: the task to hit or to catch balls, such as `HitStroke()`.
         rate: [Hz], rate of the setpoints in an answer.
         horizon: number K of setpoints in an answer.
         deadline: [s], longest time from the arrival of a packet to its answer.
@@ -135,7 +135,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         self.report.begin()
 
     def answer(self, data: bytes, sender: Hashable, received: float) -> bytes | None:
-        """Use the measurement in a packet; return the answer's packet, None if it is unreadable.
+        """Use the measurement in a packet; return the answer, or None for an unreadable packet.
 
         `received` [s] is the arrival time by `time.perf_counter()`.
         """

@@ -16,7 +16,7 @@ PORT = 5560  # default UDP port of the server
 
 @dataclasses.dataclass(frozen=True)
 class ServeSettings:
-    """Options of `planner-jax serve` for any task; an invalid value raises `ArgumentError`."""
+    """Options of `planner-jax serve` for both tasks; an invalid value raises `ArgumentError`."""
 
     port: int = option(PORT, "N", "UDP port of this machine; 0 selects a free port")
     rate: float = option(100.0, "HZ", "rate of the setpoints in an answer [Hz]")

@@ -25,9 +25,9 @@ _SPREAD = 15.0  # [m/s], assumed standard deviation of the velocity at the first
 _DENSITY = 0.01  # [m^2/s^3], power spectral density of accelerations not in the flight model
 # An observation is an outlier if its Mahalanobis distance from the prediction is above this number.
 _GATE = 5.0
-_OTHERS = 5  # number of consecutive outliers after which the filter starts anew
-_FORGOTTEN = 0.3  # [s], time without an observation after which the filter starts anew
-_LEAST = 3  # least number of observations before the velocity counts as known
+_OTHERS = 5  # number of consecutive outliers after which the filter deletes its estimate
+_FORGOTTEN = 0.3  # [s], time without an observation after which the filter deletes its estimate
+_LEAST = 3  # least number of observations from which the velocity counts as known
 
 
 @struct.dataclass
@@ -94,10 +94,11 @@ class Sight:
     def see(
         self, number: int, pos: tuple[float, ...], measured: float, until: float
     ) -> tuple[BallState | None, Fault]:
-        """Update the estimate; return the ball at the time `until` [s], and the fault if any.
+        """Update the estimate, and predict the ball at the time `until` [s].
 
-        The ball `number` was observed at `pos` (3,) [m] at the time `measured` [s]. The predicted
-        ball has NumPy leaves (3,), or is None at the first observation and after a fault.
+        The ball `number` was observed at `pos` (3,) [m] at the time `measured` [s]. Returns the
+        predicted ball, or None at the first observation and after a fault; and the fault, which is
+        the reason why the observation is not used, or `Fault.NONE`.
         """
         belief = self._belief
         if belief is None or number != self.number or measured - self._time > _FORGOTTEN:

@@ -147,10 +147,10 @@ class HitStroke(Stroke[HitCase, HitPlan]):
 
 
 def _time_left(case: CatchCase) -> Array:
-    """Return the time (1,) [s] until the falling ball is too low for an upright net, or 0."""
+    """Return the time (1,) [s] until a falling ball is too low for the net, 0 if it is already."""
     height = case.limits.min_height + case.net.height
     path = jax.tree.map(lambda leaf: leaf[0], case.targets)
-    # The bisection starts at the ball's apex, since a rising ball may be too low at time 0.
+    # The bisection starts at the ball's highest point, since a rising ball may be low at time 0.
     start = jnp.maximum(path.ball.vel[2], 0.0) / path.gravity
 
     def halve(_: int, bounds: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -299,7 +299,7 @@ def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _pick_samples(values: np.ndarray, lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
-    """Return values[..., lane, sample]; a last axis of length 1 holds values of all samples."""
+    """Return values[..., lane, sample]; values that do not change have a last axis of length 1."""
     return values[..., lane, sample if values.shape[-1] > 1 else 0]
 
 

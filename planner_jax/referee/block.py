@@ -49,7 +49,7 @@ _SENTENCES = {
     "outer box before it gets into the inner one",
 }
 LIMITS = tuple(_SENTENCES)
-# Fields of a case that may be infinite; the limits of joint velocities and accelerations may too.
+# Fields of a case that may be infinite, besides limits of joint velocities and accelerations.
 _UNBOUNDED_LEAVES = ("arm.lower", "arm.upper", "offset", "tilt")
 _SIDES = ("lower", "upper")
 _CASE_SHAPES: dict[str, tuple[int, ...]] = {

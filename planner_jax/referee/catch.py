@@ -393,7 +393,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """Reduce a test (failed, excess, time), each (B, N), to the worst catch (B,) of each plan."""
+    """Reduce a test of all catches to a test of each plan, with the excess of its worst catch."""
     failed, excess, time = test
     failed = failed & held
     counts = failed | (held & np.isnan(excess))

@@ -42,7 +42,7 @@ def worst_extras(pieces: Pieces, lanes: np.ndarray, extras: tuple, u: np.ndarray
 
     Args:
         pieces: trajectories of B plans.
-        lanes: (B,), index of each plan's case in the arrays of `extras`.
+        lanes: (B,), indices of the plans' cases in the arrays of `extras`.
         extras: extras of all cases of the batch, limits and terms of the cost.
         u: (S,), sampled fractions of a piece's duration, from 0 to 1.
     """

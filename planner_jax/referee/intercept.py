@@ -43,7 +43,7 @@ _SENTENCES = {
     "heading": "the heading is {excess:.3g} rad off the required one at {time:.3f} s",
 }
 LIMITS = tuple(_SENTENCES)
-# Fields of a case that may be infinite, like the limits of the car.
+# Fields of a case that may be infinite, besides the limits of the car.
 _UNBOUNDED = ("lower", "upper", "tolerance", "heading_tolerance")
 
 LONGEST_STEP = 0.02  # [s], greatest time between two samples of the motion
@@ -313,7 +313,7 @@ def _judge_limits(case: dict, span: np.ndarray, relative: float) -> tuple[dict, 
         name: above(value, case[f"limits.{name.replace(' ', '_')}"], relative, time)
         for name, (value, time) in peaks.items()
     }
-    # The car may not drive backwards: a negative speed fails the same test as too high a speed.
+    # The car may not drive backwards. A negative speed fails the test of the speed limit.
     limit = case["limits.speed"][:, None]
     scale = np.where(np.isinf(limit), 1.0, np.maximum(limit, SMALLEST_LIMIT))
     excess, when = _greatest(np.maximum(v - limit, -v) / scale, knots)

@@ -36,7 +36,7 @@ class Pieces:
     flown: np.ndarray  # (B, M) bool, whether a piece is used
 
     def of(self, lanes: slice) -> "Pieces":
-        """Return the pieces of the trajectories in the slice `lanes` of the batch."""
+        """Return the pieces of some trajectories of the batch, in the slice `lanes`."""
         others = (part[lanes] for part in (self.durations, self.starts, self.flown))
         return Pieces(self.coeffs[:, lanes], *others)
 
@@ -122,7 +122,7 @@ def check_coeffs(value: ArrayLike) -> np.ndarray:
 
 
 def read_flight(cases, plans) -> dict[str, np.ndarray]:
-    """Read the arrays of cases and plans that `judge_motion` needs, except the head state."""
+    """Read the arrays of cases and plans for the tests of the flight, except the start state."""
     coeffs = check_coeffs(plans.trajectory.coeffs)
     num_lanes, num_pieces = coeffs.shape[:2]
     leaves = {"lane": np.arange(num_lanes), "coeffs": coeffs}
@@ -344,7 +344,7 @@ def judge_motion(
 
     Returns the measurements of `FlightVerdict`, and tests (failed, excess, time) by name. The
     dictionary `case` has "head_state" and the arrays of `read_flight`. The tolerance of the start
-    state and of jumps between pieces is `continuity` times the scale of `joint_errors`.
+    state and of jumps is `continuity` times the largest coordinate at ends of pieces (>= 1 m).
     """
     found = peaks(pieces, case["gravity"], intervals)
     head, jump, jump_time, scale = joint_errors(pieces, case["head_state"])

@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return for each damaged file the reason, by path; also if all files lack `num` rows."""
+        """Return the damage of each damaged file, by path; also if there are not `num` rows."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
@@ -114,7 +114,7 @@ class Dataset:
         return self._open().to_table(columns=None if columns is None else list(columns))
 
     def parts(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield one table for each file, with those of the named columns that the file has."""
+        """Yield one table for each file; named columns that the file does not have are left out."""
         for fragment in self._open().get_fragments():
             names = fragment.physical_schema.names
             known = None if columns is None else [name for name in columns if name in names]

@@ -70,7 +70,7 @@ class RunFolder:
 
     @contextlib.contextmanager
     def lock(self) -> Iterator[None]:
-        """Hold the folder's lock within the `with` block; raise `ArgumentError` if it is held."""
+        """Hold the folder's lock within the block; raise if another process holds the lock."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -37,7 +37,7 @@ def recovery_option(usual: str = NONE) -> str:
 
 
 def recovery_options(value: str) -> dict[str, str]:
-    """Return a planner's keyword arguments for a value of the setting `recovery`, or raise."""
+    """Return the planner's arguments for the setting `recovery`; raise if the value is unknown."""
     require_one_of(CHOICES, "recovery", value)
     return {} if value == NONE else {"recovery": value}
 
@@ -124,7 +124,7 @@ class SweepSettings:
 
 
 def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Options) -> AnySettings:
-    """Return the stored settings of a run; raise if they differ from those repeated in `given`."""
+    """Return the stored settings of a run; raise if a setting in `given` has another value."""
     settings = settings_of_manifest(kind, parameters, "out")
     asked = dataclasses.replace(settings, **given)
     for name in given:
@@ -136,7 +136,7 @@ def settings_to_resume(kind: type[AnySettings], parameters: Options, given: Opti
 def settings_of_manifest(
     kind: type[KnownSettings], parameters: Options, name: str
 ) -> KnownSettings:
-    """Return a run's settings, of class `kind`, from its manifest, or raise `ArgumentError`."""
+    """Return a run's settings from its manifest; raise `ArgumentError` if they break a rule."""
     try:
         return kind(**parameters)
     except (TypeError, ValueError) as error:

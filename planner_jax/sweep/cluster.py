@@ -60,7 +60,8 @@ def workers_of(kind: str | None) -> Iterator[Workers | None]:
     with tempfile.TemporaryDirectory("", "ray-", "/tmp", ignore_cleanup_errors=True) as folder:
         _start(ray, folder)
         try:
-            # Let JAX use one GPU in this process, because each worker uses one GPU too.
+            # Let JAX use one GPU in this process. Each worker uses one GPU, and the device that the
+            # run records must be equal in all processes.
             os.environ[_GPUS] = os.environ.get(_GPUS, "0").partition(",")[0]
             os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
             on_gpus = require_backend() == "gpu"
@@ -92,7 +93,7 @@ def _start(ray: ModuleType, folder: str) -> None:
         rule = "the address of a Ray cluster that answers, or left out where Ray starts"
         raise ArgumentError(_ADDRESS, rule, shown=f"{address!r} ({reason})") from None
     finally:
-        # Ray replaces the handler of SIGTERM in the main thread, so that it is set again.
+        # Ray has replaced this process's handler of SIGTERM. Restore the original handler.
         with contextlib.suppress(ValueError):
             signal.signal(signal.SIGTERM, handler)
 

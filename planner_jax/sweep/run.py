@@ -45,7 +45,7 @@ def start_sweep(
 
     Args:
         task: task of the sweep.
-        settings: settings of the sweep, of the settings class that the task names.
+        settings: settings of the sweep, of the class that belongs to the task.
         out: folder of the run, which must be missing or empty.
         progress: whether to show a progress bar on the standard error stream.
         workers: "ray" lets the workers of a Ray cluster plan the chunks of cases, on all its GPUs
@@ -104,7 +104,7 @@ def resume_sweep(
         task: task of the sweep.
         out: folder of the run.
         progress: whether to show a progress bar on the standard error stream.
-        workers: "ray" or None as for `start_sweep`, independent of the workers used so far.
+        workers: "ray" or None as for `start_sweep`; the interrupted sweep may have used others.
         **given: settings by name that the caller repeats; they must equal the run's settings.
 
     Returns:

@@ -152,7 +152,7 @@ def sweep_of(task: Task) -> Sweep:
 
 
 def sweep_of_run(manifest: Entries, name: str = "out") -> Sweep:
-    """Return the sweep object for a run's task, or raise `ArgumentError` about argument `name`."""
+    """Return the sweep object for a run's task; raise unless it is a sweep of a known task."""
     first, _, task = str(manifest["kind"]).partition(" ")
     if first != "sweep":
         raise ArgumentError(name, "the folder of a sweep", shown=f"a {manifest['kind']}")

@@ -40,7 +40,7 @@ class Margin:
     """How close a plan comes to one limit."""
 
     limit: str  # name and unit of the limit
-    reached: float  # the plan's value closest to the limit
+    reached: float  # value of the limited quantity where the plan is closest to the limit
     allowed: float  # the limit
     time: float  # [s], time at which the plan is closest to the limit
     least: bool = False  # whether the limit is a lower bound

@@ -14,13 +14,13 @@ from planner_jax.task.catch.spec import DECISIONS, TRAINED
 from planner_jax.task.hit.spec import DRAG
 
 _OWN = "(default: the robot's)"
-# Greatest number of balls: the planner evaluates all orders in which they can be caught.
+# Greatest number of balls. The planner evaluates all orders of the catches, 720 for six balls.
 _MOST_BALLS = 6
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class SingleSettings:
-    """Options of `planner-jax plan` for every task of a quadrotor; a subclass adds the task's.
+    """Options of `planner-jax plan` for hits and catches; a subclass adds options of one task.
 
     Each field is an option. Its `metavar`, such as "X Y Z", has one word for each number of the
     option's value. A value that breaks a rule raises `ArgumentError`.

@@ -1,6 +1,6 @@
 """Receding-horizon planning of blocks: a motion is planned again as more observations arrive.
 
-At specified moments the ball's flight is fitted to all observations so far. If the current motion
+At specified times (moments) the flight is fitted to all observations so far. If the current motion
 still meets the newly fitted ball near the shield's centre, the arm continues it. Otherwise a new
 motion is planned from the state that the arm will have when the new motion can start. If no new
 motion meets the ball closer to the shield's centre, the arm continues its current motion and brakes
@@ -51,7 +51,7 @@ _LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer tha
 
 @dataclasses.dataclass(frozen=True)
 class Aim:
-    """Requirements on the contact with an estimated ball, stricter than those of its case."""
+    """Requirements on the contact with an estimated ball, added to the requirements of a case."""
 
     offset: float  # [m] greatest distance of the contact from the shield's centre
     at_rest: bool = False  # whether the arm must be at rest at the contact
@@ -133,13 +133,13 @@ def decide(
         cases: a batch of B cases with the true balls, and with the arms' initial states.
         eye: the camera, its noise and its frame rate.
         moments: [s], increasing times at which the flights are fitted to all observations so far.
-        overhead: [s], time from a moment until a new motion may start, which includes the planning
-            time, >= 0.
+        overhead: [s], time from the fit of a flight until a new motion may start, which includes
+            the planning time, >= 0.
         seed: seed of the noise, or one seed for each throw, (B,).
         aims: requirements on the contact, tried in this order; offsets must not decrease.
         shortest: [s], time before the latest possible contact in which no new motion is started.
-        patient: whether an arm that has not started waits for more observations as long as a motion
-            from the next moment would still meet the first aim.
+        patient: whether an arm that has not started waits for more observations, as long as a
+            motion that starts later would still meet the first aim.
         again: whether an arm may replace its motion; if not, it starts one motion only.
 
     Raises:

@@ -8,7 +8,7 @@ from planner_jax.runs.manifest import Entries
 from planner_jax.runs.settings import option
 from planner_jax.studies.block.settings import StudySettings, require_moderate
 
-# Names of the sets of joint limits: the keys of `planner_jax.robot.arm.REGIMES`, without JAX.
+# Names of the sets of joint limits. They are repeated here, since `robot.arm` would import JAX.
 REGIMES = ("R1", "R2", "R3")
 
 

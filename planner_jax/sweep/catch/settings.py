@@ -36,7 +36,8 @@ class CatchSettings(QuadrotorSettings):
     PLANNER: ClassVar[tuple[str, ...]] = ("decide",)
     DRAW: ClassVar[tuple[str, ...]] = ("limit_scale", "robot")
     JUDGE: ClassVar[tuple[str, ...]] = ("tolerance", "net_test")
-    # With six targets, evaluating all 720 orders takes 1 MB of memory for each case of a batch.
+    # Number of cases in a batch on a GPU. It is small, because evaluating the 720 orders of six
+    # targets takes 1 MB of memory for each case.
     GPU_BATCH: ClassVar[int] = 8192
 
     def __post_init__(self) -> None:

@@ -108,7 +108,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return [f"{text}."]
 
     def remarks(self, manifest: Entries) -> list[str]:
-        """Return sentences for the report: robot, cases, decision, limits and rules of success."""
+        """Return sentences on robot, cases, how catches were ordered, limits, and what succeeds."""
         settings, limits = manifest["parameters"], manifest["setting"]
         gravity = limits["gravity"]
         return [

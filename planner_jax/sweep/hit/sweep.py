@@ -40,7 +40,7 @@ class ServeSource(Source):
     folder: Serves | None  # all serves of published files, if the settings name a folder of files
 
     def cases(self, first: int, last: int) -> Chunk:
-        """Return cases `first` to `last - 1` with their serves, or raise `ArgumentError`."""
+        """Return cases `first` to `last - 1` with their serves; raise if a case breaks a rule."""
         settings = self.settings
         if self.folder is not None:
             serves = self.folder[first:last]
@@ -55,7 +55,7 @@ class ServeSource(Source):
         return Chunk(serves.index, jax.tree.map(np.asarray, cases), serves)
 
     def check(self) -> PyTree:
-        """Check the cases of the first chunk, or of all chunks if serves are read from files."""
+        """Check the first block of cases, or all cases if their serves are read from files."""
         cases = super().check()
         for chunk in range(1, 1 if self.folder is None else self.num_chunks):
             self.chunk(chunk)
@@ -120,7 +120,7 @@ class HitSweep(Sweep[HitSettings]):
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
         """Return the source of a sweep's cases; a folder of published serves is read completely."""
-        # Suites that other packages add cannot be used, as only this task's suites define serves.
+        # Suites that other packages add cannot be used, since they define cases without serves.
         require_one_of(TASK.suites, "suite", str(settings.suite))
         folder = None if settings.serves is None else read_serves(settings.serves)
         if folder is not None and (settings.num or 0) > len(folder):

@@ -115,7 +115,7 @@ _COLOURS_OF_TIME = ListedColormap(colormaps["viridis"](np.linspace(0.0, 5.0 / 6.
 
 
 def plane_figure(figure: Figure, run: RunRows) -> None:
-    """Draw the run's example and some other cases from above, one panel for each case."""
+    """Draw some cases of a run from above, one panel for each case."""
     setting = run.manifest["setting"]
     drives = [sample_drive(row, setting, _SAMPLES) for row in choose_rows(run)]
     latest = max(drive.row["due_time"] for drive in drives)
@@ -138,7 +138,7 @@ def plane_figure(figure: Figure, run: RunRows) -> None:
 
 
 def choose_rows(run: RunRows) -> list[Row]:
-    """Return the example's row, evenly spaced rows of other successes, and at most two failures."""
+    """Return the rows of the drawn cases: the report's example, successes, at most two failures."""
     (_, example), rows = run.same_case()[0], run.sample()
     others = [row for row in rows if row["index"] != example["index"]]
     failures = [row for row in others if not row["success"]][:_FAILURES]
