@@ -166,7 +166,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Replace the plans of flights by new plans, where the pilot accepts these."""
+    """Replace the plans of flights by new plans, where the pilot accepts a new plan."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)

@@ -117,7 +117,11 @@ def throws(
     wide: bool = False,
     delay: float = 0.0,
 ) -> Throws:
-    """Draw throws of a suite by `pj.block.draw`; the keywords are options of `pj.block.case`."""
+    """Draw throws of a suite by `pj.block.draw`.
+
+    `regime` names the joint limits of plans, `wide` allows contacts 0.1 m from the shield's centre,
+    and `delay` [s] is the time from the first sight of a ball until the arm starts.
+    """
     cases = draw_throws(num, suite, seed, regime=regime, wide=wide, delay=delay)
     return Throws(index=np.arange(num), cases=jax.tree.map(np.asarray, cases))
 

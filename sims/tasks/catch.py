@@ -238,7 +238,7 @@ class CatchFlight(BallFlightTask):
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor, by default of [Yu2023catch]."""
+        """The model of the quadrotor; by default the quadrotor of [Yu2023catch]."""
         return self.settings.robot or PAPER_CATCHER
 
     def cases(self) -> Throws:

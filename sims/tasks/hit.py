@@ -122,7 +122,7 @@ class HitPilot:
     def pose_problem(
         self, case: HitCase, plan: HitPlan, outlook: Outlook
     ) -> Replanning[HitCase, HitPlan]:
-        """Return the problem for the predicted ball and robot; `plan` is the current plan."""
+        """Return the replanning problem for the predicted ball and robot; `plan` is now flown."""
         return Replanning(
             case=replace_ball(case, outlook.balls, outlook.drag, outlook.head_state),
             previous=plan,
@@ -152,7 +152,7 @@ def replace_ball(case: HitCase, balls: BallState, drag: Array, head: Array) -> H
 
 @dataclasses.dataclass(frozen=True)
 class Volleys(FlightCases):
-    """B served balls as cases at the start of their plans, and initial drag estimates."""
+    """B cases, each a served ball at the start of its plan, and initial estimates of drag."""
 
     cases: HitCase  # leaves (B, ...), with the true ball and drag
     believed: np.ndarray  # (B,), initial estimate of K_D [1/m]
@@ -295,7 +295,7 @@ class HitFlight(BallFlightTask):
 
     @property
     def robot(self) -> QuadrotorModel:
-        """The model of the quadrotor, by default of [Yu2023bat]."""
+        """The model of the quadrotor; by default the quadrotor of [Yu2023bat]."""
         return self.settings.robot or PAPER_HITTER
 
     def cases(self) -> Volleys:

@@ -1,8 +1,8 @@
 """Dimensions and limits of the simulated car, and its tyres.
 
-The car is a model car of scale 1:10, as in `planner_jax.task.intercept.case`. [Qu2022] reports none
-of these numbers. The limits of drive and steering are 50 % above the limits of plans, which leaves
-a margin for control.
+The car is a model car of scale 1:10, as in `planner_jax.task.intercept.case`. [Qu2022] reports no
+dimensions and limits. The limits of drive and steering are 50 % above the limits of plans, which
+leaves a margin for control.
 """
 
 import dataclasses

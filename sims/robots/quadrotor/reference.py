@@ -1,4 +1,4 @@
-"""References of a quadrotor: a plan's trajectory and attitude, then a piece that brakes to hover.
+"""The planned states that a quadrotor tracks: a plan's trajectory, and then braking to hover.
 
 World frame, z up; body rates in the body frame.
 """
