@@ -56,7 +56,7 @@ class Regime:
 
 
 def _regime(factor: float, acceleration: float, ends_at_rest: bool) -> Regime:
-    """Return limits for the arm IRB 1600-6/1.2: `factor` times the speeds of its data sheet."""
+    """Return joint limits of the IRB 1600-6/1.2: `factor` times the speeds of its data sheet."""
     speeds = np.deg2rad(np.array([150, 160, 170, 320, 400, 450], np.float32))
     accelerations = np.full(6, acceleration, np.float32)
     limits = ArmLimits(host_leaf(factor * speeds), host_leaf(accelerations))

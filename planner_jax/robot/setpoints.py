@@ -29,12 +29,12 @@ def sample_at_rate(
 
     Args:
         rate: [Hz], number of samples in a second.
-        ends: () or (B,) [s], end of each plan.
+        ends: () [s], end of the plan, or (B,) for a batch of B plans.
         leaves: pytree of the arrays that describe the plans, with their batch shape.
         setpoint_at: pure function (leaves of a plan, time () [s]) -> quantities by name.
 
     Returns:
-        "time" (K,) [s], and quantities (K, ...) or (B, K, ...), NaN after the end of a plan.
+        "time" (K,) [s], K times, and quantities (K, ...) or (B, K, ...), NaN after a plan's end.
 
     Raises:
         TypeError: the rate is not a number.

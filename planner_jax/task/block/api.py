@@ -12,12 +12,12 @@ def planner(name: str = "online", **options: object) -> Planner[BlockCase, Block
     """Make a planner of blocks by its name.
 
     * `online`: a straight motion in joint space if one is free of collisions. Otherwise least
-      squares find end pose, time of contact and motion together, from several starts.
+      squares find end pose, time of contact and motion together, from several starting points.
     * `brisk`: the paths of `online` from rest to rest, as fast as the limits allow. The arm then
       waits for the ball at standstill. These motions need more torque.
     * `library:FILE`: a motion that is stored in a file of `planner-jax library build`. The faces of
-      the inner and outer box are divided into cells, and the file has a motion for each pair of
-      cells through which a ball can enter.
+      two boxes around the arm are divided into cells, and the file has a motion for each pair of
+      an outer and an inner cell through which a ball can fly.
     * `adapt:FILE`: motions of such a file, changed to meet the ball and refined by least squares.
     * `direct`: each joint moves as fast as its limits allow, to the end pose that is reached first
       without a collision.

@@ -117,7 +117,7 @@ def case(
     """Make one case of a ball to block, or a batch, by default in the scene of [Natarajan2024].
 
     Args:
-        ball_pos: (3,) or (B, 3) [m], position of the ball at time 0.
+        ball_pos: (3,) [m], position of the ball at time 0, or (B, 3) for a batch of B cases.
         ball_vel: (3,) or (B, 3) [m/s], velocity of the ball at time 0.
         delay: () or (B,) [s], time at which the arm may start to move, >= 0. Delay, angles, rates
             and gravity are one value for all cases, or one value for each case.

@@ -253,7 +253,7 @@ class OnlineBlock(Planner):
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
 
     def solve_at_once(self, cases: BlockCase, attempt: Search) -> BlockPlan:
-        """Return the plans of a batch; the starts of all cases are refined in step."""
+        """Return the plans of a batch; all cases make the same steps at the same time."""
         return jax.vmap(lambda case: self._solve_in_step(case, attempt))(cases)
 
     def _solve_in_step(self, case: BlockCase, attempt: Search) -> BlockPlan:
@@ -318,7 +318,7 @@ class OnlineBlock(Planner):
         return flight, poses, rank_poses(poses, num, 1.0 - self.slack)
 
     def _count_straight(self, flight: Flight, poses: EndPoses, attempt: Search) -> Array:
-        """Return how many straight motions to check: those in time, at most `attempt.straight`."""
+        """Return the number of end poses reached in time, but at most `attempt.straight`."""
         in_time = jnp.sum(poses.effort <= 1.0 - self.slack)
         return jnp.where(flight.comes, jnp.minimum(in_time, attempt.straight), 0)
 

@@ -1,7 +1,7 @@
 """Joint motions of an arm whose rates are linear in time between equidistant knots.
 
-The parameters of a motion are its steps (K, 6) [rad]: the joint rates at the knots 1 to K,
-multiplied by the duration T. For given steps the angles therefore do not depend on T. Angles are
+A motion has K pieces. Its parameters are the steps (K, 6) [rad]: the joint rates at the ends of the
+pieces, multiplied by the duration. The angles then do not depend on the duration. They are
 quadratic in time between knots. Rates have their extremes at knots, and accelerations are constant
 between knots, so that checks at the knots suffice for the limits of both.
 """
@@ -53,8 +53,8 @@ def step_weights(pieces: int, shares: tuple[float, ...]) -> tuple[np.ndarray, np
 def angles_at(start: Array, first: Array, steps: Array, shares: tuple[float, ...]) -> Array:
     """Return the joint angles (N, 6) [rad] of a motion at N times: `shares` of its duration.
 
-    The motion has the steps (K, 6) [rad] and the initial angles `start` (6,) [rad]. `first` (6,)
-    [rad] are the initial rates multiplied by the duration.
+    The motion has K pieces, the steps (K, 6) [rad] and the initial angles `start` (6,) [rad].
+    `first` (6,) [rad] are the initial rates multiplied by the duration.
     """
     of_first, of_steps = step_weights(steps.shape[0], shares)
     turned = jnp.matmul(jnp.asarray(of_steps, steps.dtype), steps, precision=lax.Precision.HIGHEST)
@@ -134,7 +134,7 @@ def joint_terms(
 
 
 def bump_steps(height: Array, pieces: int) -> Array:
-    """Return steps (K, 6) of a detour: angles rise by `height` (6,) [rad] and fall, as sin^2."""
+    """Return the steps of a detour: angles rise by `height` (6,) [rad] and fall, as sin^2."""
     knots = np.arange(1, pieces + 1) / pieces
     return jnp.asarray(np.pi * np.sin(2.0 * np.pi * knots), height.dtype)[:, None] * height[None]
 

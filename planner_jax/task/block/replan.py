@@ -108,8 +108,8 @@ class ReplanBlock(Planner):
 
         See `pj.replan` for cases, the previous plan, the elapsed time and the errors. `ball` is the
         estimated ball at time 0 of the cases, by default the ball of the cases. `angles` [rad] and
-        `rates` [rad/s] at the start of the new motion are (6,) or (B, 6). By default they are taken
-        from the previous plan, in which the arm brakes after the end of the motion.
+        `rates` [rad/s] at the start of the new motion are (6,), or (B, 6) for B cases. By default
+        they are taken from the previous plan, whose motion is followed by braking.
         """
         elapsed, batch = check_elapsed(cases, elapsed), cases.batch_shape
         if ball is not None:

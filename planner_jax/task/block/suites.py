@@ -43,7 +43,8 @@ def draw(
 ) -> BlockCase:
     """Draw a batch of cases with random throws in float64, and cast them to `dtype`.
 
-    The suite is "pole" (default), "open", "short", or a suite of another package. See
+    In the suite "pole" (default) a pole stands in front of the arm, in "open" there is none, and in
+    "short" balls are launched nearer. Suites of other packages are also accepted. See
     `pj.block.case` for `regime`, `wide`, `anywhere` and `delay` [s], and `pj.hit.draw` for the
     other arguments and the errors.
     """

@@ -171,7 +171,7 @@ def _choice(position: Array, times: Array) -> CatchChoice:
 
 
 def optimal_time_ratio(cases: CatchCase, plans: CatchPlan) -> np.ndarray:
-    """Return the mean of |T_o - T_p| / T_o over the caught targets, (B,) [Yu2023catch, eq. 29].
+    """Return the mean of |T_o - T_p| / T_o over caught targets in B cases [Yu2023catch, eq. 29].
 
     T_p are the times of catches that were decided before planning, T_o the times in the plans.
     """
@@ -246,7 +246,7 @@ class Greedy(CatchDecision):
         return in_several_lengths(case, jax.tree.map(lambda leaf: leaf[None], choice))
 
     def _handicap(self, case: CatchCase, table: Timetable) -> Array:
-        """Return times (N,) [s] that are added to the targets' times before they are compared."""
+        """Return a time [s] for each target, to be added before targets' times are compared."""
         return jnp.zeros_like(case.horizon)
 
 

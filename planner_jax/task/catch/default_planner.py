@@ -66,7 +66,7 @@ _FROM_LEARNED = Round(starts=1, solver=LbfgsConfig(max_steps=2))  # from a netwo
 # would end too far from the optimum.
 _LONG_CHAIN = Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5))
 _CHAIN_TOLERANCE = 1e-4
-# If more than `_FEW` targets must all be caught, the first two rounds are longer.
+# If more than `_FEW` targets must all be caught, the first two rounds have more iterations.
 _FEW = 3
 _STEPS_A_TARGET = 20
 _OF_MANY = LbfgsConfig(max_steps=300, memory=8, trial_steps=(1.0, 0.3))

@@ -64,7 +64,7 @@ def _to_catch(case: CatchCase, states: BallState, speed: Array) -> tuple[Array, 
 
 
 def length(vectors: Array) -> Array:
-    """Return the Euclidean norms (..., K) of vectors (..., 3, K), but at least 1e-6."""
+    """Return the Euclidean norms (..., K) of K vectors (..., 3, K), but at least 1e-6."""
     x, y, z = vectors[..., 0, :], vectors[..., 1, :], vectors[..., 2, :]
     return jnp.sqrt(jnp.maximum(x * x + y * y + z * z, 1e-12))
 
@@ -90,7 +90,7 @@ arrivals = jax.vmap(arrival, (0, None, None, None))  # the same for N targets
 
 
 def _out_of_reach(offset: Array, span: Array, speed: Array) -> Array:
-    """Return the distance (..., K) [m] by which a flight of `span` [s] falls short of `offset`."""
+    """Return the distance [m] by which a flight of `span` (..., K) [s] falls short of `offset`."""
     span = jnp.maximum(span - _TURNING, 0.0)
     rise = speed / _ACCELERATION
     reach = jnp.where(span < rise, 0.5 * _ACCELERATION * span**2, speed * span - 0.5 * speed * rise)
@@ -133,7 +133,7 @@ def follow(case: CatchCase, table: Timetable, order: Array) -> tuple[CatchChoice
 def earliest_next(case: CatchCase, table: Timetable, handicap: Array) -> CatchChoice:
     """Return the order in which the next target is always the target with the earliest catch.
 
-    Before the times are compared, a handicap (N,) [s] is added to each target's time. Optional
+    Before the times are compared, the target's `handicap` [s] is added to its time. Optional
     targets that are out of reach are not caught; they and absent targets come last.
     """
     speed = top_speed(case)

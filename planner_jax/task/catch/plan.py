@@ -27,7 +27,7 @@ class CatchPlan(QuadrotorPlan):
 
     @property
     def _is_catch(self) -> Array:
-        """Whether the target at each position of `order` is caught, (..., N) bool."""
+        """Whether the target at each of the N positions of `order` is caught, (..., N) bool."""
         times = jnp.asarray(self.times)
         return jnp.diff(times, prepend=jnp.zeros_like(times[..., :1]), axis=-1) > 0.0
 

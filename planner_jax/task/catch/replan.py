@@ -98,8 +98,8 @@ class ReplanCatch(OptimisedPlanner):
 
         Caught targets become absent; the others keep their order. `pj.replan` describes `cases`,
         `previous`, `elapsed` and the errors. The estimated `targets` have the shapes of the cases'
-        targets, and their time 0 is the present. The quadrotor's `head_state`, (4, 3) or (B, 4, 3),
-        is by default the state that the plan has at this time.
+        targets, and their time 0 is the present. The quadrotor's `head_state` (4, 3), or (B, 4, 3)
+        for B cases, is by default the state that the plan has at this time.
         """
         elapsed = check_elapsed(cases, elapsed)
         require_path("targets", targets, np.shape(cases.present), 3)

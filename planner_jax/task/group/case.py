@@ -99,7 +99,7 @@ def case(
     Args:
         targets: paths of the targets, such as a `TurningPath`, whose leaves have leading axes (N,),
             or (B, N) for a batch.
-        time: () or (B,) [s], time before which all targets must be met.
+        time: () [s], time before which all targets must be met, or (B,) for B cases.
         present: () or (N,) or (B, N) bool, whether each target exists.
         **settings: arguments of `pj.intercept.case`, such as `start` and `walls`.
 

@@ -68,7 +68,7 @@ class GroupIntercept(Planner):
         return jax.device_get(_join(cases, begins, legs))
 
     def _plan_legs(self, drive: Drive, case: InterceptCase, needed: Array) -> InterceptPlan:
-        """Plan the legs (drives) for which `needed` (B,) is true; other plans have no meaning."""
+        """Plan the legs (drives) for which `needed` is true; other plans have no meaning."""
         patiently = lambda some: drive(self.patient, some)[0]  # noqa: E731
         if drive.is_pure:
             plans, _ = drive(self.planner, case)
@@ -113,7 +113,7 @@ def _make_legs(
 
 @jax.jit
 def _clear_unneeded(cases: InterceptCase, plans: InterceptPlan, needed: Array) -> InterceptPlan:
-    """Replace the plans of legs (drives) that are not needed, (B,), by plans that take no time."""
+    """Replace the plans of legs (drives) that are not needed by plans that take no time."""
     num = plans.speed.shape[1]
     zero = jnp.zeros_like(plans.time)
     empty = InterceptPlan(

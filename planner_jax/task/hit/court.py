@@ -55,7 +55,7 @@ def region_bounds(depth: float = HALF_LENGTH) -> np.ndarray:
 
 
 def scenario_regions(scenario) -> np.ndarray:
-    """Return serve, landing and target region (..., 3), 1 to 4 (N, F, L, R), of scenarios (...)."""
+    """Return a scenario's regions of serve, landing and target: 1 near, 2 far, 3 left, 4 right."""
     codes = np.array([[1 + REGIONS.index(letter) for letter in name] for name in SCENARIOS])
     return codes[np.asarray(scenario)]
 

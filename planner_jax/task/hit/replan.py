@@ -69,8 +69,8 @@ class ReplanHit(OptimisedPlanner):
         """Return the case, or the batch, as it remains `elapsed` seconds into its plan.
 
         `pj.replan` describes `cases`, `previous`, `elapsed` and the errors. The estimated `ball`
-        has leaves (3,) or (B, 3). The `drag` K_D [1/m], () or (B,), is by default the drag of the
-        cases. The quadrotor's `head_state`, (4, 3) or (B, 4, 3), is by default its planned state.
+        has leaves (3,), or (B, 3) for B cases. The drag coefficient `drag` [1/m] is by default the
+        drag of the cases, and the quadrotor's `head_state` (..., 4, 3) its planned state.
         """
         elapsed = check_elapsed(cases, elapsed)
         own = states_at(previous.trajectory, elapsed)

@@ -137,7 +137,7 @@ def judge(cases: InterceptCase, plans: InterceptPlan, **settings: object) -> Int
 
 
 def position_setting(target: PlanePath) -> dict[str, object]:
-    """Return the referee's setting for targets whose class a user wrote; {} for known classes."""
+    """Return the referee's setting for targets of a user's class; {} for the library's classes."""
     while isinstance(target, LaterPath):
         target = target.path
     is_known = type(target) in (TurningPath, PolynomialPath)

@@ -190,7 +190,7 @@ def by_unknowns(drive: Motion, cost: Quadratic, is_time_free: bool) -> tuple[Arr
     pull = forms[:, :5, 8] + cost.piece_push
 
     def shift(values: Array, by: int) -> Array:
-        """Return for each piece k the entry k + by of `values` (K, ...), or zero past the end."""
+        """Return for each piece k the entry k + by of `values`, or zero past the end."""
         if by >= num:
             return jnp.zeros_like(values)
         return jnp.concatenate([values[by:], jnp.zeros_like(values[:by])])

@@ -97,7 +97,7 @@ class MotionProblem:
         return jnp.concatenate(parts if self.is_time_free else parts[:2], axis=-1)
 
     def unpack(self, case: InterceptCase, point: Array) -> tuple[Array, Array, Array]:
-        """Split the unknowns into speed and curvature (K + 1,) at all knots, and meeting time."""
+        """Split the unknowns into speed and curvature at all K + 1 knots, and the meeting time."""
         speed, curvature = point[: self.pieces], point[self.pieces : 2 * self.pieces]
         time = jnp.clip(point[-1], _SOONEST * case.time, case.time)
         return (

@@ -73,7 +73,7 @@ class ReplanIntercept(Planner[Replanning, InterceptPlan]):
         Args:
             cases: one case or a batch, as for `pj.replan`, which also describes the errors.
             previous: the plans that are being driven.
-            elapsed: () or (B,) [s], time since the start of the plans.
+            elapsed: () [s], time since the start of the plans, or (B,) for B cases.
             target: the expected path; its times count from this moment.
             movers: the moving obstacles at this moment; by default the obstacles of the cases,
                 moved at their velocities.

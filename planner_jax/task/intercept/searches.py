@@ -71,7 +71,7 @@ class LoadedSearch(Search):
     is_last: bool  # whether the planner makes no search after this one
 
     def __post_init__(self) -> None:
-        """Do nothing: `starts` is used only before a search is loaded."""
+        """Skip the checks of `Search`, which were made when the search was created."""
 
 
 @cached_by_precision

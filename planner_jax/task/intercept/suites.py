@@ -2,16 +2,16 @@
 
 `docs/suites.md` and `planner_jax.task.intercept.spec` state the ranges of all suites. SI units.
 
-In this module, draws are dictionaries of arrays with leading axis B:
+In this module, the draws of B cases are a dictionary of arrays:
 
 | key | shape | content |
 |---|---|---|
 | start, meeting | (B, 2) | [m], rear axle's middle at time 0; target at the meeting |
 | time, reached | (B,) | [s], of the meeting; bool, whether the car can be there by then |
 | pos, angle, speed, rate | (B, 2), (B,) | [m], [rad], [m/s], [rad/s]: the target at time 0 |
-| walls, movers | (B, N, V, 2) | [m], corners at time 0, counter-clockwise, may be repeated |
+| walls, movers | (B, N, V, 2) | [m], V corners of N polygons at time 0, counter-clockwise |
 | walls present, movers present | (B, N) | bool, whether each obstacle exists |
-| velocity | (B, N, 2) | [m/s], of the movers |
+| velocity | (B, N, 2) | [m/s], of the movers, that is the moving obstacles |
 """
 
 import dataclasses
@@ -173,7 +173,7 @@ def anywhere(uniform: np.ndarray) -> np.ndarray:
 
 
 def target_to(meeting: np.ndarray, time: float, turning: np.ndarray, uniform: np.ndarray) -> Draws:
-    """Return random targets that are at the points `meeting` (B, 2) [m] at the time `time` [s].
+    """Return B random targets that are at the points `meeting` (B, 2) [m] at the time `time` [s].
 
     Targets drive in a circle where `turning` (B,) is true. `uniform` (B, 4) are numbers of [0, 1).
     """
@@ -212,7 +212,7 @@ def _polygons(
 
 
 def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Map random numbers (B, 3) of [0, 1) to the x positions [m] of a maze's 2 or 3 walls."""
+    """Map random numbers of [0, 1) to the x positions [m] of the 2 or 3 walls of each maze."""
     even = np.where((count == 2)[:, None], [2.9, 5.5, SIZE], [2.2, 4.1, 6.0])
     return even + _between(uniform, -0.2, 0.2)
 
@@ -220,7 +220,7 @@ def _across(uniform: np.ndarray, count: np.ndarray) -> np.ndarray:
 def _maze(
     uniform: np.ndarray, across: np.ndarray, count: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return corners (B, 12, 6, 2) [m] of a maze's rectangles, and whether they exist, (B, 12).
+    """Return corners (B, 12, 6, 2) [m] of the rectangles of B mazes, and which exist, (B, 12).
 
     The first `count` (B,) walls at the x positions `across` (B, 3) [m] exist. Dead ends lie on the
     straight line from start to end. Of the random numbers `uniform` only `uniform[:, :3]` are used.
@@ -252,7 +252,7 @@ def _maze(
 
 
 def _boxes(left, low, right, high) -> np.ndarray:
-    """Return corners (B, N, 6, 2) of axis-aligned rectangles; the last corner is repeated."""
+    """Return six corners (..., 6, 2) of axis-aligned rectangles; the last corner is repeated."""
     x = np.stack([left, right, right, left, left, left], axis=-1)
     y = np.stack([low, low, high, high, high, high], axis=-1)
     return np.stack([x, y], axis=-1)
@@ -316,7 +316,7 @@ def _is_off_map(suite: Suite, draws: Draws) -> np.ndarray:
 
 
 def _middle(draws: Draws) -> np.ndarray:
-    """Return the middle (B, 2) [m] of the car's body at the start."""
+    """Return the middle of the car's body at the start of each of B cases, (B, 2) [m]."""
     return draws["start"] + [BODY_MIDDLE, 0.0]
 
 
@@ -346,7 +346,7 @@ def _gap(
 
 
 def _distance(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Return distances (...) [m] of points (..., 2) from convex polygons (..., V, 2); 0 inside."""
+    """Return distances [m] of points (..., 2) from convex polygons of V corners; 0 inside."""
     edge = np.roll(corners, -1, axis=-2) - corners
     away = points[..., None, :] - corners
     square = np.maximum((edge**2).sum(axis=-1), 1e-12)
@@ -399,7 +399,7 @@ CAUSES = tuple(_APPLIES)
 
 
 def first_cause(suite: Suite, draws: Draws) -> np.ndarray:
-    """Return the index (B,) in CAUSES of the first cause that rejects; len(CAUSES) if none does."""
+    """Return for B candidates the index in CAUSES of the first that applies, or len(CAUSES)."""
     cause = np.full(len(draws["start"]), len(CAUSES))
     alive = np.arange(len(cause))
     for index, applies in enumerate(_APPLIES.values()):
