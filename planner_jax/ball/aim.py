@@ -86,7 +86,6 @@ _aim.defjvp(_aim_jvp, symbolic_zeros=True)
 def _displacement(
     vel: Array, flight_time: Array, drag: Array, gravity: Array, num_steps: int = _FLIGHT_STEPS
 ) -> Array:
-    """Return the displacement (3,) [m] of a ball with quadratic drag after `flight_time` [s]."""
     ball = BallState(pos=jnp.zeros_like(vel), vel=vel)
     return fly(ball, flight_time, drag, gravity, num_steps=num_steps)[0].pos
 

@@ -76,7 +76,6 @@ def _directions(moving: tuple[int, ...]) -> list[_Direction]:
 def _call(
     num_nodes: int, moving: tuple[int, ...], lanes: int, threads: int, interpret: bool
 ) -> Callable:
-    """Build the kernel for `lanes` tables of `num_nodes` nodes, with `threads` threads a block."""
     directions = _directions(moving)
     shapes = [(num_nodes, 3, 3) if argument == _VEL else (num_nodes, 3) for argument in moving]
     shapes = 2 * (shapes or [(num_nodes, 3)])  # results for positions, then for velocities

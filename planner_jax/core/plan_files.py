@@ -78,7 +78,6 @@ def _other_file(
 
 
 def _read(path: str | os.PathLike) -> tuple[object, object, dict[str, np.ndarray]]:
-    """Return the version and the class name in a file, and its arrays."""
     try:
         # NumPy would not close a broken file that it has opened itself.
         with open_plain(path) as raw, np.load(raw, allow_pickle=False) as file:

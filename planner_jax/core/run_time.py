@@ -47,7 +47,6 @@ def with_run_time_numbers(*names: str) -> Callable[[type[Settings]], type[Settin
 
 
 def _is_run_time(value: object) -> bool:
-    """Return whether a field's value is an object, or a tuple of objects, of a registered class."""
     if isinstance(value, tuple):
         return bool(value) and all(type(each) in _RUN_TIME for each in value)
     return type(value) in _RUN_TIME

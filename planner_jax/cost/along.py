@@ -117,14 +117,12 @@ def greatest_along(
 def _with_kernel(
     function: Callable, along: Along, mode: str, jvp: Callable | None = None
 ) -> Callable:
-    """Pass `along` to a function, and attach the CUDA kernel that computes the same results."""
     path = "planner_jax.cost.along_kernel:along_kernel"
     return with_kernel(functools.partial(function, along), path, along, mode, jvp=jvp)
 
 
 @functools.cache
 def _greatest(along: Along) -> Callable:
-    """Make `greatest_along` for these constants, with its CUDA kernel."""
     greatest = functools.partial(_greatest_of_segments, along)
     return with_kernel(greatest, "planner_jax.cost.peaks_kernel:peaks_kernel", along)
 
@@ -222,7 +220,6 @@ def _dense(tangent: PyTree) -> PyTree:
 def _of_segment(
     along: Along, columns: Array, duration: Array, parameters: PyTree
 ) -> tuple[Array, Array]:
-    """Return the penalty () and the greatest excess () of one segment."""
     weights = jnp.asarray(along.weights(), columns.dtype)
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], columns.dtype)

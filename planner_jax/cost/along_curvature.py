@@ -175,7 +175,6 @@ def _at_samples(
 
 
 def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: Array) -> Array:
-    """Multiply the second derivatives at K samples by a direction (orders, K, 3)."""
     found = {}
     for group in groups:
         for one in group:

@@ -167,7 +167,6 @@ def along_kernel(
 def _call(
     along: Along, mode: str, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the function that runs the kernel on a grid; it takes the leaves of the arguments."""
     matrices, weights = along.matrices(), along.weights()
     num_samples = len(weights)
     share = -(-num_samples // grid.shares)
@@ -224,7 +223,6 @@ def load_row(matrices: Ref, sample: Array, num_columns: int) -> Vectors:
 
 
 def _store(refs: Sequence[Ref], values: Iterable[Array]) -> None:
-    """Write the results to references; columns are written number by number."""
     numbers = iter(values)
     for ref in refs:
         if len(ref.shape) == 3:
@@ -305,7 +303,6 @@ def sample_excess(along: Along, unit: Vectors, duration: Array, given: PyTree) -
 
 
 def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tuple[Array, Array]:
-    """Return a sample's sum of smoothed hinges times `duration`, and its greatest excess."""
     excess = sample_excess(along, unit, duration, given)
     hinges = [
         factor * smooth_hinge(value + margin, along.hinge_width)
@@ -323,7 +320,6 @@ def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Arr
 def _curvature(
     along: Along, sample: _Sample, free: tuple, given: PyTree, direction: tuple
 ) -> tuple:
-    """Return the derivative, along a direction, of the weighted penalty and its derivatives."""
     columns, duration, given_change = direction
     moving, tangents, still = free, (unit_motion(sample.row, columns), duration), (given,)
     if given_change is not None:

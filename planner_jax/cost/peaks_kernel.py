@@ -49,7 +49,6 @@ def peaks_kernel(
 def _call(
     along: Along, interpret: bool, treedef: Treedef, grid: Grid
 ) -> Callable[..., Sequence[Array]]:
-    """Make the function that runs the kernel on a grid; it takes the leaves of the arguments."""
     matrices, steps = along.matrices(), np.diff(along.times())
     num_samples, num = len(matrices), len(along.margins)
     share = -(-num_samples // grid.shares)

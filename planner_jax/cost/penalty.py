@@ -31,7 +31,7 @@ def trapezoid_weights(num_intervals: int) -> np.ndarray:
 def join_trapezoid_weights(
     num_intervals: int, proportions: np.ndarray | Sequence[float]
 ) -> np.ndarray:
-    """Return trapezoid weights of consecutive pieces, of which neighbours share a node.
+    """Return trapezoid weights of consecutive pieces; neighbours share a node.
 
     The pieces have durations `proportions` (M,) and n = `num_intervals` intervals each; the result
     has the shape (M n + 1,).

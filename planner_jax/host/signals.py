@@ -24,8 +24,6 @@ class Stopped(KeyboardInterrupt):
 
 
 class _State:
-    """The state of signal handling, which exists once for each process."""
-
     def __init__(self) -> None:
         self.number: int | None = None  # number of the first signal
         self.patient = False

@@ -92,7 +92,6 @@ def _full_results(closed: ClosedJaxpr, leaves: Sequence[Array], lanes: int) -> l
 
 
 def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_Value]:
-    """Evaluate a function of one problem for all lanes (problems), operation by operation."""
     jaxpr = closed.jaxpr
     values: dict[Var, _Value] = dict(zip(jaxpr.constvars, closed.consts, strict=True))
     values.update(zip(jaxpr.invars, args, strict=True))
@@ -169,7 +168,6 @@ def _bind(eqn: JaxprEqn, inputs: Sequence[_Value], **changes: object) -> list[Ar
 
 
 def _spread(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    """Return an operand of an elementwise operation, broadcast to (*shape, lanes)."""
     array = value.array if isinstance(value, _Lanes) else jnp.asarray(value)[..., None]
     if array.ndim == 1 and shape:  # one number for each lane, such as the bound of a clamp
         array = array.reshape((1,) * len(shape) + array.shape)
@@ -228,7 +226,6 @@ def _dot_general(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]
 
 
 def _dynamic_slice(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[Array]:
-    """Take a window of an array that starts at a different index in each lane (problem)."""
     operand, *starts = inputs
     shape = shape_of(eqn.invars[0])
     window = _widen(operand, shape, lanes)

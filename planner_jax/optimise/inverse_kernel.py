@@ -34,8 +34,6 @@ def inverse_kernel(*, interpret: bool = False) -> Callable:
 
 @functools.cache
 def _call(size: int, lanes: int, width: int, interpret: bool) -> Callable:
-    """Make the kernel that inverts `lanes` matrices of `size` rows each."""
-
     def body(matrix, out):
         entries = [[matrix[i, j] for j in range(size)] for i in range(size)]
         least = [1e-6 * jnp.abs(entries[j][j]) + 1e-20 for j in range(size)]

@@ -36,7 +36,6 @@ def turn_kernel(num_pairs: int, step_cap: float, *, interpret: bool = False) -> 
 def _call(
     num_pairs: int, step_cap: float, n: int, lanes: int, width: int, interpret: bool
 ) -> Callable:
-    """Make the kernel for `lanes` problems of n variables each."""
     height = 1 << (n - 1).bit_length()  # n rounded up to a power of two, as GPU blocks require
 
     def body(steps, changes, inverses, step, change, grad, *out):

@@ -122,7 +122,6 @@ def _has_steps(config: Solver, num: int) -> bool:
 
 
 def _method(config: Solver) -> ModuleType:
-    """Return the module of the solver that the settings select: `lbfgs` or `newton`."""
     if isinstance(config, LbfgsConfig):
         return lbfgs
     from planner_jax.optimise import newton  # only planners that search for low costs use it
@@ -237,7 +236,6 @@ def _stages(attempt: Round) -> tuple[Stage, ...]:
 
 
 def _of_each(function: Callable, starts: PyTree) -> PyTree:
-    """Apply a function to every start, by `vmap` if there is more than one start."""
     if len(jax.tree.leaves(starts)[0]) > 1:
         return jax.vmap(function)(starts)
     return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.map(lambda x: x[0], starts)))

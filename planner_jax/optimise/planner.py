@@ -173,5 +173,4 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         )
 
     def _fit_subspace(self, solver: NewtonConfig) -> NewtonConfig:
-        """Return the settings with the number of subspace vectors of this class of planners."""
         return dataclasses.replace(solver, subspace=self.subspace)

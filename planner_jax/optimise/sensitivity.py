@@ -236,7 +236,6 @@ def gradient_at(
 
 
 def _by_whole_hessian(product: Product, point: Array) -> tuple[Product, Product]:
-    """Return functions that multiply by the Hessian's inverse (positive pivots), by the Hessian."""
     hessian = jax.vmap(product)(jnp.eye(point.shape[0], dtype=point.dtype))
     inverse = positive_inverse(hessian)
     return lambda right: jnp.sum(inverse * right[None], axis=1), product

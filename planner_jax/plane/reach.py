@@ -149,7 +149,6 @@ def _move_x(rows: Array, move: Array) -> Array:
 
 
 def _shift(rows: Array, move: Array) -> Array:
-    """Move cells (words, ..., cells) by `move` (..., 2), numbers of cells along x and y."""
     return _move_x(_move_y(rows, move[..., 1]), move[..., 0])
 
 

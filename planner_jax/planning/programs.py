@@ -268,7 +268,6 @@ def _program(
     tree: PyTree,
     layout: _Layout,
 ) -> _Program:
-    """Compile a function for trees with the given structures, shapes and dtypes."""
     canonical = jax.dtypes.canonicalize_dtype
     dtype = canonical(np.result_type(*[d for _, d in layout if np.issubdtype(d, np.floating)]))
     ends = np.cumsum([math.prod(shape) for shape, _ in layout])

@@ -231,7 +231,6 @@ def by_pieces(
 
 
 def _motion(matrices: Array, columns: Array, piece_duration: Array) -> Motion:
-    """Return the motion at N samples, computed by the matrices (orders, N, C)."""
     # One matrix product computes all derivatives, because on a CPU a call takes longer than its
     # arithmetic. The matrix is the left factor, so that a batch adds columns to the right factor.
     orders = matrices.shape[0]
