@@ -71,7 +71,8 @@ def draw(
 
     The arguments that are not in this list, and the errors, are as in `pj.hit.draw`.
 
-    * `suite`: a key of `SUITES`, "throws" by default, or a suite of another package.
+    * `suite`: "throws" (thrown balls) by default; `planner_jax.task.catch.spec.SUITES` describes
+      all suites. Suites of other packages are also accepted.
     * `limit_scale`: factor on the limits of speed and body rate, and on the differences between
       the limits of the thrust and the thrust of hover.
     * `robot`: quadrotor with a net. Suites of other packages define their own robot.

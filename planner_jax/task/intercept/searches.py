@@ -169,7 +169,7 @@ def make_grid(case: InterceptCase, lattice: reach.Lattice) -> reach.Grid:
 
 
 def make_field(case: InterceptCase, grid: reach.Grid) -> DistanceField:
-    """Compute the distance from the walls at the nodes of a grid that is as fine as the cells."""
+    """Compute the distance from the walls at `_FIELD` nodes along each side of the map."""
     spacing = grid.cell * (grid.lattice.cells / _FIELD)
     return distance_field(case.walls, grid.corner, spacing, _FIELD)
 
