@@ -56,7 +56,7 @@ class Task:
     # Options of `planner` in speed benchmarks.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
-    # Name of the planner whose costs are the reference for planners without a long search.
+    # Name of the planner whose plans are the reference for cost gaps, if no long search is.
     yardstick: str | None = None
 
     @property

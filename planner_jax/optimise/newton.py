@@ -187,7 +187,7 @@ def _lanczos(
     """
     num = min(num, gradient.size)
     scale = 1.0 / jnp.maximum(size, 1e-30)
-    # Each row d of `directions` corresponds to the row M d of `images`.
+    # Row k of `images` is M times row k of `directions`.
     images = jnp.zeros((num, gradient.size), gradient.dtype).at[0].set(gradient * scale)
     directions = jnp.zeros_like(images).at[0].set(turned * scale)
     diagonal, beside = [], []

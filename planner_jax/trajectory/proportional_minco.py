@@ -136,7 +136,7 @@ def proportional_minco(
         raise ArgumentError("proportions", "some numbers > 0", proportions)
     s, m = order, len(proportions)
     shares = np.array(proportions) * m / np.sum(proportions)
-    # The d-th derivative by t / (r_i h) is r_i^d times the d-th derivative by t / h.
+    # Piece i lasts r_i h. The d-th derivative by t / (r_i h) is r_i^d times the one by t / h.
     units = np.tile(shares[:, None] ** np.arange(s), 2)
     piece_energy = _hermite_energy(s)
     total = np.zeros(((m + 1) * s, (m + 1) * s))
