@@ -1,4 +1,4 @@
-"""Measurements of speed, success and cost.
+"""Benchmarks of the planners: programs that measure speed, success and cost of plans.
 
-Each module with a `main` is a benchmark of the planners, run as `python -m benchmarks.NAME`.
+Each module with a function `main` is a program, run as `python -m benchmarks.NAME`.
 """

@@ -3,17 +3,19 @@
     taskset -c 0 python -m benchmarks.block_adapt [--library FILE] [--layout full] [--regime R2]
         [--num 1000] [--seed 7] [--out DIR]
 
-Throws are drawn from the suite `pole`. Each ball must meet the middle of the shield at a right
-angle, and the arm may start at time 0. Without --library a library of motions is built first. All
-planners get the same throws:
+A robot arm blocks thrown balls with a shield. Balls are drawn from the suite `pole`, in which a
+pole stands in front of the arm. Each ball must meet the middle of the shield at a right angle, and
+the arm may start at time 0. Without --library a library of motions is built first. These planners
+get the same balls:
 * `adapt`, with its short search alone, and with a longer search if the short one fails;
-* planners that try 6 or 48 straight motions of the joints;
+* planners that try 6 or 48 straight motions, in which all joints move in proportion;
 * the default planner `online`;
 * the library's motions without adaptation, which may meet a ball anywhere on the shield.
 
 Wall-clock times are from the ball's arrays to the plan's arrays. The process's CPU time is printed
-beside them, because other load on the machine changes it less. Success is judged by the referee.
-Plans that a planner reports as solved and the referee rejects are counted.
+beside them, because other load on the machine changes it less. The referee, an independent check in
+float64, decides whether a ball is blocked. Plans that a planner reports as solved and the referee
+rejects are counted.
 """
 
 import argparse
@@ -79,7 +81,7 @@ def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Build or load the library, draw the throws, and measure every planner on them."""
+    """Build or load the library of motions, draw balls, and measure all planners on them."""
     path = options.library
     if path is None:
         path = bench.path / "library.bin"
@@ -106,7 +108,6 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments, and measure all planners into a run folder."""
     parser = argument_parser("block_adapt", __doc__, num=1000, seed=7)
     options = library_options(parser, layout="full")
     with begin(parser, options) as bench:

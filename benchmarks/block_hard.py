@@ -3,12 +3,15 @@
     python -m benchmarks.block_hard [--num 2000] [--seed 20261] [--regime R2] [--repeat 3]
         [--out DIR]
 
-A ball is hard if no straight motion of the joints blocks it. Throws are drawn from the suite
-`pole`, and throws that a straight motion blocks are left out: nearly three in four with the joint
-limits R2. A hard ball needs a search by least squares, or cannot be blocked at all. All hard balls
-are planned in one call of a compiled program, and the fastest of --repeat calls is reported. The
-program also prints the share of balls that the referee accepts as blocked. Durations of the motions
-are compared with the planner `brisk`, which minimises them.
+A robot arm blocks thrown balls with a shield. A ball is hard if no straight motion blocks it, that
+is no motion in which all joints move in proportion. Balls are drawn from the suite `pole`, and
+balls that a straight motion blocks are left out: nearly three in four with the joint limits R2.
+Hard balls need a search by least squares, or cannot be blocked at all. All hard balls are planned
+in one call of a compiled program, and the fastest of --repeat calls is reported.
+
+The program also prints the share of balls that the referee, an independent check in float64,
+accepts as blocked. It compares the durations of the motions with motions of the planner `brisk`,
+which minimises the duration.
 """
 
 import jax
@@ -24,7 +27,6 @@ from planner_jax.sweep.block.settings import REGIMES
 
 
 def main() -> None:
-    """Select the throws that no straight motion blocks, time their planning, and print results."""
     parser = argument_parser("block_hard", __doc__, num=2000, seed=20261, repeat=3)
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")
     options = parser.parse_args()

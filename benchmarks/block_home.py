@@ -2,17 +2,19 @@
 
     python -m benchmarks.block_home [--num 500] [--candidates 48] [--rounds 4] [--out DIR]
 
-A home pose is the pose in which the arm waits for a ball: six joint angles. The cross-entropy
-method draws candidate poses in several rounds, first uniformly, then from a normal distribution
-around the best eighth of all candidates so far. Poses in collision, or within 3 cm of the pole, are
-left out. The score of a candidate is the share of the round's throws that one of 48 straight
-motions of the joints blocks in time and without a collision. Straight motions are quick to compute,
-and the planner's other motions can only raise the share. In the search the arm may start only after
-0.133 s. This makes blocking harder, so that good and bad poses get more different scores.
+A home pose consists of the six joint angles at which the arm waits for a ball. The cross-entropy
+method draws --candidates random poses in each round. In the first round they are uniform. In later
+rounds they have a normal distribution around the best eighth of all poses so far. Poses in
+collision, or within 3 cm of the pole in front of the arm, are left out.
 
-The best candidates of all rounds are compared on other throws. Finally the three best poses and the
-home pose of [Natarajan2024] are compared on `--num` further throws, which no selection used. For
-this comparison the default planner plans the motions, and the referee judges them.
+The score of a pose is the share of the round's balls that a straight motion, in which all joints
+move in proportion, blocks in time and without a collision. 48 straight motions are tried for each
+ball. In the search the arm may start only 0.133 s after a ball is first seen. This makes blocking
+harder, so that the scores of good and bad poses differ more.
+
+The best poses of all rounds are compared on other balls. Finally the three best poses and the home
+pose of [Natarajan2024] are compared on --num further balls. For this comparison the default planner
+plans the motions, and the referee, an independent check in float64, judges them.
 """
 
 import dataclasses
@@ -31,20 +33,20 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
-# [rad] Bounds of the joint angles of the first candidates. These poses are in front of the arm.
+# [rad] Bounds of the six joint angles from which the first round draws poses.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])
 HIGHEST = np.array([0.8, 1.5, 0.95, 0.5, 1.9, 0.8])
-# [m] Least clearance of a home pose from every obstacle and the arm itself, and from the pole.
+# [m] Least distance between the arm at home and the obstacles or itself, and from the pole.
 MARGIN, POLE_MARGIN = 0.005, 0.03
-ELITE = 8  # The best candidates, one in ELITE, define the distribution of the next round.
+ELITE = 8  # The best eighth of all poses defines the normal distribution of the next round.
 LATE = 0.133  # [s] In the search the arm may start this long after the ball is first seen.
-REPORTED = 3  # Number of best home poses in the printed table.
+REPORTED = 3  # Number of home poses found by the search that the printed table contains.
 DELAYS = (0.0, 0.133)  # [s] In the printed table the arm may start at each of these times.
 STRAIGHT = OnlineBlock(searches=(Search(straight=48, tries=0),))
 
 
 def from_home(cases: Any, homes: np.ndarray) -> Any:
-    """Combine B throws with H home poses (H, 6) [rad]: return H x B cases, ordered by pose."""
+    """Combine B cases with H home poses (H, 6) [rad]: return H x B cases, ordered by pose."""
     num = len(homes)
 
     def repeat(leaf: Any) -> np.ndarray:
@@ -58,16 +60,16 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 
 
 def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
-    """Return the share of throws that the planner reports as solved, for each home pose, (H,)."""
+    """Return the share of cases that a planner reports as solved, for H home poses, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
     return pj.are_solved(plans).reshape(len(homes), -1).mean(axis=1)
 
 
 def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
-    """Draw home poses (num, 6) [rad] that are free of collision.
+    """Draw `num` random home poses (num, 6) [rad] without a collision.
 
-    Joint angles are uniform within the bounds if `around` is None. Otherwise they have a normal
-    distribution with the mean and the spread of the good poses `around` (E, 6) [rad].
+    Joint angles are uniform between `LOWEST` and `HIGHEST` if `around` is None. Otherwise they are
+    normal, with the mean and standard deviation of the poses `around` (E, 6) [rad].
     """
     arm, scene = irb1600(), paper_scene()
 
@@ -90,7 +92,6 @@ def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | 
 
 
 def main() -> None:
-    """Search for home poses, compare the best ones on other throws, and print the table."""
     parser = argument_parser(
         "block_home", __doc__, num=500, seed=7, candidates=48, rounds=4, throws=96
     )

@@ -3,18 +3,20 @@
     python -m benchmarks.block_library [--library FILE] [--layout B] [--regime R2] [--num 2000]
         [--queries 20000] [--batch 1048576] [--shift -0.1] [--skip-repair] [--out DIR]
 
-The library divides the faces of two boxes around the protected region into rectangular cells. It
-stores a motion for each pair of an outer and an inner cell. The tunnel of a pair is the space
-between its two cells. Without --library a library is built first. Then the program reports:
+A robot arm blocks balls with a shield. Two boxes, one inside the other, stand around the region
+that the arm protects. Their faces are divided into rectangular cells. The library stores a motion
+for each pair of an outer and an inner cell. The tunnel of a pair is the space between its two
+cells. Without --library a library is built first. Then the program reports:
 * coverage: the share of pairs with a motion, among the pairs that a ball can pass through;
-* random balls through the tunnels of stored motions: how many are blocked, judged by the referee;
-* balls of the suites `pole` and `short`, drawn with a seed that no tuning used: how many are
-  blocked if the arm may start after 0 or 0.133 s;
-* the time to look up one ball of the suite `pole`, from and to host memory, on the CPU;
-* the rate at which the default device looks up a batch of balls. The table of motions is an
-  argument of the compiled program, so that the compiler cannot evaluate parts in advance;
-* a repair, after the pole has moved by --shift along y: the time to plan again all motions that
-  collide with it, and how many of the library's motions the referee then rejects.
+* random balls through the tunnels of stored motions: the share that is blocked, according to the
+  referee, an independent check in float64;
+* balls of the suites `pole` and `short`, drawn with a seed that no tuning used: the share that is
+  blocked if the arm may start 0 or 0.133 s after it sees the ball;
+* the time to look up the motion for one ball on the CPU, from and to NumPy arrays;
+* the number of balls per second that the default device looks up in a batch. The table of motions
+  is an argument of the compiled program, so that the compiler cannot precompute parts;
+* a repair, after a pole in front of the arm has moved by --shift along y: the time to plan again
+  all motions that collide with it, and how many motions the referee then rejects.
 """
 
 import argparse
@@ -55,7 +57,7 @@ ROUNDS = 20  # The time of a batch lookup is measured over this number of calls.
 
 
 def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
-    """Call a function; return its result, and its duration [s] minus JAX's compile time."""
+    """Call a function; return its result, and its duration [s] without JAX's compile time."""
     began = time.perf_counter()
     with CompileClock() as clock:
         found = function(*arguments, **how)
@@ -63,7 +65,10 @@ def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
 
 
 def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
-    """Build a library, write it to a file, and report build time and compile time."""
+    """Build a library, write it to the file `path`, and report build time and compile time.
+
+    `layout` names the division of the boxes' faces into cells, `regime` the joint limits.
+    """
     given: Any = REGIMES[regime]
     at_rest: Any = np.asarray(given.ends_at_rest)
     scene = paper_scene()
@@ -71,8 +76,8 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     home = irb1600().home
     own = LAYOUTS[layout]
     tunnel = tunnels(own, scene.inner, scene.outer)
-    # The first pairs are planned only to compile the programs of every batch size. They are spread
-    # over all pairs, so that some of them also need, and compile, the search by least squares.
+    # Some pairs of cells are planned only to compile the programs of every batch size. They are
+    # spread over all pairs, so that some also need, and compile, the search by least squares.
     few = np.flatnonzero(tunnel.is_feasible)[:: tunnel.is_feasible.sum() // 64]
     began = time.perf_counter()
     for size in set(building.portions().lanes):
@@ -106,10 +111,11 @@ def describe(bench: Bench, library: Library) -> None:
 
 
 def referee(bench: Bench, library: Library, num: int, name: str) -> None:
-    """Draw `num` balls through tunnels with stored motions; report the share that is blocked.
+    """Draw `num` balls through tunnels with stored motions; report how many the motions block.
 
-    The referee judges each motion. Blocks that the planner claims and the referee rejects are
-    counted.
+    The referee, an independent check in float64, judges each motion. The function also counts
+    motions that the planner reports as blocking and the referee rejects. `name` labels the printed
+    line.
     """
     found = check(library, num, SEED)
     wrong = int((found.claimed & ~found.verdict.success).sum())
@@ -121,7 +127,10 @@ def referee(bench: Bench, library: Library, num: int, name: str) -> None:
 
 
 def block_rates(bench: Bench, library: Library, regime: str, num: int) -> None:
-    """Report the shares of balls of the suites `pole` and `short` that stored motions block."""
+    """Report the shares of balls of the suites `pole` and `short` that stored motions block.
+
+    `num` balls are drawn for each suite. `regime` names the joint limits of the arm.
+    """
     planner = LibraryBlock(library)
     for suite in ("pole", "short"):
         for met in ("anywhere", "wide"):
@@ -166,7 +175,7 @@ class OneBall:
     """
 
     def __init__(self, library: Library, gravity: float = 9.81, home: int = 0):
-        """Compile the lookup for an arm at the home pose with index `home`; gravity in [m/s^2]."""
+        """Compile the lookup for the home pose (start pose) number `home`; gravity in [m/s^2]."""
         own = library.table
 
         def pack_rows(rows: Array, vector: Array) -> Array:
@@ -199,7 +208,7 @@ class OneBall:
 
 
 def single_queries(bench: Bench, library: Library, num: int) -> None:
-    """Time the lookup of one ball after another, `num` in total, and report quantiles."""
+    """Look up `num` balls one after another, and report quantiles of the time for one ball."""
     one, cases = OneBall(library), pj.block.draw(min(num, 2000), "pole", SEED)
     balls = list(zip(np.asarray(cases.ball.pos), np.asarray(cases.ball.vel), strict=True))
     seconds = []
@@ -220,12 +229,12 @@ def single_queries(bench: Bench, library: Library, num: int) -> None:
 
 @jax.jit
 def look_up(table: Table, balls: BallState, gravity: Any) -> Answer:
-    """Return the stored motion for each ball of a batch, leaves (B, ...)."""
+    """Look up the stored motion for each of B balls; the arrays of the answer are (B, ...)."""
     return jax.vmap(lookup, (None, 0, None))(table, balls, gravity)
 
 
 def batch_queries(bench: Bench, library: Library, batch: int) -> None:
-    """Report how many balls per second the default device looks up, in batches of `batch`."""
+    """Report how many balls per second the default device looks up in a batch of `batch` balls."""
     cases = pj.block.draw(2000, "pole", SEED)
     pick = np.random.default_rng(SEED).integers(0, 2000, batch)
     balls = jax.device_put(jax.tree.map(lambda leaf: np.asarray(leaf)[pick], cases.ball))
@@ -250,7 +259,7 @@ def batch_queries(bench: Bench, library: Library, batch: int) -> None:
 def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> None:
     """Move the pole along y by `shift` [m], and time planning again all motions that now collide.
 
-    Then `num` balls through the tunnels of the repaired library are judged by the referee.
+    Then the referee, an independent check, judges `num` balls through tunnels of the new library.
     """
     scene = library.setting.scene
     pole: Any = np.asarray(scene.pole) + np.array([0.0, shift], np.float32)
@@ -266,7 +275,7 @@ def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> No
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Build or load the library, and report all measurements of the module's docstring."""
+    """Build or load the library, and report all measurements that this module's text lists."""
     if options.library is None:
         path = bench.path / "library.bin"
         library = build_timed(bench, path, options.layout, options.regime)
@@ -282,10 +291,10 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Namespace:
-    """Add the options --library, --layout and --regime to a parser, and parse the arguments.
+    """Add the options --library, --layout and --regime to a parser, and parse the command line.
 
-    `layout` is the default of --layout. The program exits with an error if the layout or the regime
-    is unknown.
+    --layout names the division of two boxes around the arm into cells, and `layout` is its default.
+    --regime names a set of joint limits. An unknown name ends the program with an error.
     """
     parser.add_argument("--library", type=Path, help="file of a built library; default: build one")
     known = ", ".join(LAYOUTS)
@@ -300,7 +309,6 @@ def library_options(parser: argparse.ArgumentParser, layout: str) -> argparse.Na
 
 
 def main() -> None:
-    """Parse the arguments, and write all measurements to a run folder."""
     counts = {"num": 2000, "queries": 20000, "batch": 1 << 20}
     parser = argument_parser("block_library", __doc__, **counts)
     parser.add_argument(

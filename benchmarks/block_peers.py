@@ -2,24 +2,26 @@
 
     python -m benchmarks.block_peers [--suite pole] [--regime R1] [--num 100] [--out DIR]
 
-A block counts only if the referee accepts it, whatever the planner reports. The column `found`
-counts collision-free motions, even if they are too late for the ball. Each throw is planned by one
-call on one core, from NumPy arrays to NumPy arrays. A call that compiles something is repeated.
+A robot arm blocks thrown balls with a shield. A ball counts as blocked only if the referee, an
+independent check in float64, accepts the plan, whatever the planner reports. The column `found`
+counts motions without a collision, even if they are too late for the ball. One call plans one throw
+on one core, from NumPy arrays to NumPy arrays. Compile time is not counted.
 
-The column `with query time` adds the planning time: planning and motion must together fit between
-the time at which the arm may start and the contact. Motions of `online` and `brisk` always end at
-the contact, so any planning time would make them late. These two planners therefore plan a second
-time, for an arm that starts later by the 90 % quantile of all planning times. Plans that take
-longer than this quantile count as failures.
+For the column `with query time`, the planning time and the motion must together fit between the
+time at which the arm may start and the contact. Motions of `online` and `brisk` always end at the
+contact, so any planning time would make them late. These two planners therefore plan a second time,
+for an arm that starts later by the 90 % quantile of all planning times. A plan counts as failed if
+its own planning time exceeds this quantile.
 
 The execution time is how long the arm moves. Torques are root mean squares over the execution time,
 computed by inverse dynamics with the masses of the links and a massless shield. Execution times and
-torques are averaged over the blocks of each planner, and over the throws that all planners block.
+torques are averaged over the throws that the planner blocks, and over the throws that all planners
+block.
 
-The paper's rows are quoted as printed. They come from 200 throws that are not published, on a
+The paper's rows are quoted as printed. They are for 200 throws that are not published, on a
 Threadripper Pro 5995WX. The paper does not state its limits, poses and definition of torques, and
-its percentages are multiples of 1/209. Absolute numbers of the paper are therefore not comparable
-with numbers measured here. Compare the ratios between the planners of each table instead.
+its percentages are multiples of 1/209. Its numbers are therefore not comparable with numbers
+measured here. Compare the ratios between the planners of each table instead.
 """
 
 import dataclasses
@@ -45,8 +47,8 @@ from planner_jax.task.block.spec import SUITES
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate, total_duration
 
 PEERS = "ompl and toppra not installed: pip install 'planner-jax[arm-peers]' for rrt-connect, epase"
-# Row name -> planner and its options. `direct-soonest` tries a single motion. Planners named
-# "plain" return the first path that they find, as the baselines of the paper presumably do.
+# Row of the table -> planner and its options. `direct-soonest` tries a single motion. The rows
+# "plain" use the first path that is found, as the paper's planners presumably do.
 PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
     "online": ("online", {}),
     "brisk": ("brisk", {}),
@@ -60,13 +62,13 @@ PLANNERS: dict[str, tuple[str, dict[str, Any]]] = {
 }
 NEED_PEERS = ("rrt-connect", "epase")
 LASTS_UNTIL_CONTACT = ("online", "brisk")
-# [%] Planners of LASTS_UNTIL_CONTACT assume that planning takes this quantile of their planning
-# times, and plan for an arm that starts later by that time.
+# [%] Quantile of the planning times of `online` and `brisk`. If planning time counts, they plan for
+# an arm that starts later by this quantile.
 RESERVE = 90.0
 WARM = 2  # Number of throws, drawn with another seed, that are planned before the measurement.
 # Tables I and II of [Natarajan2024] as printed. Columns of Table I: motion found [%], blocked if
-# query time counts [%], blocked if it does not count [%], query time [ms] and execution time [s],
-# each as (mean, standard deviation). Table II: root mean square torques of joints 1 to 6 [N m].
+# planning time counts [%], blocked if it does not count [%], planning time [ms] and execution time
+# [s], both as (mean, standard deviation). Table II: RMS torques of joints 1 to 6 [N m].
 TABLE_I = {
     "paper: theirs": (70.33, 68.9, 68.9, (0.109, 0.033), (0.31, 0.2)),
     "paper: RRT-Connect": (59.81, 27.27, 27.27, (17.5, 31.7), (1.3, 0.97)),
@@ -90,16 +92,16 @@ class Torques:
 def motion_torques(
     arm: Arm, motion: PiecewisePolynomial, gravity: float | Array = 9.81, samples: int = 256
 ) -> Torques:
-    """Return RMS and peak joint torques: sqrt(1/T int tau^2 dt) as in Table II of [Natarajan2024].
+    """Return RMS and greatest joint torques of a motion, as in Table II of [Natarajan2024].
 
-    The midpoint rule approximates the integral, because accelerations may jump at the ends of the
-    motion. The paper states neither whether gravity is included nor how torques are sampled. Pass
-    gravity 0 for torques without gravity.
+    The RMS torque is sqrt(1/T integral of tau^2 dt), with the motion's duration T and the joint's
+    torque tau. The integral is approximated by the midpoint rule, because accelerations may jump at
+    the ends of the motion. The paper does not state whether its torques include gravity.
 
     Args:
         arm: one arm.
         motion: joint trajectory, longer than 0 s.
-        gravity: () [m/s^2], magnitude of gravity, which acts along -z of the base frame.
+        gravity: () [m/s^2], acts along -z of the base frame; 0 for torques without gravity.
         samples: number of equal time steps; 256 give steps below 4 ms for motions up to a second.
     """
     shares = (np.arange(samples) + 0.5) / samples
@@ -117,11 +119,11 @@ def motion_torques(
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Success, times and torques of one planner on B throws."""
+    """Results of one planner on B throws: success, times and torques."""
 
     verdict: BlockVerdict
     found: np.ndarray  # (B,) bool, whether the motion is free of collision, even if too late
-    counted: np.ndarray  # (B,) bool, whether the ball is blocked if planning time counts
+    counted: np.ndarray  # (B,) bool, whether the ball is blocked, planning time included
     query: np.ndarray  # (B,) [s], planning time
     execution: np.ndarray  # (B,) [s], time during which the arm moves
     with_gravity: Torques  # leaves (B, 6) [N m]
@@ -129,7 +131,7 @@ class Outcome:
 
 
 def remove_waits(motion: PiecewisePolynomial) -> PiecewisePolynomial:
-    """Set the durations of pieces in which no joint moves to zero, for motions (B, ...)."""
+    """Set the durations of pieces in which no joint moves to zero, for a batch of motions."""
     coeffs = np.asarray(motion.coeffs)
     moves = np.any(coeffs[:, :, 1:] != 0.0, axis=(2, 3))
     durations: Any = np.where(moves, motion.durations, 0.0)
@@ -146,11 +148,12 @@ def is_found(plans: BlockPlan, verdict: BlockVerdict) -> np.ndarray:
 def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
     """Plan throws one by one, judge the plans, and compute their times and torques.
 
-    If `lasts`, the planner's motions always end at the contact. Its planning time is then counted
-    by planning again for an arm that starts later.
+    `warm` are throws that are planned before the measurement. `lasts` is true if the planner's
+    motions always end at the contact. Then planning time is counted by planning a second time, for
+    an arm that starts later.
     """
-    # The warm-up plans each throw once only, because every call advances RRT-Connect's random
-    # generator: with other numbers of calls the measured paths would differ.
+    # Each of these throws is planned exactly once. Every call advances RRT-Connect's random
+    # generator, so with another number of calls the measured paths would differ.
     for k in range(WARM):
         pj.plan(planner, pj.take(warm, k))
     plans, query = measure_plans(planner, cases)
@@ -173,7 +176,7 @@ def run_planner(planner: Any, cases: Any, warm: Any, *, lasts: bool) -> Outcome:
 
 
 def with_spread(values: np.ndarray, digits: int) -> str:
-    """Format the mean and standard deviation of values as text; a dash if there are no values."""
+    """Format values as "mean ± standard deviation"; "-" if there are no values."""
     if not len(values):
         return "-"
     return f"{values.mean():.{digits}f} ± {values.std():.{digits}f}"
@@ -216,7 +219,11 @@ def table_of_rates(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarra
 
 
 def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndarray) -> None:
-    """Print Table II: torques, over each planner's blocks and over the blocks common to all."""
+    """Print Table II: mean torques of the paper and of each planner.
+
+    Means are over the throws that the planner blocks, and over the throws that all planners block,
+    which `common` (B,) bool marks.
+    """
     bench.say(
         "",
         "| Table II, RMS [N m] | throws | 1 | 2 | 3 | 4 | 5 | 6 | peak 1 | peak 2 | peak 3 |",
@@ -246,7 +253,6 @@ def table_of_torques(bench: Bench, outcomes: dict[str, Outcome], common: np.ndar
 
 
 def main() -> None:
-    """Plan the drawn throws with every requested planner, and print Tables I and II."""
     parser = argument_parser("block_peers", __doc__, num=100, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="pole", help="default: pole")
     parser.add_argument("--regime", choices=REGIMES, default="R2", help="default: R2")

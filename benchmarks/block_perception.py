@@ -4,32 +4,35 @@
                                           [--rendered 12] [--seed 7] [--out DIR]
                                           [--parts errors,images,pipeline,planning]
 
-Part `errors`: balls are observed from the first frame, at time 0, up to a given time. Then the
-ball's flight is fitted to all observations, with known gravity [Natarajan2024, eqs 5 to 8]. The
-error is evaluated when the ball is midway between the two boxes. It is the distance of the fitted
-position from the true position, perpendicular to the flight. A shield that may meet the ball 0.1 m
+A robot arm blocks thrown balls with a shield. Throws are drawn from the suites `short`, from 6 to 8
+m away, and `pole`, from 6 to 12 m away.
+
+Part `errors`: a camera observes balls from time 0 up to a given time. Then the ball's flight is
+fitted to all observations, with known gravity [Natarajan2024, eqs 5 to 8]. An inner and an outer
+box stand around the arm. The error is the distance of the fitted from the true position when the
+ball is midway between the boxes, perpendicular to the flight. A shield that may meet the ball 0.1 m
 off its middle tolerates an error of 0.1 m. Observations have equal noise in all directions, or the
 noise of a stereo camera. Stereo observations are weighted by their noise, or equally as in the
-paper's eq. 8. The summary's success is the share of errors below 0.1 m for the suite `short`, with
-frames at 60 Hz, 2 cm of noise, and a fit at 0.25 s.
+paper's eq. 8. The success in the run's summary is the share of errors below 0.1 m for the suite
+`short`, with 60 frames per second, 2 cm of noise, and a fit at 0.25 s.
 
-Part `images`: throws of `short` are rendered at 60 Hz. Each image gets depth noise. The ball is
-found by a colour mask and outlier rejection, and its centroid is converted to the world frame with
-a simulated calibration. Then the flight is fitted. The table also has errors for the same throws
-with the stereo noise model instead of images. Two times are measured on one core, without
-compilation: from image and depth to the centroid, and from observations to the flight. They contain
-neither the simulation of the noise nor a real camera's depth computation.
+Part `images`: throws of `short` are rendered, 60 images per second. Each image gets depth noise.
+The ball is found by a colour mask and outlier rejection, and its centroid is converted to the world
+frame with a simulated calibration. Then the flight is fitted. The table also has errors for the
+same throws with the noise model of a stereo camera instead of images. Two times are measured on one
+core, without compilation: from image and depth to the centroid, and from observations to the
+flight. They contain neither the simulation of the noise nor a real camera's depth computation.
 
 Part `pipeline`: throws of `short` are observed, fitted, planned for, and judged against the true
 ball. The arm has the joint limits R1, and may meet a ball up to 0.1 m off the shield's middle and
-up to 30 degrees aslant. It decides once at a fixed time, or once at the last frame after which a
+up to 30 degrees aslant. It plans once at a fixed time, or once at the last frame after which a
 motion is still in time, or repeatedly. Its motion starts 50 ms after the frame, a time called
 overhead. The column `on the shield` counts balls that meet the shield anywhere on its face. The
 table compares times as in [Natarajan2024, eq. 1]: sensing, overhead and motion must end before the
 ball arrives.
 
-Part `planning`: plans are timed for one throw at a time. A plan should take less time than the
-overhead.
+Part `planning`: the planner is timed for one throw at a time. Planning should take less time than
+the overhead.
 """
 
 import dataclasses
@@ -73,15 +76,16 @@ RATES = (30.0, 60.0, 120.0)  # [Hz] Frame rates of the camera.
 STDS = (0.01, 0.02, 0.03)  # [m] Standard deviations of each observed coordinate.
 MOMENTS = (0.08, 0.1, 0.15, 0.2, 0.25, 0.3, 0.35, 0.4)  # [s] Times at which flights are fitted.
 ROOM = 0.1  # [m] A smaller error of the fitted position counts as success.
-# Suite, frame rate [Hz], noise [m] and time of the fit [s] that define the summary's success.
+# Suite of throws, frame rate [Hz], noise of each coordinate [m], and time of the fit [s] for which
+# the run's summary states the share of errors below 0.1 m.
 BAR = ("short", 60.0, 0.02, 0.25)
 RENDERED_RATE = 60.0  # [Hz] Frame rate of rendered images.
 TIMED = 200  # Number of camera frames, and of flight fits, that are timed.
 OVERHEAD = 0.05  # [s] Time from a camera frame until the motion that uses it may start.
 PARTS = ("errors", "images", "pipeline", "planning")
-# Row name -> (noise, fits, options). Noise is the standard deviation [m] of each coordinate, or
-# None for the stereo camera's noise. Fits are (first time [s], last time [s], rate [Hz]). The
-# options are passed to the function `decide`.
+# Row of the table -> (noise, times, options). The noise is the standard deviation [m] of each
+# observed coordinate, or None for the noise of a stereo camera. The arm plans from the first to the
+# last time [s] at a rate [Hz]. The options are arguments of `decide`, which simulates the arm.
 PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, Any]]] = {
     "once": (0.02, (0.25, 0.25, 60.0), {}),
     "once, stereo": (None, (0.25, 0.25, 60.0), {}),
@@ -97,10 +101,11 @@ PIPELINES: dict[str, tuple[float | None, tuple[float, float, float], dict[str, A
 def errors_after(
     cases: Any, eye: Eye, times: Array, places: Array, moments: Array, middle: Array
 ) -> tuple[Array, Array]:
-    """Fit each ball's flight at the times `moments` (M,) [s]; return errors of the positions.
+    """Fit the flights of B balls at M times; return errors of the fitted positions.
 
-    Returns the errors at the times `middle` (B,) [s], and their standard deviations as estimated by
-    the fit. Both are (B, M) [m], perpendicular to the flight.
+    Each fit uses the observed positions `places` (B, K, 3) [m] at the times `times` (K,) [s] up to
+    one of the times `moments` (M,). Returns the errors at the times `middle` (B,), and their
+    standard deviations as estimated by the fit, both (B, M) [m] and perpendicular to the flight.
     """
 
     def one(ball: BallState, gravity: Array, places: Array, middle: Array) -> Any:
@@ -118,7 +123,7 @@ def errors_after(
 
 @jax.jit
 def middle_of(cases: Any) -> Array:
-    """Return the times (B,) [s] at which balls are midway between the boxes."""
+    """Return the times (B,) [s] at which balls are midway between the two boxes around the arm."""
     flights = jax.vmap(flight_of)(cases)
     return 0.5 * (flights.earliest + flights.latest)
 
@@ -126,7 +131,7 @@ def middle_of(cases: Any) -> Array:
 class Table:
     """Printed table of position errors, with a column for each time at which flights are fitted.
 
-    A cell has the median error, and the share of errors below `ROOM`.
+    An entry has the median error, and the share of errors below `ROOM`.
     """
 
     def __init__(self, bench: Bench):
@@ -136,12 +141,12 @@ class Table:
         bench.say("|---|---|---|" + "---|" * len(heads))
 
     def line(self, suite: str, rate: float, noise: str, errors: np.ndarray, stds: Any) -> None:
-        """Print the row of one suite, frame rate and kind of noise.
+        """Print the row of one suite of throws, frame rate and kind of noise.
 
-        `errors` (B, M) [m] are NaN for balls that were not seen. `stds` (B, M) [m] are the standard
-        deviations that the fits estimate for these errors.
+        `errors` (B, M) [m] of B balls and M fits are NaN for balls that were not seen. `stds` (B,
+        M) [m] are the standard deviations that the fits estimate for these errors.
         """
-        within = np.mean(errors < ROOM, axis=0)  # A ball that was not seen (NaN) is not within.
+        within = np.mean(errors < ROOM, axis=0)  # False for balls not seen (NaN).
         medians = np.nanmedian(errors, axis=0)
         cells = [
             f"{median:.3f} m, {100 * share:.1f} %"
@@ -182,7 +187,7 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
                 if (suite, rate, std, BAR[3]) == BAR:
                     bench.count(found[0][:, MOMENTS.index(BAR[3])] < ROOM)
                 if std is None and rate == RENDERED_RATE:
-                    alike = eye(rate=rate, std=1.0)  # Constant noise weights all frames equally.
+                    alike = eye(rate=rate, std=1.0)  # Equal noise gives all frames equal weight.
                     found = errors_after(cases, alike, times, places, moments, middle)
                     table.line(suite, rate, "stereo, unweighted", np.asarray(found[0]), found[1])
 
@@ -190,7 +195,7 @@ def report_models(bench: Bench, num: int, seed: int) -> None:
 def report_images(bench: Bench, num: int, seed: int) -> None:
     """Print errors of flights fitted to rendered images, and to observations with modelled noise.
 
-    The times to process an image and to fit a flight are printed, too.
+    Also print the times to process an image and to fit a flight. `num` throws are rendered.
     """
     from planner_jax.sims.board import calibrate_camera
     from planner_jax.sims.camera import RenderError, SceneCamera
@@ -237,10 +242,11 @@ def report_images(bench: Bench, num: int, seed: int) -> None:
 
 
 def report_frames(bench: Bench, sensor: Eye, truth: np.ndarray, places: np.ndarray) -> None:
-    """Report how far observed ball positions (B, K, 3) are from the true positions in the image.
+    """Report errors of ball positions that were found in images: mean and standard deviation.
 
-    Errors in the image plane are in pixels. Depth errors are in units of the noise model's standard
-    deviation.
+    Errors in the image plane are in pixels. Errors along the camera's axis are divided by the
+    standard deviation of the noise model. `places` are the positions found, `truth` the true
+    positions, both (B, K, 3) [m] for B balls and K images.
     """
     camera: Any = sensor.camera
     noise: Any = sensor.noise
@@ -271,8 +277,8 @@ def report_times(
         weights = information(camera, noise, places)
         return belief_at(fit_flight(times, places, weights, gravity), times[0], gravity)
 
-    # A camera delivers positions one by one to the host. They are passed as NumPy arrays of
-    # constant size, so that the fit is compiled only once.
+    # The fit takes NumPy arrays, because a real camera delivers positions to the host. The arrays
+    # have a constant size, so that the fit is compiled only once.
     until, gravity = np.asarray(times), np.float32(9.81)
     jax.block_until_ready(fit(until, places, gravity))
     fit_seconds = []
@@ -295,7 +301,7 @@ def report_times(
 
 
 def moments_of(first: float, last: float, rate: float) -> list[float]:
-    """Return the times [s] of fits from `first` to `last` [s] at a rate [Hz]."""
+    """Return equally spaced times from `first` to `last` [s], `rate` of them per second."""
     return [first + k / rate for k in range(int(np.floor((last - first) * rate + 1e-6)) + 1)]
 
 
@@ -378,10 +384,11 @@ def planning(bench: Bench, num: int, seed: int) -> None:
 
 
 def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
-    """Plan B problems one by one, and time the planner, as `plan_with_aims` does for a batch.
+    """Plan B problems one by one, and time the planner.
 
-    An aim is a reserve for the error of the fitted ball. Each problem is planned with one aim after
-    another until a plan is solved. Returns the plans, and the planning times (B,) [s].
+    A fitted ball is not exact, so each problem is first planned with stricter limits on the contact
+    (an aim, see `studies.block.receding`). Weaker limits follow until a plan is solved. Returns the
+    plans, and for each problem the total planning time, (B,) [s].
     """
     (num,), own = entries.batch_shape, isinstance(planner, ReplanBlock)
     aimed = []
@@ -403,7 +410,6 @@ def time_with_aims(planner: Any, entries: Any) -> tuple[Any, np.ndarray]:
 
 
 def main() -> None:
-    """Run the requested parts of the module's docstring, and print their tables."""
     counts = {"num": 2000, "throws": 1000, "timed": 50, "rendered": 12, "seed": 7}
     parser = argument_parser("block_perception", __doc__, **counts)
     parser.add_argument(

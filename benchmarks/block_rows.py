@@ -3,23 +3,24 @@
     python -m benchmarks.block_rows [--num 2000] [--seed 7] [--rows "R2,R2 late"] [--starts 192]
         [--lanes N] [--planner online] [--write] [--out DIR]
 
-Each row of the table is a suite of throws with joint limits and a start time of the arm. The time
-for planning is ignored. Columns are in percent of all throws:
-* end pose: there is a pose of the shield that meets the ball and is free of collision. A straight
-  motion of the joints reaches this pose in time within the joints' limits, with or without a
-  collision on its path. This is nearly an upper bound. It is not exact, because only a finite set
-  of poses is searched;
+A robot arm blocks thrown balls with a shield. Each row of the table has a suite of throws, joint
+limits, and a time at which the arm may start. The time for planning is ignored. A straight motion
+is a motion in which all joints move in proportion. Columns are in percent of all throws:
+* end pose: some straight motion ends in time at a pose of the shield that meets the ball. The pose
+  is free of collision, but the path to it need not be. This is nearly an upper bound. It is not
+  exact, because only a finite set of poses is searched;
 * straight: a straight motion blocks the ball, and is free of collision on its whole path;
-* planner: the measured planner blocks the ball;
+* planner: the planner --planner blocks the ball;
 * long: a long search blocks the ball, but neither a straight motion nor the planner does. The long
   search is least squares from --starts random starts, 40 steps each, without early stopping;
 * union: a straight motion, the planner or the long search blocks the ball;
 * planner of union: blocks of the planner, divided by the blocks of the union.
 
-Blocks in all columns but the end poses are judged by the referee. --write stores the throws and the
-results in `block_throws.csv` beside this file, one line a throw. The column of each method has one
-digit for every row of the throw's suite, in the order stated at the top of the file; 1 means
-blocked. Read these columns as text, because they may begin with zeros.
+In all columns but "end pose" the referee, an independent check in float64, decides whether a ball
+is blocked. --write stores the throws and the results in `block_throws.csv` beside this file, one
+line a throw. The column of each method has one digit for every row of the throw's suite, in the
+order stated at the top of the file; 1 means blocked. Read these columns as text, because they may
+begin with zeros.
 """
 
 import csv
@@ -41,7 +42,7 @@ from planner_jax.task.block.end_poses import end_poses, flight_of
 
 # [s] In rows named "late" the arm may start only this long after the ball is first seen.
 LATE = 0.133
-# Row name -> suite of throws, and options of `pj.block.draw`.
+# Row of the table -> suite of throws, and options with which `pj.block.draw` draws them.
 ROWS: dict[str, tuple[str, dict[str, Any]]] = {
     "R1": ("pole", {"regime": "R1"}),
     "R1 late": ("pole", {"regime": "R1", "delay": LATE}),
@@ -63,10 +64,10 @@ STRAIGHT = OnlineBlock(searches=(Search(tries=0),))
 @jax.jit
 @jax.vmap
 def has_end_pose(case: pj.block.BlockCase) -> Array:
-    """Return whether some pose of the shield meets the ball in time without a collision, () bool.
+    """Return whether a straight motion ends in time at a pose that blocks the ball, () bool.
 
-    The pose must be reachable by a straight motion within the joints' limits. Collisions on the
-    path to the pose are ignored.
+    In a straight motion all joints move in proportion, within their limits. The pose must be free
+    of collision; collisions on the path to it are ignored.
     """
     poses = end_poses(case, flight_of(case), STRAIGHT.points, STRAIGHT.pieces)
     gaps = least_clearances(case.arm, case.scene, poses.angles)
@@ -78,8 +79,9 @@ def has_end_pose(case: pj.block.BlockCase) -> Array:
 def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.block.BlockPlan:
     """Run least squares for each case (B,) from N starts; return its plan with the least violation.
 
-    Start n is a straight motion to the end pose with rank `ranks[n]` in the planner's order. The
-    joints deviate from it along its path by up to `bumps[n]` (6,) [rad].
+    The planner sorts the poses in which the shield meets the ball. Start n is a motion to the pose
+    with rank `ranks[n]` in this order, in which all joints move in proportion, plus a smooth
+    deviation of the joints by up to `bumps[n]` (6,) [rad].
     """
     online = OnlineBlock()
 
@@ -95,13 +97,13 @@ def long_search(cases: pj.block.BlockCase, bumps: Array, ranks: Array) -> pj.blo
 
 
 def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes: int) -> Any:
-    """Return which of N cases the long search from random starts blocks, (N,) bool.
+    """Return which of N cases are blocked by a long search from random starts, (N,) bool.
 
-    Plans are judged by the referee.
+    The referee, an independent check, judges the plans.
 
     Args:
-        cases: a batch; the N cases to search are selected by `index`.
-        index: (N,) int, indices of the cases to search.
+        cases: a batch that contains the N cases.
+        index: (N,) int, indices of the N cases in the batch.
         starts: number of random starts for each case.
         lanes: number of starts that are optimised in one call.
     """
@@ -118,15 +120,15 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
 
 
 def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
-    """Return for each case (B,) whether the planner blocks the ball, as judged by the referee."""
+    """Return for each case (B,) whether the referee accepts the planner's motion as a block."""
     plans = pj.plan(planner, cases)
     return np.asarray(pj.block.judge(cases, plans).success & pj.are_solved(plans))
 
 
 def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
-    """Draw the throws of one row, and print the share of them that each method blocks.
+    """Draw the throws of the row `name`, and print the share of them that each method blocks.
 
-    Returns which throws are blocked, (N,) bool, by name of the method.
+    Returns for each method, by name, which of the N throws it blocks, (N,) bool.
     """
     suite, settings = ROWS[name]
     cases = pj.block.draw(options.num, suite, options.seed, **settings)
@@ -149,7 +151,7 @@ def measure(bench: Bench, name: str, options: Any) -> dict[str, np.ndarray]:
 
 
 def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options: Any) -> None:
-    """Write a CSV file with each throw's state, and which method blocks it in which rows."""
+    """Write a CSV file with each throw's position and velocity, and which methods block it."""
     suites = {ROWS[name][0]: [] for name in results}
     for name in results:
         suites[ROWS[name][0]].append(name)
@@ -172,7 +174,6 @@ def write_throws(path: Path, results: dict[str, dict[str, np.ndarray]], options:
 
 
 def main() -> None:
-    """Measure the requested rows, print the table, and write the throws if requested."""
     parser = argument_parser("block_rows", __doc__, num=2000, seed=7, starts=192)
     parser.add_argument(
         "--rows", default=",".join(ROWS), help=f"rows to print, of {', '.join(ROWS)}; default: all"

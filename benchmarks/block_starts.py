@@ -2,17 +2,19 @@
 
     python -m benchmarks.block_starts [--num 60] [--tries 24] [--lanes 512] [--write] [--out DIR]
 
-The planner searches by least squares if no straight motion of the joints blocks a ball. The search
-starts from a straight motion with an added bump: each joint deviates smoothly to one side, by a
-given angle in the middle of the motion. A start is such a bump, and the rank of the motion's end
-pose in the planner's order of end poses.
+The planner first tries straight motions of the arm, in which all joints move in proportion. If none
+of them blocks the ball, it searches by least squares. The search starts from a straight motion plus
+a bump: each joint deviates smoothly to one side, by a given angle in the middle of the motion. A
+starting point consists of a bump and of the rank of the motion's end pose. The planner sorts the
+end poses in which the shield meets the ball.
 
 Throws are drawn from the suite `pole` with seed 1001 and the joint limits R2. They are met at a
 right angle, and the arm may start after 0.05 s. No reported result uses these throws. Throws that
-no straight motion blocks are planned from random starts. Two kinds of bumps become candidates: the
-random bumps that led to plans, and the typical deviations of these plans from straight motions.
-Each candidate is tried with the first end poses, on all throws that some random start solved. Then
-starts are selected greedily: the next start is the one that blocks most of the remaining throws.
+no straight motion blocks are planned from random bumps and end poses. Then there are two kinds of
+candidates for the bumps: random bumps that led to plans, and typical deviations of these plans from
+straight motions. Each candidate is tried with the ten best end poses, on all throws that were
+solved. The starting points are selected greedily: each is the one that blocks most of the throws
+that the points before it do not block.
 
 --write replaces the file that the library ships. The shipped file was learned with the options
 --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
@@ -42,22 +44,22 @@ from planner_jax.task.block.plan import BlockPlan
 
 SEED, DELAY = 1001, 0.05  # Seed of the throws, and time [s] after which the arm may start.
 STRAIGHT = 32  # Number of straight motions that are tried for each throw.
-SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad] Spread of random bumps of each joint.
-RANKS, LATER_RANKS = 10, 24  # Number of end poses tried with candidates, and with random starts.
-KINDS = 48  # Number of candidates: random bumps, and as many typical deviations of plans.
-MOST = 16  # Maximum number of selected starts.
-SHARES = tuple(np.arange(1, 33) / 32)  # Times at which motions are compared, over the duration.
+SPREAD = np.array([0.5, 0.4, 0.4, 0.3, 0.5, 0.0])  # [rad] Typical size of each joint's random bump.
+RANKS, LATER_RANKS = 10, 24  # Numbers of end poses for candidates, and for random starting points.
+KINDS = 48  # Number of random bumps among the candidates; there are 48 typical deviations, too.
+MOST = 16  # Maximum number of selected starting points.
+SHARES = tuple(np.arange(1, 33) / 32)  # Sampled times of a motion, divided by its duration.
 
 
 def random_starts(rng: np.random.Generator, num: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw `num` starts: bumps (num, 6) [rad] of the joints, and ranks (num,) of end poses."""
+    """Draw `num` starting points: bumps (num, 6) [rad] of the joints, ranks (num,) of end poses."""
     bumps = rng.normal(size=(num, 6)) * SPREAD * rng.uniform(0.3, 1.8, (num, 1))
     return bumps, rng.integers(0, LATER_RANKS, num)
 
 
 @struct.dataclass
 class Followed:
-    """Result of a least-squares search from one start."""
+    """Result of a least-squares search from one starting point."""
 
     plan: BlockPlan
     point: Array  # (n,), the planner's unknowns at the end of the search
@@ -73,7 +75,8 @@ def follow(
 ) -> Followed:
     """Run least squares for one case, starting from a straight motion with an added bump.
 
-    The planner's rule that stops a search without hope is switched off.
+    In a straight motion all joints move in proportion. The search runs to its end, even where the
+    planner would stop it because success is unlikely.
 
     Args:
         planner: defines the unknowns and residuals.
@@ -97,12 +100,12 @@ def follow(
 def try_starts(
     planner: online.OnlineBlock, cases: pj.block.BlockCase, bumps: Array, ranks: Array, steps: Array
 ) -> tuple[Array, Array]:
-    """Run least squares from starts (B,) of cases (B,).
+    """Run least squares for B cases, each from one starting point (see `follow`).
 
     Returns:
         is_good: (B,) bool, whether the plan is solved.
         found: (B, 6) [rad], bump that best fits the deviation of the planned motion from the
-            straight motion with the same end pose.
+            straight motion to the same end pose.
     """
 
     def one(case: pj.block.BlockCase, bump: Array, rank: Array) -> tuple[Array, Array]:
@@ -123,9 +126,10 @@ def try_starts(
 def try_in_parts(
     cases: Any, index: np.ndarray, bumps: np.ndarray, ranks: np.ndarray, steps: int, lanes: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Run `try_starts` in batches of `lanes` starts. Start n is for the case `index[n]`.
+    """Run `try_starts` from N starting points, `lanes` of them in one call.
 
-    Returns whether each start led to a plan (N,), and the fitted bumps (N, 6) [rad].
+    Point n is for the case with index `index[n]`. Returns whether each point led to a plan (N,),
+    and the fitted bumps (N, 6) [rad].
     """
 
     def parts() -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -142,10 +146,10 @@ def try_in_parts(
 
 
 def select_starts(solves: np.ndarray) -> list[int]:
-    """Select starts greedily from a table (throws, starts) bool of which start solves which throw.
+    """Select starting points greedily from a table `solves` (throws, points) bool.
 
-    Each selected start solves most of the throws that no start before it solves. Returns the
-    selected columns, at most `MOST`.
+    An entry is true if a plan from the point blocks the throw. Each selected point solves most of
+    the throws that the points before it do not solve. Returns at most `MOST` column indices.
     """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:
@@ -166,8 +170,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     Args:
         bench: prints the share of solved throws.
         num: number of throws.
-        tries: number of random starts for each throw.
-        lanes: number of starts that are optimised in one call.
+        tries: number of random starting points for each throw.
+        lanes: number of searches that run in one call.
     """
     rng = np.random.default_rng(0)
     cases = pj.block.draw(num, "pole", SEED, regime="R2", delay=DELAY)
@@ -189,8 +193,8 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
     if not solvable.size:
         return []
 
-    # Each throw contributes at most 8 starts. Otherwise throws that almost every start solves would
-    # determine most candidates.
+    # Each throw contributes at most 8 bumps that solve it. Otherwise the throws that nearly every
+    # bump solves would determine most candidates.
     some = [rng.permutation(np.flatnonzero(good & (places == throw)))[:8] for throw in solvable]
     picked = np.concatenate(some)
     # The initial cluster centres are drawn here and passed to `kmeans2`: its own argument `seed` is
@@ -217,7 +221,6 @@ def learn(bench: Bench, num: int, tries: int, lanes: int) -> list[dict[str, Any]
 
 
 def main() -> None:
-    """Learn the starting points of the search, and replace the shipped file if requested."""
     parser = argument_parser("block_starts", __doc__, num=60, tries=24)
     parser.add_argument(
         "--lanes", type=at_least(1), default=512, help="starts optimised in one call"

@@ -3,19 +3,21 @@
     python -m benchmarks.catch_decisions [--suites triangle3,hexagon6] [--num 1000] [--seed 777]
         [--policy FILE] [--timed 200] [--out DIR]
 
-The planner is `exact`, and every plan is judged by the referee. The decisions are:
+A quadrotor catches several flying targets with a net. A decision sets the order of the targets and
+proposes a time for each catch. The planner `exact` then optimises the motion and the times. The
+referee, an independent check in float64, judges every plan. The decisions are:
 * `best`: plan the six most promising of all orders, and use the best plan;
-* `greedy`: plan the one order that catches the earliest target next;
+* `greedy`: plan the one order that always catches next the target that can be caught first;
 * `random`: plan a random order;
 * `policy`: plan the mean action of a neural network, the shipped policy or the one in --policy;
 * `policy, 6`: plan six proposals of this network, and use the plan with the earliest last catch.
 
-In suites with optional targets, "caught" is the mean number of targets that successful plans catch.
-"Last catch" is the mean time of the last catch over accepted plans. The optimal time ratio (OTR)
-compares the decided times with the optimised times. "At 25" is the success rate if the planner
-stops after 25 iterations from one initial guess. The time of a decision is for one case, without
-compilation, from one NumPy vector with the case's numbers to another vector with order and times.
-No policy was trained on the cases of this seed.
+"Caught" is the mean number of targets that successful plans catch; in some suites targets may be
+left out. "Last catch" is the mean time of the last catch over accepted plans. The optimal time
+ratio (OTR) is the mean relative difference between the proposed and the optimised times. "At 25" is
+the success rate if the planner stops after 25 iterations from one initial guess. The time of a
+decision is for one case, without compilation, from one NumPy vector with the case's numbers to
+another vector with order and times. No policy was trained on the cases of this seed.
 """
 
 import argparse
@@ -64,7 +66,7 @@ def decision_time(decision: Any, cases: Any, num: int) -> float:
 def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) -> dict[str, Any]:
     """Plan the cases of one suite with one decision; return success rates, times and ratios.
 
-    The successes are added to the benchmark's summary.
+    The successes are added to the run's summary. A decision sets the order and times of catches.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
@@ -89,7 +91,7 @@ def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) ->
 
 
 def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> None:
-    """Print a table with one row for each suite and decision."""
+    """Print a table with one row for each suite and each method that decides order and times."""
     decisions = {
         "best": pj.catch.Best(),
         "greedy": pj.catch.Greedy(),
@@ -118,7 +120,6 @@ def measure(bench: Bench, suites: list[str], options: argparse.Namespace) -> Non
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of all suites and decisions."""
     parser = argument_parser("catch_decisions", __doc__, num=1000, seed=777, timed=200)
     parser.add_argument("--suites", default=",".join(TRAINED_ON), help="suites, comma-separated")
     parser.add_argument(

@@ -2,20 +2,24 @@
 
     python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
-The published C++ program solves the same problem with the reference headers of MINCO and L-BFGS, in
-one thread and in double precision. On the easy set it takes 2.96 ms and 220 iterations a plan, and
-makes 320 plans/s on a core. On the hard set it takes 4.40 ms a plan and solves 98 % of the throws.
-With better settings of its search it makes 582 plans/s on the easy set and 453 on the hard set.
+A quadrotor catches a thrown ball with a net. The authors of [Yu2023catch] published a C++ program,
+an easy and a hard set of throws, and the program's optima. The program uses the reference headers
+of MINCO and L-BFGS, in one thread and in double precision. On the easy set it takes 2.96 ms and 220
+iterations a plan, and makes 320 plans/s on a core. On the hard set it takes 4.40 ms a plan and
+solves 98 % of the throws. With better settings of its search it makes 582 plans/s on the easy set
+and 453 on the hard set.
 
-The benchmark measures two planners of this library: `catch`, which minimises the same objective,
-and `exact`, the default. It prints
+The benchmark measures two planners of this library: `catch`, which minimises the same objective as
+the C++ program, and `exact`, the default. It prints
 * for `catch`, the cost at the initial guess and at the optimum, relative to the published costs;
-* for `exact`, the success rate by the referee and the mean catching time;
+* for `exact`, the mean catching time, and the success rate by the referee, an independent check in
+  float64;
 * the speed of both planners, one throw at a time and in a batch;
 * the speed of this project's own C++ program (`benchmarks.catch_peer`), which is faster than the
   published program.
-The summary of the run folder is about `exact`. Run this benchmark on an idle machine. The command
-`taskset -c 0` binds it to one core.
+
+The success and cost in the run's summary are those of `exact`. Run this benchmark on an idle
+machine. The command `taskset -c 0` binds it to one core.
 """
 
 import csv
@@ -38,12 +42,13 @@ from planner_jax.optimise.settings import Round, Stage
 
 SETS = ("paper", "hard")
 BATCH_COPIES = 64
-# Iterations of `quick_paper_catch`, with all samples and with a quarter of the samples.
+# Maximum numbers of iterations of `quick_paper_catch` in its second stage, which checks limits at
+# all samples of a trajectory, and in its first stage, which uses a quarter of the samples.
 _QUICK, _QUICK_COARSE = 45, 60
 
 
 def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarray]]:
-    """Read a CSV file of throws; return its cases, and the published times and costs by name."""
+    """Read a CSV file of throws; return cases, and the published times and costs by name."""
     with path.open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
 
@@ -66,7 +71,7 @@ def read_set(path: Path, dtype) -> tuple[pj.catch.CatchCase, dict[str, np.ndarra
 
 
 def guess_cost(planner: PaperCatch, case: pj.catch.CatchCase) -> jax.Array:
-    """Return the cost at a planner's initial guess, in the unit of the published costs."""
+    """Return the cost at the planner's initial guess for a case, in the published costs' unit."""
     context = planner.prepare(case)
     return COST_UNIT * planner.objective(planner.guesses(context, 1)[0], context).cost
 
@@ -90,7 +95,7 @@ def latencies(planner, cases: pj.catch.CatchCase, repeats: int) -> str:
 def throughput(planner, cases: pj.catch.CatchCase) -> str:
     """Plan a large batch five times without compilation; return its best speed as text.
 
-    The batch consists of `BATCH_COPIES` copies of the cases. The speed is in plans per second of
+    The batch contains `BATCH_COPIES` copies of the cases. The speed is in plans per second of
     wall-clock time and of CPU time.
     """
     many = jax.tree.map(lambda leaf: np.tile(leaf, (BATCH_COPIES,) + (1,) * (leaf.ndim - 1)),
@@ -106,9 +111,10 @@ def throughput(planner, cases: pj.catch.CatchCase) -> str:
 
 
 def report_paper_planner(bench: Bench, data: Path) -> None:
-    """Report costs of `catch` in float64, at the initial guess and at the end of its search.
+    """Print how far the costs of the planner `catch` in float64 are from the published costs.
 
-    Both are compared with the published costs in the files of the folder `data`.
+    The costs are computed at the initial guess and at the end of the search. The published costs
+    are in the files of the folder `data`.
     """
     with jax.enable_x64(True):
         for name in SETS:
@@ -133,9 +139,9 @@ def _gap(plans, known: dict[str, np.ndarray]) -> str:
 def quick_paper_catch() -> PaperCatch:
     """Return a `PaperCatch` with few iterations, for the measurement of its speed.
 
-    The iterations suffice for a cost within 1e-3 of the optimum on most throws of the hard set. The
-    first stage of the search evaluates limits at a quarter of the samples, the second stage at all
-    samples. Both stages use the published weights of the penalties.
+    On most throws of the hard set its costs are within 1e-3 (relative) of the optimum. The first
+    stage of the search checks limits at a quarter of the samples, the second stage at all samples.
+    Both stages use the published weights of the penalties.
     """
     chosen = PaperCatch()
     (full,) = chosen.rounds
@@ -146,7 +152,7 @@ def quick_paper_catch() -> PaperCatch:
 
 
 def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
-    """Report cost, success and speed of `catch` and `exact` on one set of throws, in float32."""
+    """Print cost, success and speed of `catch` and `exact` on one set of throws, in float32."""
     cases, known = read_set(data / f"catch_{name}.csv", jnp.float32)
     quick, exact = quick_paper_catch(), pj.catch.ExactCatch()
     bench.say(
@@ -167,7 +173,7 @@ def report_set(bench: Bench, data: Path, name: str, repeats: int) -> None:
 
 
 def report_peer(bench: Bench, data: Path) -> None:
-    """Report speed and cost of the C++ program `catch_peer` on both sets of throws."""
+    """Print speed and cost of the C++ program `catch_peer` on both sets of throws."""
     with tempfile.TemporaryDirectory(prefix="catch-peer-") as folder:
         program = peer.build(Path(folder))
         if program is None:
@@ -180,7 +186,6 @@ def report_peer(bench: Bench, data: Path) -> None:
 
 
 def main() -> None:
-    """Measure both planners and the C++ program on both sets of throws, and print the results."""
     parser = argument_parser("catch_reference", __doc__, repeats=5)
     parser.add_argument("--data", type=Path, default=Path("tests/data"), help="folder of the sets")
     options = parser.parse_args()

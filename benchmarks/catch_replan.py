@@ -3,10 +3,11 @@
     python -m benchmarks.catch_replan [--num 1000] [--rate 100] [--noise 0.005] [--out DIR]
     taskset -c 1 python -m benchmarks.catch_replan --alone
 
-Balls are drawn from the suite `throws`. A camera observes each ball --rate times per second, from a
-tenth of a second before planning starts until the catch. Observed positions have noise, and the
-ball's drag is known. After each observation a Kalman filter predicts the ball one period ahead, and
-the catch is planned again for a start at that time. If the plan is ready within one period and
+A quadrotor catches a thrown ball with a net. A camera observes each ball --rate times per second,
+from a tenth of a second before planning starts until the catch. A period is the time between two
+observations. Observed positions have noise of the standard deviation --noise [m], and the ball's
+drag is known. After each observation a Kalman filter predicts the ball one period ahead, and the
+catch is planned again for a start at that time. If the new plan is ready within one period and
 keeps all limits, the quadrotor switches to it at the end of the period. A plan that takes longer is
 a missed deadline. It is dropped, as is a plan that violates a limit. During the last 0.05 s before
 the catch nothing is re-planned.
@@ -16,10 +17,10 @@ the protocol of [Yu2023catch]: limits with a tolerance of 5 %, and the ball with
 of its centre. The first plan without re-planning is judged too. With --alone, the program only
 times re-plans, and plans from scratch for the same throws.
 
-The summary of the run folder is about the flown trajectories, or with --alone about the timed
-re-plans. Its cost gap is about the first re-plans. All programs run in the calling thread, as in
-the live loop, because starting a program of 0.1 ms in one of JAX's threads adds 0.05 ms. Run the
-benchmark on an idle machine; the load average is printed.
+The run's summary contains the success rate of the flown trajectories, or with --alone of the timed
+re-plans, and the excess cost of the first re-plans over a longer search. All programs run in the
+calling thread, as in the planning server, because starting a program of 0.1 ms in one of JAX's
+threads adds 0.05 ms. Run the benchmark on an idle machine; the load average is printed.
 """
 
 import dataclasses
@@ -45,12 +46,12 @@ from planner_jax.task.catch.plan import CatchPlan
 from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 SEEN = 0.1  # [s] Observations start this long before planning starts.
-WARM_UP = 5  # Number of throws that are flown before the measurement.
+WARM_UP = 5  # Number of throws that are simulated before the measurement.
 SCRATCH, AGAIN = pj.catch.ExactCatch(), pj.catch.ReplanCatch()
 
 
 class Estimator:
-    """Kalman filter of one ball. Its mean and covariance are stored as one vector."""
+    """Kalman filter of one ball; a vector stores the mean and covariance of its state."""
 
     def __init__(self, period: float, noise: float, drag: Any, gravity: Any) -> None:
         model = EkfModel(
@@ -67,7 +68,7 @@ class Estimator:
         def advance(vector: jax.Array) -> jax.Array:
             """Update the filter with an observation, and predict one period ahead.
 
-            `vector` holds the filter's state and then the observation (3,) [m].
+            `vector` contains the mean and covariance, and then the observation (3,) [m].
             """
             state = ekf_update(unravel(vector[:-3]), vector[-3:], model)
             ahead = ekf_predict(state, jnp.asarray(period), model)
@@ -77,12 +78,12 @@ class Estimator:
         self._first = self._belief = np.asarray(first)
 
     def begin(self, observation: np.ndarray) -> None:
-        """Start a new ball: reset the filter, with the first observation (3,) [m] as the mean."""
+        """Start a new ball: the first observed position (3,) [m] becomes the mean position."""
         self._belief = self._first.copy()
         self._belief[:3] = observation
 
     def see(self, observation: np.ndarray) -> BallState:
-        """Update the filter with an observation (3,) [m]; predict the ball one period later."""
+        """Update the filter with an observed position (3,) [m]; predict the ball a period later."""
         belief: Any = np.asarray(self._advance(np.concatenate([self._belief, observation])))
         self._belief = belief
         return BallState(pos=belief[None, :3], vel=belief[None, 3:6])
@@ -90,12 +91,12 @@ class Estimator:
 
 @dataclasses.dataclass
 class Times:
-    """Durations [s] of estimation, first plans and re-plans, and counts of failures."""
+    """Durations [s] of calls in all simulated throws, and counts of rejected re-plans."""
 
     estimate: list[float] = dataclasses.field(default_factory=list)
     first: list[float] = dataclasses.field(default_factory=list)
     again: list[float] = dataclasses.field(default_factory=list)
-    missed: int = 0  # number of missed deadlines
+    missed: int = 0  # number of re-plans that took longer than a period
     broken: int = 0  # number of re-plans that violate a limit
     # The first `COMPARED` re-planning problems, with their plans.
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
@@ -106,7 +107,7 @@ class Times:
             self.replans.append((left, found))
 
     def gaps(self) -> np.ndarray | None:
-        """Return the relative costs of the stored re-plans above the costs of a long search.
+        """Return by what fraction the costs of stored re-plans exceed the costs of a long search.
 
         The long search starts from the same guess. None if no re-plan is stored.
         """
@@ -127,7 +128,7 @@ def balls_of(case: CatchCase) -> pj.BallPath:
 
 
 def first_plan(case: CatchCase) -> tuple[CatchCase, CatchPlan]:
-    """Decide when to catch, and plan from scratch; return the decided case and the plan."""
+    """Choose the time of the catch, and plan from scratch; return the new case and the plan."""
     case = case.with_choice(jax.tree.map(lambda leaf: np.asarray(leaf)[0], _propose(case)))
     return case, pj.plan(SCRATCH, case)
 
@@ -138,8 +139,8 @@ _propose = jax.jit(pj.catch.Greedy().propose)
 def warm_up(case: CatchCase) -> None:
     """Compile all searches of the planner and the re-planner.
 
-    A quadrotor with a speed limit near zero cannot catch the ball. The planner therefore tries, and
-    compiles, every round of its search.
+    The planner starts a later search only for cases that are not solved. In the case used here the
+    quadrotor's speed limit is near zero, so no search solves it and all are compiled.
     """
     stuck = dataclasses.replace(
         case, limits=dataclasses.replace(case.limits, speed=np.float32(1e-3))
@@ -154,7 +155,7 @@ def fly(
     """Simulate one throw from its first observation to the catch, with re-planning.
 
     Args:
-        case: its time 0 is one period after the observation at which planning starts.
+        case: the true case; time 0 is one period after the observation at which planning starts.
         observations: (K, 3) [m], observed positions of the ball, one for each period.
         estimator: Kalman filter of the ball.
         period: [s], time between two observations.
@@ -212,9 +213,10 @@ def join_trajectories(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
 
 
 def judge(cases: CatchCase, plans: list[CatchPlan]) -> dict[str, np.ndarray]:
-    """Judge plans by the protocol of [Yu2023catch]; return arrays of verdicts by field name.
+    """Judge plans by the protocol of [Yu2023catch]; return for each field of the verdict an array.
 
-    The order of the plans is kept, although plans with equal numbers of pieces are judged together.
+    The protocol tolerates limits exceeded by 5 %. Plans with equal numbers of pieces are judged
+    together; the arrays are in the order of the plans.
     """
     lengths = np.array([flown.trajectory.durations.size for flown in plans])
     found: dict[str, np.ndarray] = {}
@@ -257,9 +259,10 @@ def report_catches(bench: Bench, name: str, verdict: dict[str, np.ndarray]) -> N
 
 
 def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray]:
-    """Draw throws; return the true cases and noisy observations (num, K, 3) [m] of their balls.
+    """Draw `num` throws; return them as cases, and noisy observations (num, K, 3) [m] of the balls.
 
-    Time 0 of the cases is one period after planning starts.
+    There are K observations, one each `period` [s], with the standard deviation `noise` [m]. Time 0
+    of the cases is one period after planning starts.
     """
     suite = pj.catch.draw(num)
     times = jnp.arange(-round(SEEN / period), int(suite.horizon.max() / period)) * period
@@ -279,10 +282,10 @@ def throws(num: int, period: float, noise: float) -> tuple[CatchCase, np.ndarray
 
 
 def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: float) -> None:
-    """Time one re-plan for each case, and a plan from scratch, and report percentiles.
+    """Time one re-plan and one plan from scratch for each case, and print percentiles.
 
-    A re-plan starts at a random time of the first plan, for a ball whose position and velocity
-    deviate from the expected ones by random errors of the size `noise`.
+    A re-plan starts at a random time of the first plan. The ball's position and velocity then
+    deviate from the expected values by random errors with the standard deviation `noise`.
     """
     random = np.random.default_rng(0)
     tasks = []
@@ -320,7 +323,6 @@ def time_replans(bench: Bench, lanes: list[CatchCase], period: float, noise: flo
 
 
 def main() -> None:
-    """Simulate all throws with re-planning, or only time re-plans with --alone."""
     parser = argument_parser("catch_replan", __doc__, num=1000)
     parser.add_argument(
         "--rate", type=float, default=100.0, help="observations and plans per second [Hz]"
@@ -362,7 +364,7 @@ def fly_all(
         fly(lane, seen, estimator, period, Times())
     times = Times()
     gc.collect()
-    gc.disable()  # A garbage collection takes milliseconds, and loops with deadlines avoid it.
+    gc.disable()  # A garbage collection takes milliseconds, so a real control loop avoids it.
     flights = [
         fly(lane, seen, estimator, period, times)
         for lane, seen in zip(lanes, observations, strict=True)

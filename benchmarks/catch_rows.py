@@ -3,10 +3,11 @@
     python -m benchmarks.catch_rows [--suites throws,hard] [--planners exact,catch,mpp]
         [--decide best] [--num 1000] [--seed 0] [--out DIR]
 
-The referee judges every plan with a relative tolerance of 1e-3. The paper's planner, here named
-`catch`, uses soft penalties, whose plans exceed limits slightly. Every plan is therefore judged a
-second time by the protocol of the published C++ program, which accepts limits exceeded by up to 5 %
-and requires the ball within the net's radius of its centre.
+A quadrotor catches flying targets with a net. A suite is a family of random cases. The referee, an
+independent check in float64, judges every plan with a relative tolerance of 1e-3. The paper's
+planner, here named `catch`, treats limits as penalties, so its plans exceed limits slightly. Every
+plan is therefore judged a second time by the protocol of the published C++ program, which accepts
+limits exceeded by up to 5 % and requires the ball within the net's radius of its centre.
 """
 
 import argparse
@@ -24,9 +25,9 @@ from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Plan the cases of one suite with one planner; return success, cost gap, ratios and times.
+    """Plan the cases of one suite with one planner; return success rates, costs and times by name.
 
-    The successes are added to the benchmark's summary.
+    The successes are added to the run's summary.
     """
     num, seed = options.num, options.seed
     planner, cases = pj.catch.planner(name, decide=options.decide), pj.catch.draw(num, suite, seed)
@@ -61,7 +62,6 @@ def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) ->
 
 
 def main() -> None:
-    """Print a table with one row for each requested suite and planner."""
     parser = argument_parser("catch_rows", __doc__, num=1000, seed=0)
     parser.add_argument(
         "--suites", default=",".join(SUITES), help="suites, comma-separated; default: all"

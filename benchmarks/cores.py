@@ -2,7 +2,7 @@
 
     python -m benchmarks.cores [--num 36000] [--turns 8] [--out DIR]
 
-Three groups of processes are compared:
+Three groups of processes plan the same batch:
 * one process on one core;
 * one process on all cores;
 * one process on each core, all at the same time. This group shows the greatest speed-up that the
@@ -10,7 +10,7 @@ Three groups of processes are compared:
 
 The groups take turns, so that other load on the machine affects all of them. For each group the
 program prints plans per second without compilation, and their ratio to the plans per second on one
-core in the same turn. It runs on Linux only, because processes are bound to cores.
+core in the same turn. It runs on Linux only, because it binds processes to cores.
 """
 
 import functools
@@ -26,8 +26,8 @@ import numpy as np
 
 import planner_jax as pj
 
-# Every child process imports this module. Imports that only the main process needs are therefore
-# inside of `main`.
+# Every child process imports this module. The function `main` contains the imports that only the
+# main process needs.
 
 
 def _start_process(cores: Sequence[int]) -> ProcessPoolExecutor:
@@ -38,7 +38,7 @@ def _start_process(cores: Sequence[int]) -> ProcessPoolExecutor:
 
 @functools.cache
 def _cases(num: int) -> tuple[Any, Any]:
-    """Return the planner `exact` and a batch of `num` drawn hits, stored between calls."""
+    """Return the planner `exact` and a batch of `num` drawn hits; repeated calls reuse them."""
     return pj.hit.planner("exact"), pj.hit.draw(num)
 
 
@@ -56,7 +56,6 @@ def _time_plan(num: int) -> float:
 
 
 def main() -> None:
-    """Let the groups of processes plan in turns, and print their plans per second."""
     from planner_jax.benchmarks.cost_gap import cost_gaps, gap_figures
     from planner_jax.benchmarks.run import argument_parser, begin
 
@@ -82,7 +81,7 @@ def main() -> None:
     for children in groups.values():
         for child in children:
             child.shutdown()
-    with bench:  # Only now does JAX start in the main process, so that it took no core before.
+    with bench:  # JAX starts in this process only after the measurement, so it took no core.
         bench.say(
             f"load average {load:.1f}; {options.turns} turns",
             "| process | plans/s, median | lowest | highest | times one core | success |",

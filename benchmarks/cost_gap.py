@@ -1,7 +1,4 @@
-"""Compare the costs of plans with the optimum that a long search finds.
-
-Benchmarks use this module to report how far their plans are from the optimum.
-"""
+"""Compare the costs of plans with the optimum that a long search finds, for the benchmarks."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -17,8 +14,8 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 
 COMPARED = 1024  # Maximum number of plans of a batch that are compared with a long search.
-# The long search starts from the planner's first guess. It runs L-BFGS, then Newton's method, which
-# converges also along directions in which the cost changes very little.
+# The long search starts from the planner's initial guess. It runs L-BFGS, then Newton's method,
+# which also converges along directions in which the cost changes very little.
 TO_THE_OPTIMUM = Round(
     solver=NewtonConfig(max_steps=100, tolerance=1e-8, patience=10),
     stages=(Stage(LbfgsConfig(max_steps=200, tolerance=1e-6, patience=5)),),
@@ -35,20 +32,20 @@ def cost_gaps(
 ) -> np.ndarray | None:
     """Return by what fraction the costs of plans exceed the costs that a long search finds.
 
-    For a planner that minimises in rounds, the long search is `TO_THE_OPTIMUM`. For any other
-    planner it is the planner that the task specification names as `yardstick`, with its defaults.
+    For a planner that minimises a cost, the long search is `TO_THE_OPTIMUM`. For any other planner
+    it is another planner, which the task specification names in its field `yardstick`.
 
     Args:
-        planner: the planner that made the plans. If it also decides (`DecidedPlanner`), the long
-            search uses the same decisions.
+        planner: the planner that made the plans. If it also decides order and times
+            (`DecidedPlanner`), the long search uses the same decisions.
         cases: a batch; only the first `COMPARED` cases are compared.
         plans: one plan for each case.
         devices: devices of the long search; None for all devices.
-        card: specification of the planner's task, which names the yardstick.
+        card: specification of the planner's task.
 
     Returns:
         (K,), cost / best cost - 1 for the K cases that both searches solve. None if the planner
-        has no rounds and the task names no yardstick for this class of cases.
+            does not minimise a cost and the task names no other planner for this class of cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):
@@ -68,19 +65,20 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # The yardstick cannot plan re-planning problems or groups of targets, which have other classes.
+    # The reference planner cannot plan re-planning problems and groups of targets, which have other
+    # classes.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 
 def with_long_search(planner: OptimisedPlanner) -> OptimisedPlanner:
-    """Return a copy of the planner that runs `TO_THE_OPTIMUM` instead of its own rounds."""
+    """Return a copy of the planner whose only search is `TO_THE_OPTIMUM`, a long search."""
     return planner.with_settings((("rounds", (TO_THE_OPTIMUM,)),))
 
 
 def gap_figures(*gaps: np.ndarray | None) -> dict[str, float | None]:
-    """Return the median, 90 % and 99 % quantile of relative cost gaps, by name.
+    """Return the median, 90 % and 99 % quantile of the results of `cost_gaps`, by name.
 
-    The gaps are one or more results of `cost_gaps`. The quantiles are None if there are no gaps.
+    The results are concatenated; None stands for no result. Without results the quantiles are None.
     """
     together = np.concatenate([np.zeros(0), *(each for each in gaps if each is not None)])
     names = ("cost_gap_median", "cost_gap_p90", "cost_gap_p99")

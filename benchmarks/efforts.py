@@ -2,11 +2,12 @@
 
     python -m benchmarks.efforts [--num 1000] [--seed 0] [--repeat 3] [--out DIR]
 
-The effort states how long a planner continues to search after every limit holds. The planner is
-`exact`, for hits of the suite `court` and for catches of one and of two balls in greedy order. The
-table has the share of plans that the referee accepts, their cost above the optimum, and the time of
-the fastest call without compilation. The optimum is found by a long search from the same initial
-guess, which ends with Newton's method.
+The effort states how long a planner continues to search for a lower cost after every limit holds.
+The planner is `exact`, for hits of the suite `court` and for catches of one and of two balls, where
+the ball that can be caught first is caught first. The table has the share of plans that the
+referee, an independent check in float64, accepts; their cost above the optimum; and the time of the
+fastest call without compilation. The optimum is found by a long search from the same initial guess,
+which ends with Newton's method.
 """
 
 import argparse
@@ -25,7 +26,7 @@ SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan every suite with every effort, and print a table with one row for each pair."""
+    """Plan every suite with every effort, and print one row for each suite and effort."""
     bench.say(
         f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
         "| task | suite | effort | refereed | cost above the optimum (median, p90, p99) | "
@@ -72,7 +73,6 @@ def _time_fastest(planner: Any, cases: Any, repeat: int) -> tuple[Any, float]:
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of costs and times for each effort."""
     parser = argument_parser("efforts", __doc__, num=1000, seed=0, repeat=3)
     options = parser.parse_args()
     with begin(parser, options) as bench:

@@ -3,14 +3,15 @@
     python -m benchmarks.environment_speed [--suite triangle3] [--iterations 25] [--lanes 16384]
         [--steps 20] [--out DIR]
 
-The environment `CatchEnv` is a batch of --lanes catching problems. In each step, an action decides
-order and times for each problem, and the planner plans with this decision. The step returns
-rewards, the next problems and their observations. Actions are random, with a standard deviation of
-0.1 in a range from -1 to 1, similar to a policy in training.
+A policy decides in which order and when a quadrotor catches several balls. It is trained in the
+environment `CatchEnv`, a batch of --lanes catching problems. In each step, an action of the policy
+sets order and times for each problem, and the planner plans with this decision. The step returns
+rewards, the next problems and their observations. Here actions are random, with a standard
+deviation of 0.1 in a range from -1 to 1, similar to a policy in training.
 
 A run is one compiled loop of --steps steps, and the fastest of three runs after a first run counts.
 The program also prints the share of plans that keep all limits after --iterations iterations. The
-planner's own check decides about the limits, because a step stores no plans for the referee.
+planner itself checks the limits, because a step stores no plans that could be judged independently.
 """
 
 import argparse
@@ -61,7 +62,6 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments, and print the environment's speed."""
     parser = argument_parser(
         "environment_speed", __doc__, iterations=25, lanes=16_384, steps=20, seed=0
     )

@@ -2,13 +2,15 @@
 
     python -m benchmarks.first_plan [--rows hit,block-64] [--out DIR]
 
-Each row is planned by two new processes, one after the other. The first process finds an empty
-compile cache on the disk. The second process loads the programs that the first one compiled. The
-CPU seconds are those of the whole process from its start, with imports and the drawing of cases,
-until the first call of `pj.plan` returns. The device is JAX's default, or that of JAX_PLATFORMS.
+Each row of the table is planned by two new processes, one after the other. The first process finds
+an empty compile cache on the disk. The second process loads the programs that the first one
+compiled. The CPU time is that of the whole process, from its start until the first call of
+`pj.plan` returns; it includes imports and the drawing of cases. The device is JAX's default, or the
+one that the variable JAX_PLATFORMS names.
 
-A row whose name starts with "later" measures a case that needs later rounds of the planner. Its
-process plans the task's usual case before, and its seconds start after that plan.
+Planners search unsolved cases again in later rounds, which need other programs. A row whose name
+starts with "later" measures a case that needs later rounds. Its process first plans a usual case of
+the task, and the row's times start after that plan.
 """
 
 import dataclasses
@@ -27,13 +29,13 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """The cases of a row: arguments of the task's function `draw`."""
+    """A row of the table: the cases to plan, as arguments of the task's function `draw`."""
 
     task: str
     num: int | None = None  # number of cases in a batch; None for one case without a batch axis
     suite: str | None = None
     options: dict[str, Any] = dataclasses.field(default_factory=dict)
-    is_later: bool = False  # whether the task's usual case is planned before
+    is_later: bool = False  # whether a usual case of the task is planned before
 
 
 ROWS = {
@@ -45,9 +47,9 @@ ROWS = {
     "intercept-64": Row("intercept", 64, "hard"),
     "block-64": Row("block", 64),
     "hit-late": Row("hit", 4096, options={"delay": 0.5}),
-    # No plan keeps limits of a fifth of the usual ones, which the planner reports after all rounds.
+    # With a fifth of the usual limits there is no solution, so the planner runs all its rounds.
     "later-hit": Row("hit", options={"limit_scale": 0.2}, is_later=True),
-    # No straight motion of the arm blocks this ball.
+    # No motion in which all joints move in proportion blocks this ball.
     "later-block": Row("block", options={"first": 2}, is_later=True),
 }
 _PROCESS = """
@@ -87,8 +89,9 @@ def plan_in_new_process(row: Row, caches: str) -> dict[str, Any]:
     """Plan a row's cases in a new process, with compiled programs in the folder `caches`.
 
     Returns:
-        "cpu" and "wall" [s], until the first plans; "programs", the number that compiled or loaded
-        for more than 0.1 s; "again" [s], CPU time of a second call; "success", of each case.
+        "cpu" and "wall", the times [s] until the first plans; "programs", the number of programs
+            that took more than 0.1 s to compile or load; "again", the CPU time [s] of a second
+            call; and "success" of each case.
     """
     usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_PERS")}
     command = [sys.executable, "-c", _PROCESS, json.dumps(dataclasses.asdict(row))]
@@ -103,7 +106,6 @@ def plan_in_new_process(row: Row, caches: str) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Plan every row in two processes, and print a table."""
     parser = argument_parser("first_plan", __doc__)
     usual = ",".join(ROWS)
     parser.add_argument("--rows", default=usual, help=f"comma-separated (default: {usual})")
@@ -125,8 +127,8 @@ def main() -> None:
                     f"{found['programs']} | {found['again']:.3f} | {100.0 * success:.1f} % |"
                 )
                 rows.append({"name": name, "cache": cache, **found})
-    # This process uses the device only after the others have ended, because the device's memory may
-    # suffice for one process only.
+    # This process uses the device only after the child processes have ended, because the device's
+    # memory may suffice for one process only.
     with bench:
         for row in rows:
             success = np.array(row.pop("success"))

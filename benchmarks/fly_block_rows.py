@@ -3,12 +3,13 @@
     python -m benchmarks.fly_block_rows [--num 200] [--seed 0] [--suite pole]
                                         [--regimes R1,R2] [--rows ideal,drives,...] [--by-clock]
 
-A row simulates joint drives with one kind of error, such as a lag of the torques or noise of the
-encoders. Plans are computed once for each set of joint limits (`--regimes`), one at a time, and the
-same plans are executed in every row. A ball is blocked if it hits the face of the shield before the
-ball's centre enters the inner box. The block is a success if the arm has touched nothing until
-then. An arm that follows its plans exactly would block the share of balls whose plans the referee
-accepts. This share is printed too.
+An arm with a shield protects a box from thrown balls. Each row of the table simulates joint drives
+with one kind of error, such as a lag of the torques or noise of the encoders. Plans are computed
+once for each set of joint limits (`--regimes`), one at a time, and the same plans are executed in
+every row. A ball is blocked if it hits the face of the shield before the ball's centre enters the
+box. The block is a success if the arm has touched nothing until then. The program also prints the
+share of balls whose plans the referee, an independent check in float64, accepts. An arm that
+followed its plans exactly would block this share.
 
 The arm may start 163 ms after a ball is first seen. This is the sum of 83 ms for perception and 50
 ms of overheads [Natarajan2024, Section VI-B], and of 30 ms for planning. Planning times depend on
@@ -26,8 +27,8 @@ from planner_jax.benchmarks.run import Bench, argument_parser, begin, parse_name
 from planner_jax.runs.summary import percent, wilson_interval
 from planner_jax.sweep.block.settings import REGIMES
 
-# Row name -> fields of `Drives` that differ from ideal drives. The key "share" is no such field: it
-# is a factor of the torque limits.
+# Row of the table -> fields of `Drives` that differ from drives without errors. The key "share" is
+# not a field of `Drives` but a factor of the torque limits.
 ROWS: dict[str, dict[str, Any]] = {
     "ideal": {},
     "lag 5 ms": {"lag": 0.005},
@@ -139,7 +140,6 @@ def measure(bench: Bench, regime: str, rows: list[str], options: Any) -> None:
 
 
 def main() -> None:
-    """Print the table for the requested joint limits and rows."""
     known = ", ".join(ROWS).replace("%", "%%")
     parser = argument_parser("fly_block_rows", __doc__, num=200, seed=0)
     parser.add_argument(

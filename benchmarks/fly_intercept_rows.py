@@ -3,11 +3,11 @@
     python -m benchmarks.fly_intercept_rows [--suite hard] [--num 50] [--seed 0]
                                             [--rows sensing,replan,latency,slip]
 
-Each row simulates drives of a car to predicted targets, and changes one setting: what is known
-about the target, the rate of re-planning, the latency of observations, or the slip of the tyres.
-The miss is the distance of the body's middle from the true target when the plan ends. A meeting
-counts as success if the miss is at most 0.3 m and the car has touched nothing. Contacts are checked
-with exact polygons every 20 ms.
+Each row of the table simulates drives of a car that meets moving targets among obstacles, and
+changes one setting: what is known about the target, the rate of re-planning, the latency of
+observations, or the slip of the tyres. The miss is the distance of the body's middle from the true
+target when the plan ends. A meeting counts as success if the miss is at most 0.3 m and the car has
+touched nothing. Contacts are checked with exact polygons every 20 ms.
 
 By default, targets are observed 15 times before the start and then once a second, with noise of 0.1
 m. The car's own pose is observed with noise of 1 cm and 0.01 rad. All observations are 50 ms old,
@@ -109,7 +109,6 @@ def run_drives(
 
 
 def main() -> None:
-    """Print the requested rows of the table, and a command that repeats each row."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--suite", default="hard", help="default: hard")
     parser.add_argument("--num", type=int, default=50, help="drives a row; default: 50")

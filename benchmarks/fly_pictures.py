@@ -3,9 +3,9 @@
     python -m benchmarks.fly_pictures [--out docs]
 
 The simulated sensors have the noise `lab`, that is the noise of a motion-capture hall, and a
-latency of 20 ms. The initial estimate of the ball's drag is 15 % wrong. Catches are re-planned at
-100 Hz, hits at 50 Hz. Four flights of each kind are simulated, and the picture shows the first
-successful flight.
+latency of 20 ms. The initial estimate of the ball's drag is 15 % wrong. Catches are re-planned 100
+times per second, hits 50 times. Four catches and four hits are simulated. Each picture shows the
+first of the four that succeeds.
 """
 
 import argparse
@@ -29,7 +29,6 @@ PICTURES = {
 
 
 def main() -> None:
-    """Simulate the flights, and write one picture of a catch and one of a hit."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument(
         "--out", type=Path, default=Path("docs"), metavar="DIR", help="default: docs"

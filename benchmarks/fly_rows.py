@@ -4,16 +4,18 @@
                                   [--limit 300]
 
 The option --rows selects groups of lines: `exact` without noise, `catch` and `hit` with noise, and
-`ablate`, which leaves out one part of the control loop at a time. The noise is `lab` with a latency
-of 20 ms, and the initial estimate of the ball's drag is 15 % too large or too small.
-Catches are re-planned at 100 Hz. Hits are re-planned at 50 Hz or, as in [Yu2023bat], not at all. A
-flight of several balls succeeds if all balls are caught.
+`ablate`, which leaves out one part of the control loop at a time. The noise is `lab`, that is the
+noise of a motion-capture hall, with a latency of 20 ms. The initial estimate of the ball's drag is
+15 % too large or too small. Catches are re-planned 100 times per second. Hits are re-planned 50
+times per second or, as in [Yu2023bat], not at all. A flight of several balls succeeds if all balls
+are caught.
 
 Each line prints the success rate with its 95 % Wilson interval, and the required rate if there is
-one. Every simulation runs twice, and the time of the second run is printed, which compiles nothing.
-It is divided into simulation with re-planning and planning from scratch. A simulation that exceeds
-the time limit is stopped as soon as the running compiled program returns. The printed prediction
-errors can be compared with the largest errors of [Yu2023bat], (15, 5, 25) cm along x, y and z.
+one. Every simulation runs twice, and the time of the second run, without compilation, is printed.
+This time is divided into simulation with re-planning and planning from scratch. A simulation that
+exceeds the time limit --limit is stopped as soon as the running compiled program returns. The
+printed errors of the predicted contact position can be compared with the largest errors of
+[Yu2023bat], (15, 5, 25) cm along x, y and z.
 """
 
 import argparse
@@ -39,9 +41,10 @@ from planner_jax.trajectory.polynomial import evaluate
 DRAG_ERROR = 0.15  # Relative error of the initial estimate of the ball's drag.
 CATCH_RATE, HIT_RATE = 100.0, 50.0  # [Hz] Re-planning rates of catches and of hits.
 LAB = NOISES["lab"]
-CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # Number of balls -> required success rate with noise.
-LANDING = 0.05  # [m] Without noise each hit ball must land this close to its target.
-# [s] Intervals of the time until the contact, for which prediction errors are printed.
+CAUGHT = {1: 0.97, 2: 0.93, 3: 0.88}  # Number of balls -> required success rate of catches.
+LANDING = 0.05  # [m] Greatest distance of landing and target of hits without noise.
+# [s] Intervals of the time until the contact. For each of them, the errors of the contact positions
+# that were predicted in this interval are printed.
 HORIZONS = ((0.9, 1.1), (0.7, 0.9), (0.5, 0.7), (0.3, 0.5), (0.1, 0.3))
 
 
@@ -63,7 +66,7 @@ def format_quantiles(values: np.ndarray, scale: float, unit: str) -> str:
 
 @contextlib.contextmanager
 def limit_time(name: str, seconds: int) -> Iterator[None]:
-    """Stop the code in this context with a printed message after `seconds`."""
+    """Stop the code in this context after `seconds`, and print that `name` was abandoned."""
 
     def stop(*_: Any) -> None:
         raise TimeoutError
@@ -94,7 +97,7 @@ def run_twice(fly: Callable[[], Any]) -> tuple[Any, str]:
 
 
 def check_rate(good: np.ndarray, bar: float | None) -> str:
-    """Return text on whether the success rate reaches `bar`; empty if no rate is required."""
+    """Return text that states whether the share of `good` reaches `bar`; empty if `bar` is None."""
     if bar is None:
         return ""
     return f", must reach {100 * bar:g} %: {'yes' if good.mean() >= bar else 'NO'}"
@@ -107,9 +110,9 @@ def format_tracking(flown: Flown) -> str:
 
 
 def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
-    """Compare the flown contact with the first ball to the planned contact.
+    """Return how far the flown contact with the first ball is from the planned contact.
 
-    Returns the errors of position [m] and of time [s], (B,) each.
+    Returns the errors of position [m] and of time [s], (B,) each for B flights.
     """
     planned = flown.contact.planned_time[:, 0]
     places = np.asarray(jax.vmap(evaluate)(flown.plan.trajectory, planned - flown.began))
@@ -138,7 +141,7 @@ def catches(
 ) -> CatchFlights | None:
     """Simulate catches, and print one line: success rate, distances, tracking error and times.
 
-    Returns the flights, or None if the time limit was exceeded.
+    Returns the flights, or None if the time limit was exceeded. `bar` is the required success rate.
     """
     cases = throws(args.num, loop.world.num_balls, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -160,7 +163,8 @@ def hits(
 ) -> HitFlights | None:
     """Simulate hits, and print one line: landing errors, success rates, tracking error and times.
 
-    Returns the flights, or None if the time limit was exceeded.
+    Returns the flights, or None if the time limit was exceeded. `regions` are the names of the
+    court scenarios from which serves are drawn.
     """
     cases = volleys(args.num, regions, args.seed, drag_error=drag_error)
     with limit_time(name, args.limit):
@@ -218,7 +222,7 @@ def catch_rows(args: Any) -> None:
 
 
 def hit_rows(args: Any) -> None:
-    """Print lines with noise for hits in six scenarios, with and without re-planning."""
+    """Print lines with noise for hits in the six scenarios of [Yu2023bat], re-planned and not."""
     for rate in (HIT_RATE, 0.0):
         for name, regions in REAL_SCENARIOS.items():
             loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")
@@ -229,7 +233,7 @@ def hit_rows(args: Any) -> None:
 
 
 def make_ablations(whole: Loop) -> dict[str, Loop]:
-    """Return a control loop, and copies that each lack one part, by name of the missing part."""
+    """Return the control loop `whole`, and copies that each lack one part, by name of that part."""
     return {
         "everything": whole,
         "no Kalman filter": dataclasses.replace(whole, kalman=False),
@@ -239,7 +243,7 @@ def make_ablations(whole: Loop) -> dict[str, Loop]:
 
 
 def ablation_rows(args: Any) -> None:
-    """Print lines that show the effect of each part of the loop, and of other planners."""
+    """Print lines for control loops that each lack one part, and for other planners."""
     for name, loop in make_ablations(Loop(CATCH_WORLD, LAB, replan=CATCH_RATE)).items():
         catches(f"lab, one ball, {name}", loop, args, DRAG_ERROR)
     loop = Loop(CATCH_WORLD, LAB)
@@ -259,7 +263,6 @@ ROWS = {"exact": exact_rows, "catch": catch_rows, "hit": hit_rows, "ablate": abl
 
 
 def main() -> None:
-    """Parse the arguments, and print the requested groups of lines."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--num", type=int, default=1000, help="flights a row (default: 1000)")
     parser.add_argument("--seed", type=int, default=0, help="default: 0")

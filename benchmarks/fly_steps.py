@@ -4,9 +4,10 @@
 
 A world is one simulated quadrotor and one ball, and a batch has many worlds. Two simulations are
 measured. The open loop computes the physics alone, with constant rotor thrusts. The closed loop is
-a whole flight without re-planning: observations, Kalman filter, reference, control, physics and
-contact. A step covers 2 ms of simulated time. If the package crazyflow is installed, its
-first-principles quadrotor without a ball is measured too. Compile time is reported separately.
+a whole flight: observations, Kalman filter, reference, control, physics and contact. Its plan is
+computed before and not changed in flight. A step covers 2 ms of simulated time. If the package
+crazyflow is installed, its first-principles quadrotor without a ball is measured too. Compile time
+is reported separately.
 """
 
 import argparse
@@ -37,7 +38,7 @@ RUNS = 3
 
 
 def report_speed(name: str, steps: int, run: Callable[[], Any]) -> None:
-    """Run a simulation several times; print steps per second of the fastest run, and compile time.
+    """Run a simulation several times; print the speed of the fastest run, and the compile time.
 
     `steps` is the number of physics steps that one call of `run` computes, over all worlds.
     """
@@ -78,7 +79,7 @@ def measure_closed_loop(world: World, worlds: int, seconds: float) -> None:
     The time does not include planning. `seconds` is the simulated time of each flight.
     """
     loop = Loop(world, NOISES["lab"])
-    few = min(worlds, 256)  # Number of different throws. They are repeated to fill the batch.
+    few = min(worlds, 256)  # Number of different throws, which are repeated to fill the batch.
     cases = throws(few)
     drag, guess = jnp.asarray(cases.drag), jnp.asarray(cases.believed)
     starts = jnp.tile(jnp.array(START), (few, 1))
@@ -118,7 +119,6 @@ def measure_crazyflow(worlds: int, steps: int) -> None:
 
 
 def main() -> None:
-    """Measure open loop, closed loop and crazyflow for each batch size, and print the results."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     default = "256" if jax.default_backend() == "cpu" else "4096,65536"
     parser.add_argument("--worlds", default=default, help=f"batch sizes; default: {default}")

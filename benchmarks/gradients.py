@@ -2,15 +2,16 @@
 
     python -m benchmarks.gradients [--task hit] [--num 4096] [--steps N] [--accuracy 64] [--out DIR]
 
-The gradient of a plan's quantity, such as the contact time of a hit, is defined at the optimum of
-the planner's objective. Three calls are timed in turns: planning with the planner's default search,
-planning to the optimum, and planning to the optimum with the gradient. Times are for whole calls
-without compilation, from arrays on the device to arrays on the device: the fastest and the median
-of `--repeat` calls. The first calls, which compile, are listed separately.
+A case contains the numbers of a planning problem. The gradient of a plan's quantity, here of the
+contact time of a hit or of the time of the last catch, is defined at the optimum of the planner's
+objective. Three calls are timed in turns: planning with the planner's default search, planning to
+the optimum, and planning to the optimum with the gradient. Times are for whole calls without
+compilation, from arrays on the device to arrays on the device: the fastest and the median of
+--repeat calls. The first calls, which compile, are listed separately.
 
 The accuracy is the relative difference from a reference gradient, over all arrays of the case with
-respect to which the plan is differentiated. The reference is computed at optima in float64 with the
-whole Hessian, for cases that the search in float64 solves.
+respect to which the plan is differentiated. The reference gradient is computed in float64 at optima
+in float64, with the whole Hessian. Cases that are not solved in float64 are left out.
 """
 
 import argparse
@@ -56,9 +57,10 @@ def _case(task: str, num: int) -> tuple[Any, Any, Any]:
 
 
 def _time_calls(calls: dict[str, Any], repeat: int) -> dict[str, tuple[float, float, float]]:
-    """Run the functions in turns; return for each the durations [s] of its calls.
+    """Call the functions in turns; return for each of them three durations [s].
 
-    The durations are of the first call, of the fastest later call, and the median of later calls.
+    These are the durations of the first call and of the fastest later call, and the median of all
+    later calls.
     """
     first, later = {}, {name: [] for name in calls}
     for turn in range(1 + repeat):
@@ -90,8 +92,9 @@ def _double(tree: Any) -> Any:
 def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
     """Format quantiles of the relative difference between gradients `found` and `best` (B, n).
 
-    Each of the n columns is first divided by the median of its absolute value in `best`, because
-    the columns have different units. `lanes` are the indices of the compared cases.
+    Both have n components for each of B cases. Each component is first divided by the median of its
+    absolute value in `best`, because components have different units. Only the cases with the
+    indices `lanes` are compared.
     """
     has_none = ~np.isfinite(found[lanes]).all(axis=1)
     none, lanes = has_none.mean(), lanes[~has_none]
@@ -104,7 +107,6 @@ def _errors(found: np.ndarray, best: np.ndarray, lanes: np.ndarray) -> str:
 
 
 def main() -> None:
-    """Measure times of plans and gradients, then the gradients' accuracy, and print both."""
     parser = argument_parser("gradients", __doc__, num=4096, repeat=10)
     parser.add_argument("--task", choices=_BY, default="hit", help="default: hit")
     parser.add_argument("--steps", type=at_least(0), help="steps of the adjoint solver")
@@ -158,7 +160,7 @@ def _measure(
 
 
 def _compare(bench: Bench, options: argparse.Namespace, differentiate: Any, few: Any) -> None:
-    """Print how much the gradients of a few cases differ from gradients at optima in float64."""
+    """Print how much the gradients of `few` cases differ from gradients at optima in float64."""
     found = differentiate(few, steps=options.steps)
     with jax.enable_x64(True):
         best = differentiate(_double(few), curvature="whole", solver=_LONG)

@@ -2,17 +2,18 @@
 
     python -m benchmarks.hit_rows --serves DIR [--rows base,late-0.5] [--num N] [--out DIR]
 
-The rows are
+A quadrotor hits a served ball with a racket such that it lands at a target [Yu2023bat]. The rows
+are
 * `base`: the quadrotor starts at the published initial position;
 * `uniform-start`: the initial position is drawn over the half court;
 * `late-T`: planning starts T seconds after the serve, while the quadrotor still hovers;
 * `limits-F`: the limits on speed, acceleration and body rate are multiplied by F;
 * `drag-after-impact`: the ball has drag also after the hit;
-* `tight`, which is not part of the protocol: the limits are 2.5 m/s, 10 m/s^2 and 3 rad/s. In
-  every hundredth case the ball flies away from the quadrotor, so that no plan can reach it.
+* `tight`, which is not part of the protocol: the limits are 2.5 m/s, 10 m/s^2 and 3 rad/s. In every
+  hundredth case the ball flies away from the quadrotor, so that no plan can reach it.
 
-Success is judged by the referee. Without --serves the serves are drawn with seed 0. The run folder
-also stores the indices of each row's failures.
+The referee, an independent check in float64, decides about success. Without --serves the serves are
+drawn with seed 0. The run folder also stores the indices of each row's failures.
 """
 
 import dataclasses
@@ -40,7 +41,7 @@ _TIGHT = {"speed": 2.5, "acceleration": 10.0, "body_rate": 3.0}
 
 
 def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
-    """Convert serves to the cases of the row `name`, with its start, delay and limits."""
+    """Convert serves to the cases of the row `name`: its initial positions, delay and limits."""
     cases = pj.hit.to_cases(serves, **ROWS[name])
     if name != "tight":
         return cases
@@ -57,7 +58,7 @@ def cases_of(name: str, serves: Serves) -> pj.hit.HitCase:
 def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
     """Plan the serves of one row; return its success rate, costs and times by name.
 
-    The successes are added to the benchmark's summary.
+    The successes are added to the run's summary.
     """
     drag_after = name == "drag-after-impact"
     planner = pj.hit.planner("exact", drag_after_impact=drag_after)
@@ -89,7 +90,6 @@ def run_row(bench: Bench, name: str, serves: Serves) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Read or draw the serves, and print a table with the requested rows."""
     parser = argument_parser("hit_rows", __doc__, num=9000)
     parser.add_argument(
         "--serves", type=Path, help="folder of published trial files; default: draw serves"

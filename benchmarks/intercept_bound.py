@@ -1,15 +1,15 @@
 """Compute a lower bound on the time at which any car can meet its target.
 
 `benchmarks.intercept_oracle` uses this bound to prove that cases are infeasible. The car is
-replaced by a point at the middle of its body, which may change its direction instantly. The point
-is never faster than a car at full acceleration from the start, and keeps half the body's width
-from all obstacles. So the point reaches every position that the middle of a car can reach.
+replaced by a point at the middle of its body, which may change its direction instantly. The point's
+speed at each time is the greatest that a car can have by then. The point keeps only half the body's
+width from all obstacles. So the point reaches every position that the middle of a car can reach.
 
-The plane is divided into square cells, and time into layers. A cell counts as reached if the point
-can be anywhere in it, and as free of obstacles if any part of it is free. Hence, if no reached cell
-contains the target at the time of a layer, no car meets the target then. Obstacles are checked
-twice per layer. Between two checks a car moves less than the thickness of the thinnest wall plus
-the body's width, so that the point cannot jump over a wall.
+The plane is divided into square cells, and time into layers (time steps). A cell counts as reached
+if the point can be anywhere in it, and as free of obstacles if any part of it is free. Hence, if no
+reached cell contains the target at the time of a layer, no car meets the target then. Obstacles are
+checked twice per layer. Between two checks a car moves less than the thickness of the thinnest wall
+plus the body's width, so that the point cannot jump over a wall.
 """
 
 import numpy as np
@@ -21,11 +21,11 @@ _SLACK = CELL * np.sqrt(0.5)  # [m] Distance from the middle of a cell to its co
 
 
 def earliest_bound(scene: Scene) -> tuple[bool, float]:
-    """Return whether a car may meet the target at the case's time, and the earliest such time.
+    """Return whether a car may meet the target at the case's time, and the earliest meeting [s].
 
-    False means that a meeting at the case's time is impossible. The earliest time is the time of a
-    layer [s]: at every earlier layer a meeting is impossible. It is infinite if no layer permits
-    a meeting.
+    False proves that a meeting at the case's time is impossible. The earliest meeting is the time
+    of a layer (time step): at every earlier layer a meeting is impossible. It is infinite if no
+    layer permits a meeting.
     """
     middle = scene.start[:2] + scene.middle * np.array(
         [np.cos(scene.start[2]), np.sin(scene.start[2])]
@@ -35,8 +35,8 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     origin = middle - first * CELL
     radius = 0.5 * scene.width - _SLACK
     columns, rows = (origin[k] + CELL * np.arange(count[k]) for k in (0, 1))
-    # The position of a moving obstacle is rounded to whole cells. Its set of blocked cells is
-    # therefore smaller than a wall's by the greatest rounding error, so that no free cell is lost.
+    # Positions of moving obstacles are rounded to whole cells. Their radius is therefore reduced by
+    # the greatest rounding error, so that no free cell counts as blocked.
     movers = [_draw_polygon(corners, radius - _SLACK) for corners in scene.movers]
     steps = _limit_steps(scene)
     guard = max([int(steps.max() / CELL) + 2, *(drawn.shape[1] for _, drawn in movers)])
@@ -61,12 +61,13 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
 
 
 def _limit_steps(scene: Scene) -> np.ndarray:
-    """Return upper bounds (2 L,) [m] on the distance that the body's middle covers per half layer.
+    """Return upper bounds (2 L,) [m] on the distance covered in each half of L layers of time.
 
-    The middle is at a distance b ahead of the rear axle, whose speed is v on a path of curvature
-    kappa. The middle's speed is sqrt(v^2 + (b v kappa)^2). The term (v kappa)^2 is the product of
-    kappa and v^2 kappa, and both factors are limited. The speed is convex in v, so for linearly
-    increasing v the trapezoid rule is an upper bound of the distance.
+    This is the distance of the body's middle, which is b ahead of the rear axle. On a path of
+    curvature kappa, its speed is sqrt(v^2 + (b v kappa)^2), where v is the speed of the rear axle.
+    The term (v kappa)^2 is the curvature kappa times the lateral acceleration v^2 kappa, and both
+    are limited. The speed is convex in v, so for linearly increasing v the trapezoid rule is an
+    upper bound.
     """
     step = 0.5 * scene.dt
     times = step * np.arange(2 * len(scene.target) - 1)
@@ -78,7 +79,7 @@ def _limit_steps(scene: Scene) -> np.ndarray:
 
 
 def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return the cells within `radius` [m] of a polygon: first cell (2,) int, and mask (Y, X)."""
+    """Return the cells within `radius` [m] of a polygon: first index (2,), mask of cells (Y, X)."""
     low = np.floor((corners.min(axis=0) - radius) / CELL).astype(int)
     high = np.ceil((corners.max(axis=0) + radius) / CELL).astype(int)
     x, y = (CELL * np.arange(low[k], high[k] + 1) for k in (0, 1))
@@ -88,7 +89,8 @@ def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
 def _grow(plane: int, distance: float, stride: int) -> int:
     """Return all cells that the point can reach from a set of cells by moving `distance` cells.
 
-    Sets of cells are the bits of an integer, with rows of cells `stride` bits apart.
+    A set of cells is an integer with one bit for each cell, and `stride` bits for each row of
+    cells.
     """
     grown, wide, width = 0, plane, 0
     for row in range(int(distance) + 1, -1, -1):
@@ -101,9 +103,9 @@ def _grow(plane: int, distance: float, stride: int) -> int:
 
 
 def _draw_goal(scene: Scene, layer: int, origin: np.ndarray, count: np.ndarray, stride: int) -> int:
-    """Return, as bits of an integer, the cells that contain a meeting point at a layer.
+    """Return the cells that are within the case's tolerance of the target at a layer of time.
 
-    A meeting point is within the case's tolerance of the target.
+    The result is an integer with one bit for each cell.
     """
     place = (scene.target[layer] - origin) / CELL
     reach = scene.tolerance / CELL

@@ -1,17 +1,17 @@
 """Check by sampling whether a car can leave the neighbourhood of its start without a collision.
 
 `benchmarks.intercept_oracle` uses this check. A car that starts with a speed can neither turn on
-the spot nor reverse. If an obstacle is close ahead, all of its motions may collide. The lattice
-search (`intercept_lattice`) may find a motion in spite of this, because its cars turn instantly and
-its positions are rounded. This search does not round states. It only merges states that lie in the
-same small cell. It shares no code with the planners. Positions are in the plane of the world frame,
-in SI units.
+the spot nor reverse. If an obstacle is close ahead, all of its motions may collide. The search of
+`intercept_lattice` may find a motion in spite of this, because its cars turn instantly and its
+positions are rounded. This search does not round states. It only merges states that lie in the same
+small cell. It shares no code with the planners. Positions are in the plane of the world frame, in
+SI units.
 
 In each time step the steering angle changes at one of five rates, and the speed at one of three
 accelerations. Steering that would exceed a limit of curvature or lateral acceleration is clipped,
 even if real wheels could not turn back in time. So the search may accept an infeasible motion.
 Because states are merged and discarded, it may also miss a feasible motion. Obstacles are checked
-every 0.02 s, as by the referee.
+every 0.02 s.
 """
 
 import numpy as np
@@ -20,18 +20,19 @@ from planner_jax.benchmarks.intercept_lattice import Scene
 
 STEP = 0.1  # [s] Time step with constant steering rate and acceleration.
 _PARTS = 5  # Number of parts of a step; obstacles are checked after each part.
-# Sides of a cell: x [m], y [m], heading [rad], speed [m/s] and steering angle [rad].
+# Sizes of a cell, within which states are merged: x [m], y [m], heading [rad], speed [m/s] and
+# steering angle [rad].
 _CELL = np.array([0.015, 0.015, 0.03, 0.08, 0.15])
-_MOST = 20_000  # Maximum number of states. A random subset of this size is kept.
+_MOST = 20_000  # Maximum number of states. Of more states a random subset is kept.
 _RATES = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])  # Steering rates, relative to their limit.
 _PEDALS = np.array([-1.0, 0.0, 1.0])  # Accelerations, relative to their limit.
 
 
 def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2.0) -> bool:
-    """Return whether some collision-free motion gets `far` [m] away from the start in `until` [s].
+    """Return whether a collision-free motion gets `far` [m] away from the start within `until` [s].
 
-    If the meeting is nearer to the start or earlier, it suffices that a motion is free of
-    collisions for `alive` [s], or until the meeting.
+    If the meeting with the target is nearer to the start or earlier, it suffices that a motion is
+    free of collisions for `alive` [s], or until the meeting.
     """
     random = np.random.default_rng(0)
     steering = np.arctan(scene.wheelbase * scene.initial_curvature)
@@ -53,7 +54,7 @@ def departs(scene: Scene, far: float = 1.5, until: float = 6.0, alive: float = 2
 
 
 def _advance(scene: Scene, states: np.ndarray, time: float) -> np.ndarray:
-    """Return all collision-free states (M, 5) that are reached one step after N states at `time`.
+    """Return all collision-free states (M, 5) that are reached one step after N states (N, 5).
 
     A state has x [m], y [m], heading [rad], speed [m/s] and steering angle [rad].
     """
@@ -105,7 +106,10 @@ def is_free(
 
 
 def _is_apart(scene: Scene, corners, x, y, cos, sin) -> np.ndarray:
-    """Return which bodies of N cars do not overlap a polygon (V, 2) [m], by separating axes."""
+    """Return for N cars whether the body does not overlap a convex polygon (V, 2) [m], (N,) bool.
+
+    The test searches a separating axis.
+    """
     half = 0.5 * np.array([scene.length, scene.width])
     from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N)
     along, across = cos * from_x + sin * from_y, cos * from_y - sin * from_x

@@ -2,23 +2,23 @@
 
     python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
 
-A case is a group of the suite `group`, of which the first three targets are used. Four methods are
-compared:
+A case is a group of moving targets from the suite `group`, of which the first three are used. Four
+methods are compared:
 * plan all six orders, and use the best plan;
 * plan the three orders with the earliest estimated last meeting, and use the best plan;
 * the greedy order, which continues with the target that can be met next, by an estimate;
 * the order in which the targets were drawn, which is random.
 
-Success is judged by the referee. Times of the last meeting are over groups that all four methods
-solve. They are compared with a lower bound, which no plan can beat. For the bound, the car is
-replaced by a point that moves in a straight line to each target, through obstacles, and that
-changes its direction instantly. Its speed is at most the speed of the middle of a car at full
-acceleration from the start. It meets a target as soon as their distance is within the case's
-tolerance. The bound is the earliest last meeting over all orders.
+The referee, an independent check in float64, decides about success. Times of the last meeting are
+averaged over groups that all four methods solve. They are compared with a lower bound, which no
+plan can beat. For the bound, the car is replaced by a point that moves in a straight line to each
+target, through obstacles, and that changes its direction instantly. Its speed is at most the speed
+of the middle of a car at full acceleration from the start. It meets a target as soon as their
+distance is within the case's tolerance. The bound is the earliest last meeting over all orders.
 
 Planning times are for a second call, which compiles nothing, with all groups at once. The compile
 time of the first listed method is the longest, because the other methods use the same programs. The
-summary's success is for the best of all six orders.
+success rate in the run's summary is that of the first method.
 """
 
 import argparse
@@ -48,7 +48,7 @@ STEP = 0.005  # [s] Time step of the lower bound on the time of the last meeting
 
 
 def draw(num: int, seed: int) -> InterceptGroup:
-    """Draw `num` groups of the suite `group` and keep their first three targets, NumPy leaves."""
+    """Draw `num` groups of targets and keep their first three targets; NumPy arrays."""
     groups = jax.tree.map(np.asarray, pj.group.draw(num, seed=seed))
     present = np.broadcast_to(np.arange(groups.num_targets) < TARGETS, groups.present.shape)
     return dataclasses.replace(groups, present=present)
@@ -63,9 +63,9 @@ def _places(paths: PlanePath, times: jax.Array) -> jax.Array:
 
 
 def limit_times(groups: InterceptGroup) -> np.ndarray:
-    """Return lower bounds (B,) [s] on the time at which a car has met all three targets.
+    """Return lower bounds (B,) [s] on the time at which a car has met the three targets of a group.
 
-    The bound is infinite if no car can meet all targets.
+    There are B groups. The bound is infinite if no car can meet all targets.
     """
     shared = groups.shared
     num = int(np.ceil(shared.time.max() / STEP)) + 1
@@ -74,9 +74,9 @@ def limit_times(groups: InterceptGroup) -> np.ndarray:
     )
     places = np.asarray(_places(shared.target, times), float)
     limits, ahead = shared.limits, np.asarray(shared.body.middle)
-    # On a path of curvature kappa the speed of the body's middle is sqrt(v^2 + (ahead v kappa)^2).
-    # The term (v kappa)^2 is the product of kappa and v^2 kappa, and both factors are limited. The
-    # bound on the speed never decreases with time, so it is greatest at the end of a step.
+    # On a path of curvature kappa the speed of the body's middle is sqrt(v^2 + (ahead v kappa)^2),
+    # where v is the speed of the rear axle. The term (v kappa)^2 is the curvature kappa times the
+    # lateral acceleration v^2 kappa, and both are limited. The bound on v never decreases.
     v = np.minimum(
         limits.speed[:, None], shared.speed[:, None] + limits.acceleration[:, None] * times
     )
@@ -102,14 +102,15 @@ def _meet_in_order(
 ) -> np.ndarray:
     """Return the times (B,) [s] at which a fast point has met all targets in a given order.
 
-    The point replaces the car for the lower bound. The time is infinite if it cannot meet them.
+    The point replaces the car of each of B groups for the lower bound. The time is infinite if the
+    point cannot meet all targets.
 
     Args:
         order: indices of the targets.
         place: (B, 2) [m], position of the point at time 0.
         travel: (B, T) [m], greatest distance that the point has covered at each time.
         times: (B, T) [s], times at which meetings are checked.
-        places: (B, N, T, 2) [m], positions of the targets.
+        places: (B, N, T, 2) [m], positions of the N targets.
         tolerance: (B,) [m], greatest distance of a meeting from the target.
     """
     lanes, at, slack = np.arange(len(travel)), np.zeros(len(travel), int), tolerance
@@ -119,8 +120,7 @@ def _meet_in_order(
         meets = far <= travel - travel[lanes, at, None] + slack[:, None]
         meets &= np.arange(travel.shape[1]) >= at[:, None]
         met &= meets.any(axis=1)
-        # The meeting may lie between the previous time step and the first step that permits it, so
-        # the bound uses the previous step.
+        # The meeting may be between two time steps. For a lower bound the earlier step is used.
         at = np.maximum(meets.argmax(axis=1) - 1, at)
         place, slack = places[lanes, target, at], 2.0 * tolerance
     return np.where(met, times[lanes, at], np.inf)
@@ -179,7 +179,6 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of all methods and the lower bound."""
     parser = argument_parser("intercept_group", __doc__, num=20, seed=1)
     options = parser.parse_args()
     with begin(parser, options) as bench:

@@ -1,19 +1,20 @@
 """Compute which states a car can reach at each time, by exhaustive search on a lattice.
 
-`benchmarks.intercept_oracle` uses the lattice to tell infeasible interceptions from failures of a
-planner. A state has the position of the rear axle, as the cell of a grid, one of 64 headings, and
-one of several speed levels. All reached cells with one heading and one speed are the bits of one
-Python integer. A motion is then a shift of the bits, and a check for obstacles is a bit mask. No
-code is shared with the planners. Positions are in the plane of the world frame, in SI units.
+`benchmarks.intercept_oracle` uses the lattice, a grid of states, to tell infeasible interceptions
+from failures of a planner. A state has the position of the rear axle, as the cell of a grid, one of
+64 headings, and one of several speed levels. All reached cells with one heading and one speed are
+the bits of one Python integer. A motion is then a shift of the bits, and a check for obstacles is a
+bit mask. No code is shared with the planners. Positions are in the plane of the world frame, in SI
+units.
 
 Time is divided into layers of length `dt`. In each layer a car first moves straight for half of the
 layer. Then its speed changes by at most one level, as the acceleration limit permits. Its heading
 changes by at most the number of steps that the limits of curvature and lateral acceleration permit
 at the new speed. Finally the car moves straight for the other half. Displacements are rounded to
-whole cells. To avoid an accumulation of rounding errors, the total displacement since time 0 along
-a heading is rounded, and a shift is the difference of two totals. The start is exactly the middle
-of a cell and has one of the headings. Its speed is rounded to the nearest level. Obstacles are
-checked after every half layer, with positions rounded to 1/8 of a cell's side.
+whole cells. Rounding each displacement would accumulate errors. Instead the total displacement
+since time 0 along a heading is rounded, and a shift is the difference of two totals. The start is
+exactly the middle of a cell and has one of the headings. Its speed is rounded to the nearest level.
+Obstacles are checked after every half layer, with positions rounded to 1/8 of a cell's side.
 """
 
 import dataclasses
@@ -25,7 +26,7 @@ import numpy as np
 CELL = 0.05  # [m] Side of a square cell of the lattice.
 HEADINGS = 64  # Number of headings, equally spaced over a full turn.
 LAYER = 0.25  # [s] Greatest length of a layer of time.
-FINER = 4  # Obstacles are drawn on a grid whose cells are this factor smaller.
+FINER = 4  # Side of a lattice cell, divided by the side of a cell of the grid for obstacles.
 _FINE = CELL / FINER  # [m] Side of a cell of the grid for obstacles.
 
 
@@ -64,8 +65,8 @@ class Rules:
     # 1: one disc inside of the body, whose radius is half the body's width. 2: two discs that cover
     # the body.
     discs: int
-    # Whether a fractional limit on the number of heading steps is rounded up in every layer. If
-    # not, fractions accumulate over the layers until they permit another whole step.
+    # The limit on the heading change in a layer is a fractional number of steps. True: it is
+    # rounded up. False: fractions add up over the layers until they permit a whole step.
     turns_up: bool
 
 
@@ -79,11 +80,12 @@ class Reach:
 
     at_end: bool  # whether the target can be met at the case's time
     earliest: float  # [s], time of the first layer at which the target can be met, or infinity
-    path: np.ndarray | None  # (2 n + 1, 5): time, x, y, heading, speed; None if not requested
+    # (2 n + 1, 5): time, x, y, heading and speed after each half of n layers, or None.
+    path: np.ndarray | None
 
 
 def footprint(scene: Scene, rules: Rules) -> tuple[list[float], float]:
-    """Return where discs that replace the body are ahead of the rear axle [m], and their radius."""
+    """Return the discs that replace the body: distances ahead of the rear axle, and radius [m]."""
     half = 0.5 * scene.width
     if rules.discs == 1:
         return [scene.middle], half
@@ -120,7 +122,10 @@ def _round(value: np.ndarray) -> np.ndarray:
 
 
 class Lattice:
-    """Search of all states that a car can reach in one scene, with given settings (`Rules`)."""
+    """Search of all states that a car can reach in one scene, with given settings (`Rules`).
+
+    Methods represent a set of cells as an integer, with one bit for each cell.
+    """
 
     def __init__(self, scene: Scene, rules: Rules):
         if not np.isfinite([*scene.lower, *scene.upper, scene.speed, scene.acceleration]).all():
@@ -146,7 +151,7 @@ class Lattice:
         self.origin = scene.start[:2] - first * CELL
 
     def _draw_movers(self) -> None:
-        """Store each moving obstacle's blocked cells as bits, for every offset within a cell."""
+        """Store each moving obstacle's blocked cells, for every position of it within a cell."""
         drawn = []
         for corners in self.scene.movers:
             low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
@@ -223,7 +228,7 @@ class Lattice:
         return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
-        """Return movers' blocked cells and shifts to their positions, by half layer and heading."""
+        """Return moving obstacles' cells as bits, and their shifts, by half layer and heading."""
         scene, num = self.scene, 2 * self.layers + 1
         times = 0.5 * scene.dt * np.arange(num)
         drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]
@@ -241,7 +246,7 @@ class Lattice:
         return drawn
 
     def _free(self, half: int, heading: int) -> int:
-        """Return the cells where a car with one heading touches nothing at a half layer's time."""
+        """Return the cells where a car with a given heading touches nothing at a half layer."""
         blocked = 0
         for stencil, shift in self.placed[half][heading]:
             blocked |= shift_bits(stencil, shift)
@@ -249,7 +254,7 @@ class Lattice:
         return walls ^ (walls & blocked)
 
     def _goal(self, layer: int) -> list[int]:
-        """Return for each heading the cells from which the car meets the target at a layer."""
+        """Return for each heading the cells from which the car meets the target at a time layer."""
         scene = self.scene
         reach = scene.tolerance + CELL * np.sqrt(0.5)
         place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL
@@ -268,7 +273,7 @@ class Lattice:
     def sets(self) -> Iterator[list[list[int]]]:
         """Yield the reached cells after 0, 1, ... L layers of time.
 
-        Each item is indexed by speed level and heading, and holds cells as bits of integers.
+        Each item is indexed by speed level and heading. The cells are the bits of an integer.
         """
         num, start = len(self.levels), int(self.first[1] * self.stride + self.first[0])
         planes = [[0] * HEADINGS for _ in range(num)]
@@ -288,7 +293,7 @@ class Lattice:
             yield planes
 
     def _neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
-        """Return the reached cells of speed level k, and of the next lower and higher level."""
+        """Return the reached cells of speed level k - 1, of level k, and of level k + 1."""
         last = len(planes) - 1
         return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
 
@@ -309,8 +314,8 @@ class Lattice:
     def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
         """Return reached states that meet the target after `layer` layers of time.
 
-        A state is (bit of the cell, index of the speed level, index of the heading). There is at
-        most one for each speed level and heading.
+        A state is (bit of the cell, index of the speed level, index of the heading). At most one
+        state is returned for each speed level and heading.
         """
         goal = self._goal(layer)
         found = [
@@ -385,10 +390,10 @@ def shift_bits(plane: int, shift: int) -> int:
 def _spread(row: list[int], turn: int) -> list[int]:
     """Add to each heading's cells the cells of up to `turn` neighbouring headings on either side.
 
-    `row` has the reached cells of every heading. The width of the united range doubles in each
+    `row` has the reached cells of every heading. The number of united headings doubles in each
     step.
     """
-    # In the loop, spread[h] is the union of row[h:h + width].
+    # In the loop, spread[h] is the union of the cells row[h], ..., row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row
     while width < target:
         step = min(width, target - width)

@@ -3,9 +3,9 @@
     python -m benchmarks.intercept_oracle [--suite hard] [--num 200] [--seed 1] [--first 0]
         [--planner spacetime] [--failed | --early] [--workers N] [--out FILE.npz]
 
-Three searches determine for each case whether the target can be met at the case's time. They divide
-time into layers of 0.25 s, and also find the first layer at which the target can be met. They share
-no code with the planners:
+A car must meet a moving target among obstacles. Three searches determine for each case whether the
+target can be met at the case's time. They divide time into layers of 0.25 s, and also find the
+first layer at which the target can be met. They share no code with the planners:
 
 * `strict`: an exhaustive search of pose and speed on a lattice (`intercept_lattice`), with two
   discs that cover the car's body. A motion that it finds is feasible except for discretisation
@@ -14,23 +14,23 @@ no code with the planners:
   starts that no real car can leave. Therefore a second search without a grid and with a limited
   steering rate (`intercept_departure`) must also find a motion away from the start.
 * `minimal`: the same lattice with one disc inside of the body, and with turns rounded up in every
-  layer. Except for rounding to cells, it reaches every target that a car can reach. Rounding
-  may both close and open gaps. A target that this search does not reach is therefore very likely
+  layer. Except for rounding to cells, it reaches every target that a car can reach. Rounding may
+  both close and open gaps. A target that this search does not reach is therefore very likely
   infeasible, but this is no proof.
 * `bound`: a point that moves in any direction, no faster than the car (`intercept_bound`). If this
   point cannot meet the target at the time of a layer, no car can. This is a proof.
 
 In short, a case is infeasible if `bound` fails, and very likely infeasible if `minimal` fails. If
 `strict` succeeds, the case is feasible except for discretisation errors. Cases in which `minimal`
-succeeds and `strict` fails are undecided. Meetings are checked only at the times of layers. The two
-lattices add half the diagonal of a cell to the case's tolerance.
+succeeds and `strict` fails are undecided. Meetings are checked only at the times of layers. Both
+searches on the lattice add half the diagonal of a cell to the case's tolerance.
 
-A planner, `spacetime` by default, plans the same cases. A case counts as feasible if `strict`
-succeeds or the planner solves it. The planner's success rate is the share of feasible cases that it
-solves, judged by the referee. With `--failed` only cases that the planner does not solve are
-searched. This gives the same success rate in much less time. With `--early` the default planner
-also plans to meet every target as early as possible, and its times are compared with the earliest
-meetings of `strict`.
+The planner --planner plans the same cases. A case counts as feasible if `strict` succeeds or the
+planner solves it. The planner's success rate is the share of feasible cases that it solves, judged
+by the referee, an independent check in float64. With --failed only cases that the planner does not
+solve are searched. This gives the same success rate in much less time. With --early the default
+planner also plans to meet every target as early as possible, and its times are compared with the
+earliest meetings of `strict`.
 """
 
 import argparse
@@ -116,7 +116,7 @@ def _polygons(group: Obstacles) -> tuple[tuple[np.ndarray, ...], np.ndarray]:
 
 
 def search(scene: Scene) -> tuple[list[bool], list[float]]:
-    """Run all `SEARCHES` on one scene.
+    """Run the searches `bound`, `minimal` and `strict` on one scene.
 
     Returns for each search whether the target is met at the case's time, and the earliest meeting
     [s].
@@ -129,7 +129,7 @@ def search(scene: Scene) -> tuple[list[bool], list[float]]:
 
 
 def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray]:
-    """Run all searches on B scenes in `workers` processes; return the results of `search`.
+    """Run the three searches on B scenes in `workers` processes.
 
     Returns whether targets are met at the case's time (B, 3), and the earliest meetings (B, 3) [s].
     """
@@ -207,7 +207,7 @@ def compare(bench: Bench, index: np.ndarray, reached: np.ndarray, solved: np.nda
 
 
 def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> None:
-    """Plan B cases to meet early, and compare with the earliest meetings (B,) [s] of `strict`."""
+    """Plan B cases to meet early; compare with the earliest meetings (B,) [s] on the lattice."""
     plans = pj.plan(pj.intercept.planner(meet="early"), cases)
     solved = np.asarray(pj.intercept.judge(cases, plans).success)
     met = np.where(solved, plans.time, np.inf)
@@ -223,7 +223,6 @@ def report_early(bench: Bench, cases: InterceptCase, earliest: np.ndarray) -> No
 
 
 def main() -> None:
-    """Plan the cases of one suite, run the searches on them, and print and save the results."""
     parser = argparse.ArgumentParser(
         "python -m benchmarks.intercept_oracle", description=(__doc__ or "").partition("\n")[0]
     )

@@ -2,8 +2,8 @@
 
     python -m benchmarks.intercept_paths [--num 50] [--seed 0] [--out DIR]
 
-The problems are paths among static walls. Walls, starts and meeting points are from the suites
-`hard` and `maze`, without their moving obstacles. First this library searches paths with any
+The problems are paths of a car among static walls. Walls, starts and meeting points are from the
+suites `hard` and `maze`, without their moving obstacles. First this library searches paths with any
 heading at the meeting. Then the headings that it found are prescribed, because the published
 planner fastsim-navigation (C++, extra `peers`) needs a heading at the goal. Both planners get the
 same start and goal poses. This library represents walls by a distance field, and the car by discs
@@ -37,7 +37,7 @@ from planner_jax.plane.obstacles import distances, separation
 from planner_jax.task.intercept.api import draw, positions
 
 SUITES = ("hard", "maze")
-CURVATURE_SHARE = 0.9  # Paths that are smoothed were searched with this share of the limit.
+CURVATURE_SHARE = 0.9  # Factor of the curvature limit in searches whose paths are smoothed.
 REPEATS = 3  # The fastest of this number of calls is reported.
 
 
@@ -116,7 +116,7 @@ def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
 
 
 def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) -> Row:
-    """Search paths with this library, and return their table row.
+    """Search paths with this library to each case's meeting point, and return their table row.
 
     A heading [rad] at the meeting point is prescribed, or arbitrary if it is None.
     """
@@ -129,7 +129,7 @@ def search_row(cases: list, meetings: np.ndarray, headings: list[float | None]) 
 
 
 def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
-    """Search paths with fastsim-navigation to prescribed headings, and return their table row."""
+    """Search paths with fastsim-navigation to given headings [rad], and return their table row."""
     searches = []
     for case, meeting, heading in zip(cases, meetings, headings, strict=True):
         behind, ahead, half = body_of(case)
@@ -162,7 +162,7 @@ def peer_row(cases: list, meetings: np.ndarray, headings: list[float]) -> Row:
 
 
 def say_rows(bench: Bench, suite: str, heading: str, rows: dict[str, Row]) -> None:
-    """Print the rows of all planners for one suite, with means over problems that all solve."""
+    """Print the rows of all planners for one suite; lengths are over problems that all solve."""
     together = np.logical_and.reduce([row.found for row in rows.values()])
     for name, row in rows.items():
         ms = np.nanpercentile(row.ms, [50, 95, 99]) if np.isfinite(row.ms).any() else [np.nan] * 3
@@ -211,7 +211,6 @@ def say_smoothing(bench: Bench, suite: str, batch: Any, cases: list, meetings: n
 
 
 def main() -> None:
-    """Search and smooth the paths of both suites, and print the tables."""
     parser = argument_parser("intercept_paths", __doc__, num=50, seed=0)
     options = parser.parse_args()
     with begin(parser, options) as bench:
@@ -233,7 +232,7 @@ def main() -> None:
             row = search_row(cases, meetings, [None] * options.num)
             say_rows(bench, suite, "free", {"this library": row})
             bench.count(row.clear)
-            # The heading is arbitrary for problems without a path.
+            # If no path was found, any heading can be prescribed.
             headings = [float(path.poses[-1, 2]) if path.found else 0.0 for path in paths]
             rows = {"this library": search_row(cases, meetings, list(headings))}
             if is_installed():

@@ -2,10 +2,11 @@
 
     python -m benchmarks.intercept_peers [--suite hard] [--num 200] [--timed 50] [--out DIR]
 
-Success is judged by the referee, whatever a planner reports. The tables list the root mean square
-and the greatest acceleration along the trajectory, as means over successful plans. Two planners of
-a pair are compared on the cases where both succeed. The planners `lattice, best path` and `em`
-drive along the same path, so that only their speeds differ.
+A car meets a moving target among obstacles. The referee, an independent check in float64, decides
+about success, whatever a planner reports. The tables list the root mean square and the greatest
+acceleration along the trajectory, as means over successful plans. Two planners of a pair are
+compared on the cases where both succeed. The planners `lattice, best path` and `em` drive along the
+same path, so that only their speeds differ.
 
 Times are for one case at a time, from arrays to arrays, without compilation. For each of --timed
 cases the fastest of three calls counts. Planners that first search a path and then plan the speed
@@ -37,8 +38,9 @@ from planner_jax.referee.intercept import InterceptVerdict
 from planner_jax.task.intercept.spec import SUITES
 
 BASELINES = "numba not installed: pip install 'planner-jax[baselines]' for the planner paper"
-# Weight of the end of the speed profile: w_2 T^3 / w_1 with w_1 = 10, w_2 = 3 and T = 10 s, as in
-# the paper.
+# Weight of the squared error at the end of the speed profile, in units of the weight of the squared
+# acceleration: w_2 T^3 / w_1, with the weights w_1 = 10 and w_2 = 3 and the horizon T = 10 s of the
+# paper [Qu2022].
 SOFT_END = 3.0 * 10.0**3 / 10.0
 PAIRS = (
     ("spacetime", "em"),
@@ -74,7 +76,7 @@ def planners() -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """Verdicts, statuses and the time of the first call of one planner on all cases."""
+    """Results of one planner on all cases: verdicts, statuses, and the time of the first call."""
 
     verdict: InterceptVerdict
     status: np.ndarray  # (B,), the planner's own report for each case
@@ -230,7 +232,6 @@ def table_of_times(bench: Bench, named: dict[str, Any], lanes: list) -> None:
 
 
 def main() -> None:
-    """Plan the drawn cases with every planner, and print all tables."""
     parser = argument_parser("intercept_peers", __doc__, num=200, seed=0)
     parser.add_argument("--suite", choices=list(SUITES), default="hard", help="default: hard")
     parser.add_argument("--timed", type=at_least(1), default=50, help="timed cases; default: 50")

@@ -2,9 +2,9 @@
 
     python -m benchmarks.intercept_predicted [--suite hard] [--num 40] [--seed 0] [--out DIR]
 
-A target is observed 15 times, once a second up to the start, with noise of 0.1 m on each coordinate
-[Qu2022, Section V-A]. The function `select` predicts its path. The planner knows walls and moving
-obstacles exactly. There are three rows for straight and for turning targets:
+A moving target is observed 15 times, once a second up to the start, with noise of 0.1 m on each
+coordinate [Qu2022, Section V-A]. The function `select` predicts its path. The planner knows walls
+and moving obstacles exactly. There are three rows for straight and for turning targets:
 
 * `one shot`: the target is predicted once, and one plan is driven to its end.
 * `re-planned`: observations continue once a second while the car drives. After each observation the
@@ -17,10 +17,11 @@ increased to 0.2 m. If planning fails again, and the car does not follow a solve
 eight points 0.5 m around the predicted target are tried. If all these plans fail, the car drives
 the plan with the smallest excess over a limit, and plans from scratch at every later observation.
 
-The referee judges the whole driven trajectory, at steps of 20 ms, as one plan against the true
-target. It checks the limits of the car, the map, collisions with polygons, and a distance of at
-most 0.3 m from the target at the case's time. The table lists this distance, called miss, over all
-drives, including drives with a collision. A case is solvable if at least one of the rows solves it.
+The referee, an independent check in float64, judges the whole driven trajectory, at steps of 20 ms,
+as one plan against the true target. It checks the limits of the car, the map, collisions with
+polygons, and a distance of at most 0.3 m from the target at the case's time. The table lists this
+distance, called miss, over all drives, including drives with a collision. A case is solvable if at
+least one of the rows solves it.
 
 Finally the program prints which share of the first predictions is within 0.3 m of the true target
 at the case's time. It also prints this share for a predictor at the Cramer-Rao bound, which is
@@ -52,10 +53,10 @@ NOISE = 0.1  # [m] Standard deviation of each observed coordinate.
 COUNT = 15  # Number of observations up to the start.
 INTERVAL = 1.0  # [s] Time between two observations, and between two plans.
 RATE = 50.0  # [Hz] Sampling rate of the driven trajectory that the referee judges.
-RADII = (0.05, 0.3, 0.5)  # [m] The table lists the shares of misses below these distances.
+RADII = (0.05, 0.3, 0.5)  # [m] The table lists which shares of drives end this near the target.
 SUCCESS = 0.3  # [m] Greatest distance from the true target of a successful meeting.
-CLOSE = 0.2  # [m] Tolerance of the meeting for cases in which the usual plan exceeds a limit.
-# [m] Offsets from the predicted target of the points that are tried if all other plans fail.
+CLOSE = 0.2  # [m] Tolerance of the meeting in a second attempt, if the first plan fails.
+# [m] Points around the predicted target, relative to it. The car plans to them if other plans fail.
 PLACES = 0.5 * np.stack([f(np.arange(8) * np.pi / 4.0) for f in (np.cos, np.sin)], axis=1)
 PLANNER = SpacetimeIntercept()
 MODES = ("straight", "turning")
@@ -69,17 +70,20 @@ HEADER = (
 @jax.jit
 @jax.vmap
 def predict(times: jax.Array, seen: jax.Array, weights: jax.Array) -> TurningPath:
-    """Predict the paths of B targets from observations (B, L, 2) [m] at times (B, L) [s]."""
+    """Predict the paths of B targets from observations (B, L, 2) [m] at times (B, L) [s].
+
+    The fit weights the L observations of each target by `weights` (B, L).
+    """
     return select(times, seen, NOISE, weights).path
 
 
 @jax.jit
 @jax.vmap
 def compute_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
-    """Return the probabilities (B,) that the best unbiased prediction is within `SUCCESS`.
+    """Return the probabilities (B,) that a best unbiased prediction is within `SUCCESS` [m].
 
-    The prediction is for the times `end` (B,) [s], from observations at `times` (B, L) [s]. Its
-    covariance is the Cramer-Rao bound.
+    The predictions are for B targets at the times `end` (B,) [s], from observations at the times
+    `times` (B, L) [s]. Their covariance is the Cramer-Rao bound.
     """
     straight, turning = (
         share_within(cramer_rao(path, times, NOISE, end, turning=turning), SUCCESS)
@@ -123,13 +127,14 @@ def replace_lanes(tree: Any, lanes: np.ndarray, some: Any) -> Any:
 
 
 def plan_cases(cases: InterceptCase, around: np.ndarray) -> InterceptPlan:
-    """Plan B cases from scratch, and relax the meeting of cases that are not solved.
+    """Plan B cases from scratch, and unsolved cases again with weaker requirements.
 
-    Such cases are planned with a larger tolerance, and then to points beside the target.
+    Unsolved cases are planned with a larger tolerance of the meeting, and then to points around the
+    target.
 
     Args:
         cases: a batch, leaves (B, ...).
-        around: (B,) bool, whether the case may be planned to a point beside the target.
+        around: (B,) bool, whether the case may be planned to a point around the target.
     """
     plans = pj.plan(PLANNER, cases)
     lanes = np.flatnonzero(~is_solved(plans.status))
@@ -151,7 +156,7 @@ def loosen(cases: InterceptCase, distance: float) -> InterceptCase:
 
 
 def plan_beside(cases: InterceptCase) -> InterceptPlan:
-    """Plan each case to several points around its target; return the case's first solved plan."""
+    """Plan each case to eight points around its target; return each case's first solved plan."""
     num, path = len(PLACES), cast("Any", cases.target)
     many = take_lanes(cases, np.repeat(np.arange(len(cases.time)), num))
     moved = np.asarray(path.pos)[:, None] + PLACES
@@ -252,8 +257,7 @@ def report(
         turning: (B,) bool, whether the target turns.
     """
     verdicts = {name: drives.judge(truth) for name, (drives, _) in rows.items()}
-    # The share "success of the solvable" leaves out cases that no row solves, not even the row with
-    # known targets.
+    # The column "success of the solvable" leaves out cases that no row of the table solves.
     solvable = np.any([verdict.success for verdict in verdicts.values()], axis=0)
     for mode, is_of_mode in zip(MODES, (~turning, turning), strict=True):
         if not solvable[is_of_mode].any():
@@ -303,7 +307,7 @@ def report_bound(
 ) -> None:
     """Print the share of first predictions within `SUCCESS` of the target at the case's time.
 
-    The share of the best unbiased predictor, by the Cramer-Rao bound, is printed too.
+    Also print this share for the best unbiased predictor, by the Cramer-Rao bound.
     """
     times = np.asarray(truth.time)
     there = positions(truth.target, times)
@@ -322,7 +326,6 @@ def report_bound(
 
 
 def main() -> None:
-    """Simulate all three rows, print the table, and print how accurate the predictions are."""
     parser = argument_parser("intercept_predicted", __doc__, num=40, seed=0)
     parser.add_argument("--suite", choices=SUITES, default="hard", help="default: hard")
     options = parser.parse_args()

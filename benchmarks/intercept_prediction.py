@@ -2,11 +2,11 @@
 
     python -m benchmarks.intercept_prediction [--num 20000] [--seed 0] [--out DIR]
 
-Targets are observed 15 times, once a second up to time 0, with noise of 0.1 m on each coordinate
-[Qu2022, Section V-A]. Their positions are predicted 0, 5, 10 and 15 s ahead. The methods are
-polynomials of degree 1 to 3 as in the paper, least-squares turns, and the function `select`, which
-decides whether a target is straight or turning. The table also has the Cramer-Rao bound, a lower
-bound on the errors of unbiased predictions.
+Moving targets are observed 15 times, once a second up to time 0, with noise of 0.1 m on each
+coordinate [Qu2022, Section V-A]. Their positions are predicted 0, 5, 10 and 15 s ahead. The methods
+are polynomials of degree 1 to 3 as in the paper, turns with constant speed and turn rate (fitted by
+least squares), and the function `select`, which decides whether a target is straight or turning.
+The table also has the Cramer-Rao bound, a lower bound on the errors of unbiased predictions.
 
 Straight and turning targets move at 0.2 to 0.5 m/s, which keeps them on the paper's map. Turning
 targets turn at 0.03 to 0.1 rad/s. A third kind follows the paper's example curve, which accelerates
@@ -15,11 +15,11 @@ relative error, the mean error is divided by the mean distance of the targets fr
 The paper states neither the origin of its distances nor the degree of its polynomials. Its errors
 grow with time as errors of degree 2 do.
 
-The summary's success is the share of predictions by `select` within 0.3 m at 10 s, for straight and
-turning targets. The time is for one prediction on one core without compilation, from arrays on the
-host to arrays on the host. The prior of `select` was tuned with other seeds. The mean error of
-1,000 turning targets at 10 s has a standard error of 0.01 m. Some methods differ by less, so use
-many more targets to compare them.
+The success rate in the run's summary is the share of predictions by `select` within 0.3 m at 10 s,
+for straight and turning targets. The time is for one prediction on one core without compilation,
+from NumPy arrays to NumPy arrays. The constants of `select` were tuned with other seeds. The mean
+error of 1,000 turning targets at 10 s has a standard error of 0.01 m. Some methods differ by less,
+so use many more targets to compare them.
 """
 
 import os
@@ -39,7 +39,7 @@ from planner_jax.sims.prediction.turn_fit import fit_turn
 
 TIMES = np.arange(-14.0, 1.0, dtype=np.float32)  # [s] Times of the observations.
 AHEAD = np.array([0.0, 5.0, 10.0, 15.0], np.float32)  # [s] Times of the predicted positions.
-MEETING = 2  # Index into AHEAD of the time for which shares of small errors are counted.
+MEETING = 2  # Index into AHEAD of the time at which errors below RADII are counted: 10 s.
 NOISE, MAP = 0.1, 8.0  # [m] Standard deviation of a coordinate, and side of the square map.
 RADII = (0.3, 0.5)  # [m] Shares of errors below these distances are counted.
 MODES = {
@@ -47,7 +47,7 @@ MODES = {
     "turning": "targets with a constant turn rate",
     "gaining": "targets that accelerate by 0.4 m/s every second, the paper's curve",
 }
-# [%] Relative errors of Table I of [Qu2022] at the times AHEAD.
+# [%] Relative errors 0, 5, 10 and 15 s ahead as printed in Table I of [Qu2022].
 PUBLISHED = {"straight": (0.23, 0.56, 1.28, 2.04), "gaining": (0.58, 2.13, 3.94, 5.88)}
 DEGREES = (1, 2, 3)
 METHODS = (
@@ -60,7 +60,10 @@ METHODS = (
 
 
 def draw(mode: str, num: int, seed: int) -> tuple[Any, np.ndarray]:
-    """Draw `num` targets of one kind; return their paths and observations (num, 15, 2) [m]."""
+    """Draw `num` targets of one kind; return their paths and observed positions (num, 15, 2) [m].
+
+    `mode` is a key of `MODES`, such as "turning".
+    """
     rng = np.random.default_rng([seed, list(MODES).index(mode)])
     speed, heading = rng.uniform(0.2, 0.5, num), rng.uniform(-np.pi, np.pi, num)
     rate = rng.uniform(0.03, 0.1, num) * rng.choice([-1.0, 1.0], num) * (mode == "turning")
@@ -86,7 +89,9 @@ places = jax.jit(jax.vmap(sample_path, in_axes=(0, None)))
 @jax.jit
 @jax.vmap
 def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
-    """Predict a target from observations (15, 2) [m], given its true positions (4, 2) [m].
+    """Predict a target's positions by all methods from 15 observed positions `seen` (15, 2) [m].
+
+    The true positions `truth` (4, 2) [m] are at the times `AHEAD`.
 
     Returns:
         off: (methods, 4) [m], distances of the predictions from the true positions.
@@ -108,10 +113,10 @@ def predict(truth: jax.Array, seen: jax.Array) -> tuple[jax.Array, ...]:
 @jax.jit
 @jax.vmap
 def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
-    """Return mean errors (4,) [m] of the best unbiased prediction, at the times `AHEAD`.
+    """Return mean errors (4,) [m] of a best unbiased prediction, at the times `AHEAD`.
 
-    The covariance of this prediction is the Cramer-Rao bound. Also returns the probabilities (2,)
-    that its error 10 s ahead is below each of `RADII`.
+    Its covariance is the Cramer-Rao bound. The second result has the probabilities (2,) that its
+    error 10 s ahead is below each of `RADII`.
     """
 
     def least(time: Any) -> jax.Array:
@@ -180,7 +185,10 @@ def report(bench: Bench, mode: str, num: int, seed: int) -> None:
 
 
 def latency(bench: Bench, num: int, seed: int) -> None:
-    """Time single predictions of many targets; each includes the probability of a small error."""
+    """Time predictions of many targets, one at a time, and print quantiles of the time.
+
+    Each prediction includes the probability that its error is below 0.3 m.
+    """
 
     @jax.jit
     def one(seen: jax.Array) -> tuple[TurningPath, jax.Array]:
@@ -205,7 +213,6 @@ def latency(bench: Bench, num: int, seed: int) -> None:
 
 
 def main() -> None:
-    """Print a table of errors for each kind of target, and the time of one prediction."""
     parser = argument_parser("intercept_prediction", __doc__, num=20000, seed=0)
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # JAX's threads inherit the affinity if they start later.

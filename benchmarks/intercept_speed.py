@@ -2,22 +2,27 @@
 
     python -m benchmarks.intercept_speed [--num 500] [--seed 0] [--batch 65536] [--out DIR]
 
-In the graph of station (distance along the path) over time, moving obstacles are polygons. A
-planner first finds a line between the polygons by dynamic programming. Then it minimises the
-acceleration by a quadratic program, whose bounds keep the curve on the same side of each polygon.
-All planners use the same dynamic programming, cost, limits and end. They differ in the bounds:
-trapezoids, rectangles, or the bounds of the planner `em`.
+A car must reach the end of a given path at a given time and avoid moving obstacles. The station
+is the distance along the path. In the graph of station over time, obstacles are polygons. A planner
+first finds a line between the polygons by dynamic programming. Then a quadratic program finds the
+curve of least acceleration whose bounds keep it on the same side of each polygon as the line.
 
-Problems are drawn with a seed. A plan is good if its status is CONVERGED and its curve is outside
-of every polygon, checked every millisecond. The first table has means of acceleration and jerk over
-good plans, and the least distance from a polygon. The second table compares pairs of planners on
-the problems where both plans are good. Times are for one problem at a time without compilation,
-from the problem's arrays to the plan's arrays. The planners take turns, so that other load affects
-all of them.
+The planners differ only in these bounds. The bounds of `trapezoid` are tilted lines, the bounds of
+`trapezoid-edges` are the edges of the polygons as in [Qu2022], and the bounds of `rectangle` are
+constant for each piece of the curve. These bounds apply to control points. `em`, the speed step of
+[Fan2018], has constant bounds too, but only at samples every 0.1 s.
+
+Problems are drawn with a seed. A plan counts as good if its status is CONVERGED and its curve is
+outside of every polygon, checked every millisecond. The first table has means of acceleration and
+jerk over good plans, and the least distance from a polygon. The second table compares pairs of
+planners on the problems where both plans are good. Times are for one problem at a time without
+compilation, from the problem's arrays to the plan's arrays. The planners take turns, so that other
+load affects all of them.
 
 With --batch the program also prints how many problems per second the device solves in a batch. With
-the extra `peers`, the solvers Clarabel and OSQP solve the quadratic programs of `trapezoid` and
-`em` too. The cost gap of the summary is relative to Clarabel's cost.
+the extra `peers`, the solvers Clarabel and OSQP also solve the quadratic programs of `trapezoid`
+and `em`. The cost gap in the run's summary is the relative excess of this library's costs over
+Clarabel's.
 """
 
 import dataclasses
@@ -46,11 +51,11 @@ from planner_jax.benchmarks.run import Bench, argument_parser, at_least, begin
 from planner_jax.benchmarks.speed_problems import speed_problems
 from planner_jax.core.protocol import Status
 
-PIECES = (10, 20)  # Numbers of pieces of the planned curve.
+PIECES = (10, 20)  # Numbers of polynomial pieces of the planned curve.
 CONSTANT = "constant speed"
 OURS = "this library"
-# Pairs of a planner and a reference planner, which are compared on problems where both plans are
-# good.
+# Pairs of a planner and a reference planner. They are compared on problems that both solve without
+# a collision.
 PAIRS = (
     ("trapezoid", "em"),
     ("trapezoid-edges", "em"),
@@ -61,7 +66,7 @@ PAIRS = (
 
 @dataclasses.dataclass(frozen=True)
 class Judged:
-    """Results of one planner: arrays with one number for each problem."""
+    """Results of one speed planner: arrays with one number for each problem."""
 
     good: np.ndarray  # bool, whether the problem is solved and the curve is outside all polygons
     rms: np.ndarray  # [m/s^2], root mean square acceleration
@@ -86,7 +91,7 @@ def planners() -> dict[str, SpeedPlanner]:
 
 
 def constant_speed(problem: StationTimeProblem, degree: int = 5) -> BezierCurve:
-    """Return a curve of constant speed to the end, without regard to polygons and initial speed."""
+    """Return a curve of constant speed to the end, which ignores obstacles and initial speed."""
     points = jnp.linspace(0.0, 1.0, degree + 1)[None] * problem.end_station
     return BezierCurve(points=points, horizon=problem.horizon)
 
@@ -215,7 +220,10 @@ def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
 def _compare_pairs(
     bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]
 ) -> list[str]:
-    """Return the table that compares pairs of planners, on problems where both plans are good."""
+    """Return the lines of a table that compares each pair of `PAIRS` on problems that both solve.
+
+    `seconds` has by planner the planning time [s] of each problem.
+    """
     lines = [
         "| planner and reference | both good | good, difference | rms acc. | peak acc. "
         "| time, median |",
@@ -279,7 +287,7 @@ def table_of_solvers(bench: Bench, problems: Any) -> list[np.ndarray]:
 
 
 def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
-    """Solve a planner's quadratic programs for all problems with every installed solver.
+    """Solve a planner's quadratic programs for B problems with every installed solver.
 
     Returns by solver which programs are solved (B,), the costs (B,) and the durations (B,) [s].
     """
@@ -295,8 +303,8 @@ def solve_by_all(problems: Any, planner: SpeedPlanner) -> dict[str, tuple]:
     for peer, make in PEERS.items():
         if is_installed(peer):
             run = make(speed_matrices(planner))
-            # A solver may start at its previous solution. Therefore no program is solved twice in
-            # succession: all programs are solved once before any program is repeated.
+            # OSQP starts at its previous solution. To give no solver an advantage, all programs are
+            # solved once before any of them is solved again.
             tries = [[run(*program) for program in on_host] for _ in range(3)]
             rows[peer] = (
                 np.array([each.solved for each in tries[0]]),
@@ -339,7 +347,6 @@ def table_of_batches(bench: Bench, problems: Any, batch: int) -> None:
 
 
 def main() -> None:
-    """Draw the problems, and print the tables of planners, solvers and batches."""
     parser = argument_parser("intercept_speed", __doc__, num=500, seed=0)
     parser.add_argument(
         "--batch", type=at_least(0), default=0, help="problems in a batch; default: 0, no batch"

@@ -3,18 +3,19 @@
     python -m benchmarks.ipopt [--num 200] [--tune 20] [--seed 0] [--repeat 3] [--batch N]
         [--tasks hit,catch] [--out DIR]
 
-The planner is `exact` with each of its efforts, on hits of the suite `court` and on catches of one
-ball. It plans one case at a time on one core, and batches on JAX's first device. IPOPT runs through
+The planner is `exact`, on hits of the suite `court` and on catches of one ball. Its effort
+("feasible", "good" or "best") sets how long it searches for a lower cost after every limit holds.
+It plans one case at a time on one core, and batches on JAX's first device. IPOPT runs through
 CasADi (the extra `oracle`) on one core, with exact derivatives and the linear solver MUMPS. Its
 problem has the same decision variables, initial guess, objective and samples, but is implemented
 independently in `ipopt_peer`. It has two forms. In the form "limits", limits are constraints. In
 the form "penalties", limits are penalties in the objective, as in the planner. IPOPT's settings are
 tuned on other cases: for each form, the fastest setting without a loss of quality is used.
 
-The cost of a plan is the weighted sum of its squared snap and its time, in float64. Its gap is
-relative to the least cost of any accepted plan of the case in this run. Times on one core are CPU
-times without compilation, because other load of the machine has little effect on CPU times. For
-each case the fastest of --repeat tries counts.
+The cost of a plan is the weighted sum of its squared snap and its time, in float64. It is compared
+with the least cost of any plan of the case in this run that the referee, an independent check,
+accepts. Times on one core are CPU times without compilation, because other load of the machine has
+little effect on CPU times. For each case the fastest of --repeat tries counts.
 
 To compare at equal cost, the program finds the first iterate of IPOPT that keeps the limits and
 costs at most 0.01 % more than the planner's plan. In the form "penalties" the cost is the planner's
@@ -46,24 +47,24 @@ from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.hit.default_planner import ExactHit
 from planner_jax.trajectory.polynomial import snap_energy
 
-# Task -> suite of its cases, and module in `ipopt_peer` that defines its problem for IPOPT.
+# Task -> suite from which cases are drawn, and module of `ipopt_peer` with the problem for IPOPT.
 TASKS = {"hit": ("court", "hits"), "catch": ("throws", "catches")}
 BATCH, GPU_BATCH = 1024, 65536  # Batch sizes on a CPU and on other devices.
 # Greatest published speed-up of the batched interior-point solver jaxipm over IPOPT, measured with
 # quadrotors on one GPU of type L40S [Viljoen2026].
 JAXIPM = 32.85
 TIGHTEST = 1e-6  # Tolerance of the searches by IPOPT whose iterates are compared with plans.
-NO_MORE = 1e-4  # A relative excess of one cost over another up to this value counts as equal.
+NO_MORE = 1e-4  # Two costs count as equal up to this relative difference.
 
 
 @dataclasses.dataclass
 class Found:
-    """Costs, success and times of one solver on B cases."""
+    """Results of one solver on B cases: costs, success and times."""
 
     name: str
     cost: np.ndarray  # (B,), cost of snap and time, without penalties
-    # (B,), value of the planner's objective with penalties; None for IPOPT with limits as
-    # constraints
+    # (B,), value of the planner's objective with penalties. None for IPOPT in the form "limits",
+    # whose objective has no penalties.
     objective: np.ndarray | None
     accepted: np.ndarray  # (B,) bool, whether the referee accepts the plan
     seconds: np.ndarray  # (B,) [s], CPU times of single cases on one core
@@ -107,17 +108,17 @@ class Setup:
             self._objective = jax.jit(jax.vmap(self.planner.objective))
 
     def plans(self, points: np.ndarray) -> Any:
-        """Convert decision variables (B, n) to plans, with NumPy leaves in float64."""
+        """Convert n decision variables of each of B cases, (B, n), to plans in float64."""
         with jax.enable_x64(True):
             return jax.tree.map(np.asarray, self._decode(jnp.asarray(points), self.contexts))
 
     def objective(self, points: np.ndarray) -> np.ndarray:
-        """Return the planner's objective with penalties (B,) at decision variables (B, n)."""
+        """Return the planner's objective with penalties (B,) at n decision variables of B cases."""
         with jax.enable_x64(True):
             return np.asarray(self._objective(jnp.asarray(points), self.contexts).cost)
 
     def judge(self, plans: Any) -> np.ndarray:
-        """Return for each plan whether the referee accepts it, (B,) bool."""
+        """Return for each plan whether the referee, an independent check, accepts it, (B,) bool."""
         return np.asarray(self.card.judge(self.cases, plans).success)
 
     def cost(self, plans: Any) -> np.ndarray:
@@ -133,9 +134,10 @@ class Setup:
 def run_planner(
     setup: Setup, effort: str, repeat: int, batch: int, seed: int
 ) -> tuple[Found, float]:
-    """Plan with one effort, one case at a time on a CPU core and in a batch on JAX's first device.
+    """Plan one case at a time on a CPU core, and then a batch on JAX's first device.
 
-    Returns the results, and the duration [s] of the first call, which compiles.
+    Returns the results, and the duration [s] of the first call, which compiles. `effort` sets how
+    long the planner searches for a lower cost; `batch` and `seed` define the drawn batch.
     """
     planner = setup.card.planner("exact", effort=effort, **setup.card.bench)
     num, host = len(setup.batches["learned"].starts), jax.devices("cpu")[:1]
@@ -175,12 +177,12 @@ def run_planner(
 def seconds_to(
     setup: Setup, peer: Any, paths: list[np.ndarray], whole: np.ndarray, run: Found
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the times that IPOPT takes to feasible plans at no more than the planner's cost.
+    """Return when IPOPT reaches plans that keep the limits and cost no more than the planner's.
 
     Args:
-        setup: the cases.
+        setup: B cases.
         peer: IPOPT, which computed the iterates.
-        paths: the iterates (S, n) of IPOPT for each case.
+        paths: for each case the S iterates (S, n) of IPOPT.
         whole: (B,) [s], duration of each search by IPOPT.
         run: results of the planner.
 
@@ -279,7 +281,7 @@ def measure(bench: Bench, name: str, options: Any) -> None:
 def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarray]:
     """Print a row for each solver: success, costs above the least cost of any solver, and speed.
 
-    Returns the relative excess costs of the planner, an array for each effort.
+    Returns how much the planner's costs exceed the least costs, relative: an array for each effort.
     """
     bench.say(
         "",
@@ -315,7 +317,7 @@ def _report_solvers(bench: Bench, name: str, runs: list[Found]) -> list[np.ndarr
 
 
 def _format_quantiles(gap: np.ndarray | None) -> str:
-    """Format the median, 90 % and 99 % quantile of relative costs in per cent."""
+    """Format the median, 90 % and 99 % quantile of relative excess costs in per cent."""
     if gap is None or not gap.size:
         return "-"
     return ", ".join(f"{100.0 * (each or 0.0):.2f} %" for each in gap_figures(gap).values())
@@ -326,7 +328,8 @@ def _report_equal_costs(
 ) -> None:
     """Print how fast IPOPT reaches the cost of the planner, relative to the planner's own speed.
 
-    There is a row for each effort of the planner, form of IPOPT's problem, and initial guess.
+    There is a row for each effort of the planner (how long it searches for a lower cost), each form
+    of IPOPT's problem, and each initial guess.
     """
     bench.say(
         "",
@@ -368,7 +371,6 @@ def _report_equal_costs(
 
 
 def main() -> None:
-    """Parse the arguments, and compare planner and IPOPT on each requested task."""
     parser = argument_parser("ipopt", __doc__, num=200, tune=20, seed=0, repeat=3)
     parser.add_argument(
         "--tasks", default=",".join(TASKS), help="comma-separated; default: %(default)s"

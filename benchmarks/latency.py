@@ -3,12 +3,12 @@
     python -m benchmarks.latency [--num 2000] [--task hit] [--planner NAME] [--suite NAME]
         [--seed 1] [--elapsed S] [--out DIR]
 
-Each plan is for another case of the suite. The time is from the case's arrays to the plan's arrays.
-It includes all preparations, all searches and the check of the limits. Compile time is reported
-separately. With --elapsed S, interceptions are planned without timing. Then re-planning is timed:
-each plan is planned again from the car's state S seconds after the plan's start, for a target that
-continues on its path. Run the benchmark on an idle machine, bound to one core; the load average is
-printed.
+Each plan is for another case of the suite, which is a family of random cases. The time is from the
+case's arrays to the plan's arrays. It includes all preparations, all searches and the check of the
+limits. Compile time is reported separately. With --elapsed S, interceptions are planned without
+timing. Then re-planning is timed: each plan is planned again from the car's state S seconds after
+the plan's start, for a target that continues on its path. Run the benchmark on an idle machine,
+bound to one core; the load average is printed.
 """
 
 import os
@@ -27,9 +27,9 @@ from planner_jax.runs.timing import measure_plans
 
 
 def begin_replans(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
-    """Plan a batch, and return a re-planner with the problems that it must solve.
+    """Plan a batch of interceptions; return a re-planner, and the problems that it must solve.
 
-    Each problem starts from the state that a solved plan has after `elapsed` [s].
+    In each problem the car has the state in which a solved plan is after `elapsed` [s].
     """
     plans = pj.plan(planner, cases)
     lanes = np.flatnonzero(pj.are_solved(plans) & (np.asarray(plans.time) > elapsed))
@@ -40,7 +40,6 @@ def begin_replans(planner: Any, cases: Any, elapsed: float) -> tuple[Any, Any]:
 
 
 def main() -> None:
-    """Draw cases, plan them one by one, and print quantiles of the time, success and cost."""
     parser = argument_parser("latency", __doc__, num=2000, seed=1)
     parser.add_argument("--task", choices=all_tasks(), default="hit", help="default: hit")
     parser.add_argument("--planner", help="default: the first of the task")

@@ -5,17 +5,17 @@
 
 A network maps the numbers of a case to a correction of the planner's initial guess. Training
 minimises the mean logarithm of the planner's objective at the guess, over batches from a large pool
-of cases. Half of the cases are from the usual suites. The other half has random initial states
-(some of them moving), limits, balls, rackets or nets, and targets.
+of cases. Half of the cases are drawn like the cases of other benchmarks. The other half has random
+initial states (some of them moving), limits, balls, rackets or nets, and targets.
 
 The task `hard-hit` has a network of its own, for a trajectory with velocities at the waypoints as
 additional variables. Its cases are serves planned 0.5 to 0.88 s late, or with limits multiplied by
 0.29 to 0.5. Many of them are infeasible.
 
 With --train the networks are trained and the shipped files are replaced. The printed table compares
-plans with and without the network after several numbers of iterations, on cases that no network
-was trained on. It has the cost above the minimum that very long searches find, and the share of
-plans that keep every limit.
+plans with and without the network after several numbers of iterations, on cases that no network was
+trained on. It has the cost above the minimum that very long searches find, and the share of plans
+that keep every limit.
 """
 
 import argparse
@@ -47,7 +47,7 @@ _RATE = 2e-3  # Initial learning rate of Adam, which decays to zero along a cosi
 _SEED_APART = 90_001  # Seed of the cases in the printed table. No network is trained on them.
 _STEPS = 50  # Number of Adam steps in one compiled call.
 _ITERATIONS = (0, 3, 5, 7, 12, 20)  # Numbers of planner iterations in the printed table.
-_CHUNKS = 64  # Hard hits are drawn in this number of parts, each with one delay or limit scale.
+_CHUNKS = 64  # Number of parts of the hard hits. A part has one delay, or one factor of limits.
 
 
 def _draw_factors(random: np.random.Generator, num: int, low: float, high: float) -> np.ndarray:
@@ -56,7 +56,7 @@ def _draw_factors(random: np.random.Generator, num: int, low: float, high: float
 
 
 def _add_motion(random: np.random.Generator, head: Any) -> Any:
-    """Add random velocity, acceleration and jerk to half of the initial states (B, 4, 3)."""
+    """Add random velocity, acceleration and jerk to half of B initial states (B, 4, 3)."""
     num = len(head)
     sizes = np.array([1.5, 3.0, 15.0])[:, None] * random.uniform(size=(num, 1, 1))
     moving = random.uniform(size=(num, 1, 1)) < 0.5
@@ -66,7 +66,7 @@ def _add_motion(random: np.random.Generator, head: Any) -> Any:
 
 
 def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw `num` training cases of hits: half usual ones, half with varied states and limits."""
+    """Draw `num` training cases of hits: half as usual, half with varied states and limits."""
     random, half = np.random.default_rng(seed), num // 2
     plain = pj.hit.draw(num - half, seed=seed)
     varied = pj.hit.draw(half, seed=seed + 1)
@@ -118,10 +118,9 @@ def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_catches(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw `num` training cases of catches: half usual ones, half with varied states and limits.
+    """Draw `num` training cases of catches: half as usual, half with varied states and limits.
 
-    The usual cases are from the suites `throws` and `hard`, with catching times that the greedy
-    decision chose.
+    The usual cases are from the suites `throws` and `hard`, with the earliest catching times.
     """
     random, half = np.random.default_rng(seed), num // 2
 
@@ -165,15 +164,15 @@ def _concatenate(*batches: Any) -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class _NetworkSpec:
-    """What a network is trained on and compared on, and where it is stored."""
+    """One network: on which cases it is trained and compared, and where it is stored."""
 
     file: str  # path of the shipped file, below the folder of planner_jax.task
     draw: Callable[[int, int], Any]  # draws training cases: (number, seed) -> cases
     planner: Any  # planner without the network
     usual: Callable[[int, int], Any]  # draws cases for the printed table: (number, seed) -> cases
     hidden: tuple[int, ...] = (128, 128)  # widths of the hidden layers
-    # Added to the cost before the logarithm, so that training ignores differences between costs far
-    # below this value.
+    # Training minimises the mean of log(cost + floor), so differences between costs far below the
+    # floor have no effect.
     floor: float = 0.0
     iterations: tuple[int, ...] = _ITERATIONS  # numbers of planner iterations in the printed table
 
@@ -213,7 +212,8 @@ def make_untrained(
     """Return an untrained network, whose output is zero.
 
     Args:
-        features: (B, F), inputs for a batch of cases. Their mean and deviation scale the inputs.
+        features: (B, F), F inputs for each of B cases. Their mean and standard deviation scale the
+            inputs.
         outputs: number of outputs.
         hidden: widths of the hidden layers.
         seed: seed of the random weights.
@@ -292,7 +292,7 @@ def train(
         rate = _RATE * 0.5 * (1.0 + np.cos(np.pi * share))
         params, state, value = steps(params, state, own, rate)
         value.block_until_ready()
-        began = began or time.perf_counter()  # Time starts after the first call, which compiles.
+        began = began or time.perf_counter()  # The first call, which compiles, is not timed.
         calls += 1
         share = min((time.perf_counter() - began) / (60.0 * minutes), 1.0)
         if calls % 20 == 1:
@@ -343,7 +343,6 @@ def locate_file(task: str) -> Path:
 
 
 def main() -> None:
-    """Train the networks if requested, and compare plans with and without them."""
     parser = argument_parser("learn_starts", __doc__, num=1000, seed=11)
     parser.add_argument(
         "--tasks", nargs="+", choices=TASKS, default=list(TASKS), help="default: all"

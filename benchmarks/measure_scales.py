@@ -3,14 +3,16 @@
     python -m benchmarks.measure_scales [--write] [--out DIR]
 
 Decision variables are divided by scales, so that the objective has a similar curvature along all
-variables. The scale of variable i is 1 / sqrt(floor + median H_ii). H = J^T J is the Gauss-Newton
-approximation of the Hessian, from the Jacobian J of the planner's residuals in SI units. The median
-is over cases. For each case, H is the sum at the initial guess and at a solution.
+variables. The scale of variable i is 1 / sqrt(floor + median H_ii), with a small constant floor.
+H_ii is the diagonal element i of H = J^T J, the Gauss-Newton approximation of the Hessian, from the
+Jacobian J of the planner's residuals in SI units. For each case, H is the sum at the initial guess
+and at a solution. The median is over cases.
 
 The cases of hits are drawn serves, 100 of each of five hard kinds, so that limits are active. The
 cases of catches are throws of the suite `hard`, with limits multiplied by 1 and 0.8. The program
 prints the largest ratio of a measured to a shipped scale, and the share of plans with the measured
-scales that the referee accepts. --write replaces the shipped files.
+scales that the referee, an independent check in float64, accepts. --write replaces the shipped
+files.
 """
 
 import dataclasses
@@ -48,15 +50,15 @@ _FIRST_HIT = (0.05, 0.1, 0.2, 0.6, 0.8, 30.0, 30.0, 30.0)
 # Scales of the variables at the end of a catch with which the measurement starts: logarithm of the
 # duration, position in the net (2), velocity [m/s], acceleration [m/s^2], jerk [m/s^3].
 _FIRST_CATCH = (0.03, 0.5, 0.5, 0.6, 0.6, 0.6, 2.0, 2.0, 2.0, 40.0, 40.0, 30.0)
-# Floor of the curvature for catches. It is larger than for hits, because the objective of easy
+# Constant added to curvatures of catches. It is larger than for hits, because the objective of easy
 # throws hardly depends on the position in the net and the final jerk.
 _CATCH_FLOOR = 0.1
 
 
-# Type of a function that returns the residuals (R,) of a planner at decision variables (n,). Its
+# Type of a function that returns the residuals (R,) of a planner at n decision variables (n,). Its
 # third argument is the planner's prepared data of the case.
 Residuals = Callable[[Any, jax.Array, Any], jax.Array]
-_ROUNDS = 3  # Number of measurements, each with the scale of the measurement before.
+_ROUNDS = 3  # Number of measurements, each with the scales that the previous one measured.
 
 
 def curvature_diagonal(residuals: Callable[[jax.Array], jax.Array], point: jax.Array) -> jax.Array:
@@ -77,8 +79,8 @@ def measure_scale(
     Args:
         planner: a frozen dataclass with a `scale` field, whose initial value is only a rough guess.
         cases: a batch of a few hundred cases, some of them hard, so that limits are active.
-        residuals: function of the planner, a point (n,) and its context. Returns (R,), whose
-            squares sum to about twice the objective near its minimum.
+        residuals: function of the planner, a point (n,) of the n decision variables, and prepared
+            data. Returns residuals whose squares sum to about twice the objective near its minimum.
         floor: added to the curvature, so that a variable with almost no effect gets a finite scale.
 
     Returns:
@@ -144,8 +146,8 @@ def chain_residuals(planner: ChainPlanner, point: jax.Array, context: Any) -> ja
 def draw_hard_serves(num: int, seed: int) -> pj.hit.HitCase:
     """Draw `num` hits of each of five hard kinds.
 
-    The kinds are: planned 0.5 s late, planned 0.6 s late, limits x 0.5, limits x 0.35, and random
-    initial positions.
+    The kinds are: planned 0.5 s late, planned 0.6 s late, limits multiplied by 0.5 and by 0.35, and
+    random initial positions.
     """
     kinds = (
         functools.partial(pj.hit.to_cases, delay=0.5),
@@ -160,7 +162,10 @@ def draw_hard_serves(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
-    """Draw `num` throws of the suite `hard`, with limits of speed and body rate x 1 and x 0.8."""
+    """Draw `num` throws of the suite `hard`, each with full limits and with limits times 0.8.
+
+    The limits of speed and body rate are multiplied.
+    """
     cases = first_choice(pj.catch.Greedy(), pj.catch.draw(num, "hard", seed))
 
     def weaker(factor: float) -> pj.catch.CatchCase:
@@ -175,7 +180,7 @@ def draw_weak_throws(num: int, seed: int) -> pj.catch.CatchCase:
 
 
 def hit_planners() -> dict[str, Any]:
-    """Return planners of hits for each number of pieces, with guessed scales, by file key."""
+    """Return planners of hits with rough scales, one for each number of pieces, by file key."""
     found = {}
     for pieces in HIT_PIECES:
         first = (0.2,) * (3 * (pieces - 1)) + _FIRST_HIT
@@ -185,7 +190,7 @@ def hit_planners() -> dict[str, Any]:
 
 
 def catch_planners() -> dict[str, Any]:
-    """Return planners of catches for each number of pieces, with guessed scales, by file key."""
+    """Return planners of catches with rough scales, one for each number of pieces, by file key."""
     found = {}
     for pieces in CATCH_PIECES:
         first = (0.3,) * (3 * (pieces - 1)) + _FIRST_CATCH
@@ -194,7 +199,7 @@ def catch_planners() -> dict[str, Any]:
     return found
 
 
-# Task -> function that draws cases, function that returns planners, options of `measure_scale`.
+# Task -> function that draws cases, function that creates planners, and options of `measure_scale`.
 TASKS = {
     "hit": (draw_hard_serves, hit_planners, {}),
     "catch": (draw_weak_throws, catch_planners, {"floor": _CATCH_FLOOR}),
@@ -230,7 +235,6 @@ def locate_file(task: str) -> Path:
 
 
 def main() -> None:
-    """Measure the scales of the requested tasks, and replace the shipped files if requested."""
     parser = argument_parser("measure_scales", __doc__, num=100, seed=7)
     parser.add_argument("--write", action="store_true", help="replace the shipped files")
     parser.add_argument(

@@ -3,10 +3,10 @@
     python -m benchmarks.optimiser [--num 200] [--row late-0.5] [--out DIR]
 
 All three solvers minimise the same float32 objective in the same scaled variables, from the same
-initial guess. This library's solver and optax solve all serves in one batched call. SciPy solves
-one serve after another, with a compiled function of value and gradient. Times are per plan, without
-compilation. Success is judged by the referee. The summary of the run folder is about this library's
-solver, over all maximum numbers of iterations.
+initial guess. This library's solver and optax solve all cases in one batched call. SciPy solves one
+case after another, with a compiled function of value and gradient. Times are per plan, without
+compilation. The referee, an independent check in float64, decides about success. The success rate
+in the run's summary is that of this library's solver, over all maximum numbers of iterations.
 """
 
 import time
@@ -75,9 +75,10 @@ def make_optax_solver(iterations: int) -> Callable:
 
 
 def run_batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
-    """Solve a batch of cases in one call, after a first call that compiles.
+    """Solve B cases in one call, after a first call that compiles.
 
-    Returns decision variables (B, n), the mean number of iterations, and the duration [s].
+    Returns n decision variables of each case (B, n), the mean number of iterations, and the
+    duration [s].
     """
     compiled = jax.jit(jax.vmap(solve))
     jax.block_until_ready(compiled(cases))
@@ -87,9 +88,10 @@ def run_batched(solve: Callable, cases) -> tuple[np.ndarray, float, float]:
 
 
 def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
-    """Solve cases one after another with SciPy's L-BFGS-B, and a compiled value and gradient.
+    """Solve B cases one after another with SciPy's L-BFGS-B and a compiled value and gradient.
 
-    Returns decision variables (B, n), the mean number of iterations, and the duration [s].
+    Returns n decision variables of each case (B, n), the mean number of iterations, and the
+    duration [s].
     """
     contexts = jax.jit(jax.vmap(PLANNER.prepare))(cases)
     starts = np.asarray(jax.jit(jax.vmap(lambda c: PLANNER.guesses(c, 1)[0]))(contexts), float)
@@ -117,7 +119,6 @@ def run_scipy(cases, iterations: int) -> tuple[np.ndarray, float, float]:
 
 
 def main() -> None:
-    """Run each solver with several maximum numbers of iterations, and print a line for each."""
     parser = argument_parser("optimiser", __doc__, num=200)
     parser.add_argument("--row", default="late-0.5", choices=[*ROWS][:-1], help="default: late-0.5")
     options = parser.parse_args()

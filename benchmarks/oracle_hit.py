@@ -3,15 +3,16 @@
     python -m benchmarks.oracle_hit [--serves DIR] [--delay S] [--limit-scale F]
         [--failures RUN/plans | --indices FILE.npy] [--num N] [--starts K] [--out DIR]
 
-The search takes a sample of serves, for example serves for which a planner failed. It shares no
-code with the planners, and solves a nonlinear program by direct transcription. The quadrotor's snap
-is constant on pieces of free duration, so position to jerk are continuous. The impact and the
-ball's flight to the target are equality constraints. Limits are inequalities at samples of every
-piece. IPOPT minimises the excess: the largest relative amount by which a limit is exceeded.
+A quadrotor hits a served ball with a racket such that it lands at a target. The search takes a
+sample of serves, for example serves for which a planner failed. It shares no code with the
+planners, and solves a nonlinear program by direct transcription. The quadrotor's snap is constant
+on pieces of free duration, so position to jerk are continuous. The impact and the ball's flight to
+the target are equality constraints. Limits are inequalities at samples of every piece. IPOPT
+minimises the excess: the largest relative amount by which a limit is exceeded.
 
 Each search starts with few pieces, from one of several starting points. If the excess is small, the
 pieces are halved, and limits that are exceeded between samples are tightened on their piece. A hit
-counts only if the library's referee accepts it.
+counts only if the library's referee, an independent check in float64, accepts it.
 
 A hit that is found proves that its case is feasible. If no hit is found, nothing is proven. But if
 all starting points lead to the same excess, the case probably becomes feasible only if all limits
@@ -44,7 +45,7 @@ def read_failures(plans: Path) -> np.ndarray:
 
 
 def summarise(findings: list[Finding]) -> dict:
-    """Count the verdicts of all cases, with shares, Wilson intervals, excesses and CPU times."""
+    """Return the number of cases with each verdict, its share, excesses and CPU times, by name."""
     num, verdicts = len(findings), {}
     for name in VERDICTS:
         count = sum(finding.verdict == name for finding in findings)
@@ -101,7 +102,6 @@ def write_findings(
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """Return the parser of this program's command line."""
     parser = argument_parser("oracle_hit", __doc__, num=200, starts=len(STARTS), seed=0, workers=1)
     add = parser.add_argument
     add("--serves", type=Path, help="folder of published trial files (default: draw serves)")
@@ -123,7 +123,6 @@ def make_parser() -> argparse.ArgumentParser:
 
 
 def main() -> None:
-    """Read or draw serves, search for hits in a sample of them, and print the verdicts."""
     parser = make_parser()
     options = parser.parse_args()
     try:

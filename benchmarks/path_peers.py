@@ -2,8 +2,8 @@
 
 The package fastsim-navigation is installed with the extra `peers`. Its C++ code sometimes aborts
 the process, so it runs in a separate process. The command `python -m benchmarks.path_peers
-SEARCHES.json RESULTS.jsonl FIRST` runs the searches of a file from number FIRST on, and appends a
-line of results for each.
+SEARCHES.json RESULTS.jsonl FIRST` reads path problems from a file, solves them from the problem
+with index FIRST on, and appends one line a problem to RESULTS.jsonl.
 """
 
 import importlib
@@ -98,7 +98,6 @@ def search_one(given: dict) -> dict:
 
 
 def main() -> None:
-    """Read path problems from a file, solve those from number FIRST on, and append the results."""
     given, results, first = sys.argv[1:]
     searches = json.loads(Path(given).read_text())
     with Path(results).open("a") as file:

@@ -5,8 +5,8 @@
 
 A batch is planned twice: as drawn, and with invalid ("poisoned") numbers in every hundredth case. A
 poisoned case has one array with a bad value: NaN, infinity, or a number outside the allowed range.
-The poisoned cases take turns through all arrays and bad values. A poisoned case is marked if the
-status of its plan is BAD_INPUT. All other plans must be equal, bit for bit, in both batches.
+The poisoned cases take turns through all arrays and bad values. A poisoned case counts as marked if
+the status of its plan is BAD_INPUT. All other plans must be equal, bit for bit, in both batches.
 """
 
 import argparse
@@ -30,7 +30,7 @@ BAD = (np.nan, np.inf, -np.inf, -1.0, 0.0, 1e6)
 
 
 def poisons(case: Any) -> list[tuple[str, float]]:
-    """Return the names of a case's arrays, each with a value that the array's rule forbids."""
+    """Return the names of a case's arrays, each with a value that is invalid for the array."""
     found = []
     for ruled in all_ruled(jax.tree.map(np.asarray, case)):
         for value in BAD:
@@ -62,12 +62,12 @@ def poison(cases: Any, lanes: np.ndarray, spared: Collection[str] = ()) -> Any:
 
 
 def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
-    """Plan a valid and a poisoned batch, and count marked cases and changed plans.
+    """Plan a valid batch and a batch with invalid cases; count marked cases and changed plans.
 
     Args:
         task: specification of the task.
         num: number of cases.
-        every: one in this number of cases is poisoned.
+        every: one in this number of cases is made invalid.
         seed: seed of the cases.
     """
     cases, planner = task.draw(num, seed=seed), task.planner(**task.bench)
@@ -91,7 +91,7 @@ def compare(task: Any, num: int, every: int, seed: int) -> dict[str, int]:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan a valid and a poisoned batch; print how many plans are marked and how many unchanged."""
+    """Plan both batches; print how many invalid cases are marked and how many plans unchanged."""
     task = pj.task_named(options.task)
     found = compare(task, options.num, options.every, options.seed)
     bench.row(task=options.task, num=options.num, **found)
@@ -106,7 +106,6 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments, and print the counts of marked and of unchanged plans."""
     parser = argument_parser("poisoned_batches", __doc__, num=20_000, every=100, seed=0)
     parser.add_argument("--task", default="hit", choices=all_tasks(), help="default: hit")
     options = parser.parse_args()

@@ -14,10 +14,10 @@ reinforcement learning. The variants of the training are:
   of the decisions. Even so its training takes longer than the other variants.
 
 The trained policies decide on cases of a seed that no training uses. The planner `exact` plans
-these cases, and the referee judges the plans. The table has means over accepted plans of the time
-of the last catch and of the optimal time ratio (OTR), which compares decided and optimised times.
-The variation over training seeds is printed as minimum and maximum. Training times include
-compilation.
+these cases, and the referee, an independent check in float64, judges the plans. The table has means
+over accepted plans of the time of the last catch and of the optimal time ratio (OTR), which is the
+relative difference between decided and optimised times. Of several training seeds the minimum and
+maximum are printed. Training times include compilation.
 """
 
 import argparse
@@ -62,7 +62,7 @@ def training_settings(
     weights: Mapping[str, float] | None = None,
     **others: Any,
 ) -> Training:
-    """Return the settings of a training.
+    """Return the settings of one training of a policy.
 
     Args:
         suite: suite of catches on which the policy is trained.
@@ -82,10 +82,10 @@ def training_settings(
 def judge_decision(
     bench: Bench, decision: Any, suite: str, options: argparse.Namespace
 ) -> dict[str, float]:
-    """Plan a suite's cases with a policy or another decision, and judge the plans.
+    """Plan a suite's cases with a method that decides order and times, and judge the plans.
 
-    The successes are added to the benchmark's summary. Returns the success rate [%], the mean time
-    of the last catch [s], and the mean optimal time ratio.
+    The successes are added to the run's summary. Returns the success rate [%], the mean time of the
+    last catch [s], and the mean relative difference between decided and optimised times.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)
@@ -99,7 +99,7 @@ def judge_decision(
 
 
 def measure(bench: Bench, variants: list[str], options: argparse.Namespace) -> None:
-    """Train and judge every variant, and print the table, with two untrained decisions first."""
+    """Train and judge every variant, and print the table; two untrained methods come first."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",
@@ -141,7 +141,7 @@ def report_seeds(
 
     Args:
         bench: stores a row for each seed.
-        named: the column heading of the training's name -> this name.
+        named: heading of the table's first column -> name of the training.
         train_by: function that trains a policy with a seed.
         options: command-line options with `suite`, `seeds` (their number), `num` and `seed`.
     """
@@ -164,7 +164,6 @@ def report_seeds(
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of all variants."""
     parser = argument_parser("policy_ablations", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
     parser.add_argument(

@@ -7,17 +7,18 @@ The benchmark needs `pip install stable-baselines3`, in an environment without t
 PyTorch needs other versions of the CUDA libraries than JAX, so no extra of this library contains
 it.
 
-Both trainings use the same environment, in which a policy decides order and times of catches. They
-train the network of [Yu2023catch], two hidden layers of 64 units with ReLU, in 100 environments at
-once, with the same number of decisions and the same rewards. Every 100 decisions are used in four
-passes of four minibatches. In the table, "sb3" is PPO of Stable-Baselines3. It clips Gaussian
-actions to -1 and 1, normalises advantages in each minibatch, and has a value network of the same
-size and a learning rate of 3e-4. "brax" is this library's training. It adapts the learning rate to
-the divergence between the old and the new policy.
+Both trainings use the same environment, in which a policy decides in which order and when a
+quadrotor catches several balls. They train the network of [Yu2023catch], two hidden layers of 64
+units with ReLU, in 100 environments at once, with the same number of decisions and the same
+rewards. Every 100 decisions are used in four passes of four minibatches. In the table, "sb3" is PPO
+of Stable-Baselines3. It clips Gaussian actions to -1 and 1, normalises advantages in each
+minibatch, and has a value network of the same size and a learning rate of 3e-4. "brax" is this
+library's training. It adapts the learning rate to the divergence between the old and the new
+policy.
 
 Each policy decides by the mean of its action, on cases of a seed that no training uses. The planner
-`exact` plans these cases, and the referee judges the plans. The table has the minimum and the
-maximum over training seeds. Training times include compilation.
+`exact` plans these cases, and the referee, an independent check in float64, judges the plans. The
+table has the minimum and the maximum over training seeds. Training times include compilation.
 """
 
 import argparse
@@ -54,7 +55,7 @@ vec_env: Any = importlib.import_module("stable_baselines3.common.vec_env")
 
 # Number of parallel environments, of minibatches in a pass, and of passes over the same decisions.
 LANES, MINIBATCHES, PASSES = 100, 4, 4
-FIRST_STD = 0.15  # Standard deviation of actions at the start of the training by sb3.
+FIRST_STD = 0.15  # Standard deviation of actions when Stable-Baselines3 starts its training.
 
 
 class CatchVecEnv(vec_env.VecEnv):
@@ -68,16 +69,16 @@ class CatchVecEnv(vec_env.VecEnv):
         self._reset, self._step = jax.jit(self.env.reset), jax.jit(self.env.step)
 
     def reset(self) -> np.ndarray:
-        """Draw new cases, and return their observations (LANES, F)."""
+        """Draw new cases, and return F observed numbers of each, (LANES, F)."""
         self._state = self._reset(self._keys)
         return np.array(self._state.obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Plan all cases with the decisions `actions` (LANES, A), and draw the next cases."""
+        """Plan all cases with the A action values of each, (LANES, A), and draw the next cases."""
         self._state = self._step(self._state, jnp.asarray(actions, jnp.float32))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Return observations of the next cases, rewards, ended episodes, and empty infos.
+        """Return observations of the next cases, rewards, flags of ended episodes, and empty infos.
 
         Every episode ends after one step, because it has a single decision.
         """
@@ -109,7 +110,7 @@ class PeerPolicy(CatchDecision):
     layers: Sequence[tuple[Any, Any]]  # weights and biases; ReLU follows all layers but the last
 
     def propose(self, case: CatchCase) -> CatchChoice:
-        """Return the policy's choice of order and times for one case, leaves (1, N)."""
+        """Return the policy's order and times for a case with N targets, arrays (1, N)."""
         table = timetable(case)
         hidden = observe(case, table).ravel()
         *inner, (weights, bias) = self.layers
@@ -125,7 +126,7 @@ def _affine(weights: Any, bias: Any, hidden: jax.Array) -> jax.Array:
 
 
 def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
-    """Train a policy on a suite with Stable-Baselines3, with a number of decisions and a seed."""
+    """Train a policy on a suite of catches with Stable-Baselines3, with `decisions` decisions."""
     network = {
         "net_arch": [64, 64],
         "activation_fn": torch.nn.ReLU,
@@ -153,7 +154,7 @@ def train_peer(suite: str, decisions: int, seed: int) -> PeerPolicy:
 
 
 def train_own(suite: str, decisions: int, seed: int) -> Any:
-    """Train a policy on a suite with this library, with a number of decisions and a seed."""
+    """Train a policy on a suite of catches with this library, with `decisions` decisions."""
     return train_policy(
         training_settings(
             suite,
@@ -187,7 +188,6 @@ def measure(bench: Bench, options: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of both trainings."""
     parser = argument_parser("policy_peer", __doc__, num=1000, seed=777, seeds=3)
     parser.add_argument("--suite", default="triangle3", choices=SUITES, help="default: triangle3")
     parser.add_argument(

@@ -3,19 +3,20 @@
     python -m benchmarks.policy_sizes [--sizes 4,5,7] [--num 1000] [--seed 777]
         [--decisions 1500000] [--policy FILE] [--init-from FILE] [--out DIR]
 
-The suites `square4`, `pentagon5` and `heptagon7` have four, five and seven targets. Otherwise they
-equal `hexagon6`, one of the suites on which the shipped policy was trained. The rows of each suite
-are
+A policy decides in which order and when a quadrotor catches several targets. The suites `square4`,
+`pentagon5` and `heptagon7` have four, five and seven targets. Otherwise they equal `hexagon6`, one
+of the suites on which the shipped policy was trained. The rows of each suite are
 * "best": plan the six most promising of all orders (with seven targets, of the orders that a search
   finds), and use the best plan;
-* "greedy": plan the one order that catches the earliest target next;
+* "greedy": plan the one order that always catches next the target that can be caught first;
 * "policy": the policy in --policy, by default the shipped policy, without further training;
 * "trained": a policy trained on this suite with --decisions decisions and the shipped policy's
   reward. It starts with the weights of --init-from, by default of --policy.
 
-The planner `exact` plans all cases, and the referee judges the plans. The table has means over
-accepted plans of the time of the last catch and of the optimal time ratio (OTR), which compares
-decided and optimised times. Training times include compilation.
+The planner `exact` plans all cases, and the referee, an independent check in float64, judges the
+plans. The table has means over accepted plans of the time of the last catch and of the optimal time
+ratio (OTR), which is the relative difference between decided and optimised times. Training times
+include compilation.
 """
 
 import argparse
@@ -54,7 +55,7 @@ def train_on_suite(suite: str, options: argparse.Namespace) -> tuple[Policy, flo
 
 
 def measure(bench: Bench, sizes: list[str], options: argparse.Namespace) -> None:
-    """Train a policy for each suite, judge it beside the other decisions, and print the table."""
+    """Train a policy for each suite, judge it beside the other methods, and print the table."""
     bench.say(
         f"{options.num} cases each, seed {options.seed}; trained with {options.decisions:,} "
         f"decisions, {jax.devices()[0]}",
@@ -88,7 +89,6 @@ def measure(bench: Bench, sizes: list[str], options: argparse.Namespace) -> None
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of all suites."""
     parser = argument_parser("policy_sizes", __doc__, num=1000, seed=777)
     parser.add_argument(
         "--sizes", default=",".join(SUITES), help="numbers of targets, comma-separated"

@@ -64,8 +64,9 @@ def share_within(bound: Array, radius: ArrayLike) -> Array:
 def _square_radii(bound: Array) -> Array:
     """Return squared distances (64,) [m^2] of points on the error ellipse from its centre.
 
-    The ellipse belongs to one standard deviation of the covariance `bound`. The points are at equal
-    steps of the ellipse's parameter over half a turn, as nodes of an integral over the directions.
+    The ellipse belongs to one standard deviation of a Gaussian error with covariance `bound`. The
+    points are at equal steps of the ellipse's parameter angle over half a turn. Callers average a
+    function over the points, which is its mean over all directions of the error.
     """
     mean = 0.5 * (bound[0, 0] + bound[1, 1])
     apart = safe_sqrt((0.5 * (bound[0, 0] - bound[1, 1])) ** 2 + bound[0, 1] ** 2)

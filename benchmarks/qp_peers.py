@@ -1,7 +1,8 @@
 """Clarabel and OSQP, published solvers of quadratic programs, for comparison in `intercept_speed`.
 
 They are installed with the extra `peers`, and solve the programs of `baselines.intercept.qp`:
-minimise x' Q x / 2 subject to equalities and to lower and upper bounds of R x.
+minimise x' Q x / 2 over x, subject to equalities and to lower and upper bounds of R x, where Q and
+R are constant matrices.
 """
 
 import dataclasses
@@ -26,8 +27,8 @@ def is_installed(name: str) -> bool:
 class PeerSolution:
     """Solution of one quadratic program by Clarabel or OSQP, and the duration of the call."""
 
-    point: np.ndarray  # (n,)
-    cost: float  # x' Q x / 2
+    point: np.ndarray  # (n,), the n unknowns x
+    cost: float  # minimised cost x' Q x / 2, with the Hessian Q
     solved: bool  # as reported by the solver
     seconds: float  # duration of the call [s], NaN if the solver was not called
 
@@ -108,14 +109,13 @@ def osqp_solver(matrices: Mapping[str, np.ndarray]) -> Callable[..., PeerSolutio
 
 
 def _to_sparse(matrices: Mapping[str, np.ndarray]) -> tuple[Any, Any, Any]:
-    """Return as sparse matrices the upper triangle of Q, the equalities, and the bounded rows R."""
+    """Return three sparse matrices: the Hessian's upper triangle, equalities, and bounded rows."""
     equalities = np.concatenate([matrices["equalities"], matrices["zeros"]])
     hessian = scipy.sparse.csc_matrix(np.triu(matrices["hessian"]))
     return hessian, scipy.sparse.csr_matrix(equalities), scipy.sparse.csr_matrix(matrices["rows"])
 
 
 def _equality_values(matrices: Mapping[str, np.ndarray], right_side: np.ndarray) -> np.ndarray:
-    """Return the right-hand sides of a program's equalities: `right_side`, then zeros."""
     return np.concatenate([np.asarray(right_side, float), np.zeros(len(matrices["zeros"]))])
 
 

@@ -2,10 +2,10 @@
 
     python -m benchmarks.recoveries [--rows ROW,...] [--num 1000] [--seed 1] [--out DIR]
 
-A recovery trajectory brings the robot to a standstill after the last contact of a plan, as
+A recovery trajectory brings the robot to a standstill after the last contact of a plan. The command
 `planner-jax export` appends it to plans. Cases of each row are drawn and planned. For every plan
-that the referee accepts and that does not end at a standstill, a recovery trajectory is computed.
-If none is found, the limit that it would exceed is counted.
+that the referee, an independent check in float64, accepts and that does not end at a standstill, a
+recovery trajectory is computed. If none is found, the limit that it would exceed is counted.
 """
 
 import time
@@ -20,7 +20,7 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.core.errors import NoRecovery
 from planner_jax.recovery.after_plan import append_recovery, is_rested
 
-# Row name -> module of the task, options of its `draw`, options of its `planner`, and kind of the
+# Row of the table -> module of the task, options of its functions `draw` and `planner`, and kind of
 # recovery: "brake" to a standstill at any position, or "home" to the start of the case.
 ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
     "hits": (pj.hit, {}, {}, "brake"),
@@ -33,17 +33,18 @@ ROWS: dict[str, tuple[Any, dict[str, Any], dict[str, Any], str]] = {
 
 
 def count_recoveries(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tuple[Counter, float]:
-    """Compute a recovery trajectory for each accepted plan of a batch.
+    """Compute a recovery trajectory, which ends at a standstill, for each accepted plan.
 
     Args:
         cases: a batch of B cases.
         plans: the plans of these cases.
-        passed: (B,) bool, whether the referee accepts the plan.
-        to: kind of the recovery, "brake" or "home".
+        passed: (B,) bool, whether the referee, an independent check, accepts the plan.
+        to: kind of the recovery, "brake" (stop anywhere) or "home" (return to the start).
 
     Returns:
-        The numbers of plans that end at a standstill ("rests"), of recoveries that were found
-        ("found"), and of failures by the name of the limit. Then the median duration [s].
+        The numbers of plans that already end at a standstill ("rests"), of recovery trajectories
+            that were found ("found"), and of failures by the name of the limit. Then the median
+            duration of one computation [s].
     """
     counts: Counter[str] = Counter()
     seconds = []

@@ -2,10 +2,11 @@
 
     python -m benchmarks.robot_rows [--robots NAME|FILE ...] [--num 2048] [--repeats 5] [--out DIR]
 
-Every model plans with limits on the thrust of each rotor, and without them (`rotor_share` null).
-Both kinds of calls take turns, so that other load on the machine affects both. Models with a racket
-hit the serves of the suite `court`. Models with a net catch the balls of the suite `parabola2`. The
-referee judges plans without rotor limits also without these limits.
+For every model, cases are planned with limits on the thrust of each rotor, and without them
+(`rotor_share` null). Both kinds of calls take turns, so that other load on the machine affects
+both. Models with a racket hit the serves of the suite `court`. Models with a net catch the balls of
+the suite `parabola2`. The referee, an independent check in float64, judges the plans. Plans without
+rotor limits are judged without rotor limits, too.
 """
 
 import dataclasses
@@ -36,11 +37,11 @@ def vary_rotor_limits(robot: QuadrotorModel) -> dict[str, QuadrotorModel]:
 
 
 def measure_robot(robot: QuadrotorModel, num: int, repeats: int) -> dict[str, Any]:
-    """Plan `num` cases for a quadrotor model without and with rotor limits, several times.
+    """Plan `num` cases for a quadrotor model without and with rotor limits, `repeats` times each.
 
-    Returns for each of both whether the referee accepts the plans, (num,) bool, and plans per
-    second of wall-clock time and of CPU time. The first call compiles and is not timed. The fastest
-    of the other calls counts.
+    Returns for both kinds, by name, whether the referee (an independent check) accepts the plans,
+    (num,) bool, and plans per second of wall-clock time and of CPU time. The first call compiles
+    and is not timed. The fastest of the other calls counts.
     """
     task, suite = (pj.catch, "parabola2") if robot.tool.kind == NET else (pj.hit, "court")
     planner, found = task.planner(), {}

@@ -1,14 +1,15 @@
 """Shared parts of all benchmarks: arguments, printed output, and the run folder.
 
-A run folder has the following files:
-* manifest.json: the kind "bench NAME", state, parameters, versions, device, commit, times, and a
-  summary;
+A run of a benchmark writes a run folder with the following files:
+* manifest.json: the name of the benchmark as "bench NAME", whether the run is complete, its
+  arguments, the versions of packages, device, commit and times, and a summary;
 * table.md: the printed lines;
 * rows.json: the rows of the benchmark's tables, if it has any.
 
-Every summary has `num`, the number of plans that the referee judged, and `success_rate`, the share
-that it accepted. If the benchmark computes `cost_gaps`, the summary also has their median, 90 % and
-99 % quantile.
+The summary has at least two numbers. `num` is the number of plans that were judged, usually by the
+referee, an independent check in float64. `success_rate` is the share of these plans that were
+accepted. Many benchmarks also compare the costs of plans with the costs of a longer search. Then
+the summary has the median, 90 % and 99 % quantile of cost / best cost - 1.
 """
 
 import argparse
@@ -137,17 +138,17 @@ class Bench:
         self._folder.write_text("rows.json", json.dumps(self._rows, indent=1) + "\n")
 
     def count(self, accepted: Any, *gaps: np.ndarray | None) -> None:
-        """Add plans to the summary.
+        """Add plans to the numbers of the summary.
 
         Args:
-            accepted: (B,) bool, whether the referee accepts each plan.
+            accepted: (B,) bool, whether the referee, an independent check, accepts each of B plans.
             *gaps: results of `cost_gaps` for these plans.
         """
         self._accepted += np.asarray(accepted, bool).tolist()
         self._gaps += gaps
 
     def note(self, **figures: Any) -> None:
-        """Add named numbers of the benchmark to the summary in the manifest."""
+        """Add named numbers of the benchmark to the summary in manifest.json."""
         self._figures |= figures
 
 

@@ -3,10 +3,12 @@
     python -m benchmarks.serve_soak [--task catch] [--minutes 1] [--rate 100] [--bad 2]
         [--deadline 0.01] [--server-core N] [--out DIR]
 
-The benchmark starts `planner-jax serve TASK --report` as a separate process, and then acts as its
-client. It sends noisy positions of simulated flying balls, and the state of a robot that follows
-the last answer exactly. --bad per cent of the packets are imperfect: a third of them is lost, a
-third is delayed by 30 ms, and a third is sent twice. A round trip longer than --deadline is a miss.
+The planning server receives positions of a flying ball and states of a robot, and answers with
+setpoints of a plan. The benchmark starts `planner-jax serve TASK --report` as a separate process,
+and then acts as its client. It sends noisy positions of simulated balls, and the state of a robot
+that follows the last answer exactly. --bad per cent of the packets are imperfect: a third of them
+is lost, a third is delayed by 30 ms, and a third is sent twice. A round trip longer than --deadline
+is a miss.
 
 A miss can also happen because the operating system did not run the server. To recognise such
 misses, a third process does nothing but sleep for short times, and records when it was woken too
@@ -15,9 +17,9 @@ this core, and the client uses the other cores. Misses during a recorded gap are
 host.
 
 The program prints misses, times, and the server's own report with its memory at the start and at
-the end. The success of the summary is the share of balls that the tool (net or racket) meets. A
-ball is met if it is within the tool's radius of the tool's centre at the planned time of contact,
-for a robot that follows the setpoints exactly.
+the end. The success rate in the run's summary is the share of balls that the tool (net or racket)
+meets. A ball is met if it is within the tool's radius of the tool's centre at the planned time of
+contact, for a robot that follows the setpoints exactly.
 """
 
 import gc
@@ -49,7 +51,7 @@ from planner_jax.live.packets import (
 )
 from planner_jax.live.report import Latencies
 
-NUM = 200  # Number of balls that are drawn. They are thrown repeatedly.
+NUM = 200  # Number of different balls, which are thrown repeatedly.
 SECONDS = 1.8  # [s] Duration of the flight of a thrown ball.
 NOISE = 0.005  # [m] Standard deviation of each observed coordinate of a ball.
 LATE = 0.03  # [s] Delay of packets that are sent late.
@@ -72,7 +74,7 @@ while os.getppid() == asker:
 
 
 def draw_paths(task: str, rate: float) -> np.ndarray:
-    """Draw balls of a task, and return their positions (NUM, K, 3) [m] at a rate [Hz]."""
+    """Draw `NUM` balls of a task; return K positions of each, (NUM, K, 3) [m], at a rate [Hz]."""
     steps = int(SECONDS * rate)
     if task == "hit":
         cases = pj.hit.draw(NUM)
@@ -89,10 +91,10 @@ def draw_paths(task: str, rate: float) -> np.ndarray:
 
 
 def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray) -> float:
-    """Return the distance [m] of the tool's centre from a ball (3,) at the planned contact.
+    """Return the distance [m] of the tool's centre from a ball (3,) [m] at the planned contact.
 
-    The tool's centre is `height` [m] above the quadrotor's body, along its thrust. The quadrotor
-    follows the setpoints of the answer.
+    The tool, net or racket, is `height` [m] above the quadrotor's body, along its thrust. The
+    quadrotor follows the setpoints in the server's answer.
     """
     times = answer.begin + answer.period * np.arange(answer.setpoints.shape[0])
     pos, acc = (
@@ -113,7 +115,7 @@ class Naps:
         words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]
         words += [] if core is None else [str(core)]
         self._process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        # Start and end [s] of each time in which the process was not run; filled in by `end`.
+        # Start and end [s] of each gap, in which the system did not run the process; set by `end`.
         self.gaps: list[tuple[float, float]] = []
 
     def end(self) -> None:
@@ -192,7 +194,7 @@ class Soak:
         """Simulate one ball until its contact, with a robot that first hovers at `start` (3,) [m].
 
         Args:
-            path: (K, 3) [m], true positions of the ball, one for each period.
+            path: (K, 3) [m], K true positions of the ball, one for each period of 1 / rate.
             start: (3,) [m], initial position of the robot.
             ball: number of the ball in the packets.
         """
@@ -210,8 +212,8 @@ class Soak:
             known = self.send(ROBOT, time.monotonic(), tuple(state.ravel()), ball)
             seen = place + self._random.normal(0.0, NOISE, 3)
             answer = self.send(BALL, now, tuple(seen), ball) or known
-            # The robot starts to follow answers only after the server has received its state, that
-            # is after a state packet was answered. Until then it hovers.
+            # The robot hovers until the server has answered a packet with its state. After this it
+            # follows the answers.
             if answer is None or (state_now is None and known is None):
                 continue
             state_now = answer.setpoints[0, :9].astype(float).reshape(3, 3)
@@ -249,7 +251,6 @@ def start_server(options: Any) -> tuple[subprocess.Popen, int, float]:
 
 
 def main() -> None:
-    """Start the server, throw balls for the requested time, and print misses and times."""
     parser = argument_parser("serve_soak", __doc__, seed=0)
     parser.add_argument("--task", choices=("hit", "catch"), default="catch", help="default: catch")
     parser.add_argument("--minutes", type=float, default=1.0, help="duration [min]; default: 1")

@@ -1,6 +1,6 @@
 """Random problems of speed planning along a given path, for `benchmarks.intercept_speed`.
 
-Their setting is like the setting of Table II of [Qu2022].
+They have the setting of [Qu2022, Section V-C], as far as the paper states it.
 """
 
 from typing import Any
@@ -21,8 +21,8 @@ def speed_problems(num: int, seed: int = 0, *, dtype: Any = np.float32) -> Stati
     does not state limits and obstacles, which are chosen here. The limits are 1.5 m/s and 2 m/s^2.
     An obstacle is a parallelogram in the graph of station (distance along the path) over time. Its
     centre is at 1 to 5 m and 1.5 to 8.5 s. It covers 0.6 to 1.5 m of the path for 1 to 2.5 s, and
-    moves at -0.3 to 0.5 m/s. Only problems for which dynamic programming on the default grid finds
-    a line are used. With a greater `num` the first problems stay the same.
+    moves at -0.3 to 0.5 m/s. Only problems are used for which dynamic programming on the default
+    grid finds a line between the obstacles. With a greater `num` the first problems stay the same.
 
     Args:
         num: number of problems.

@@ -1,12 +1,10 @@
 """Count plans whose status disagrees with the referee, for every task, suite and kind of limit.
 
-The status is the planner's own report whether every limit holds. The referee is an independent
-judge.
-
     python -m benchmarks.status_against_referee [--num 200] [--rows hit:court,catch:throws]
         [--seed 0] [--out DIR]
 
-Each row of the table counts
+The status is the planner's own report whether every limit holds. The referee is an independent
+check in float64. Each row of the table counts
 * the plans whose status reports that every limit holds ("solved");
 * the plans that the referee accepts;
 * solved plans that the referee rejects, with the limits that fail;
@@ -42,7 +40,7 @@ class Row:
 
     task: str
     suite: str
-    draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of drawing cases
+    draw: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options for drawing cases
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the planner
     judge: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # options of the referee
     # Function that changes the drawn cases, such as `tighten_limits`; None for no change.
@@ -60,7 +58,7 @@ class Row:
         return self.card.planner(**{**self.card.bench, **self.options})
 
     def cases(self, num: int, seed: int) -> Any:
-        """Draw the row's cases, about `num` / `every` of them, and change them if specified.
+        """Draw about `num` / `every` cases of the row, and change them if `change` is specified.
 
         The cases are a batch in NumPy arrays.
         """
@@ -93,14 +91,14 @@ def _add_constraint(cases: Any, extra: Any) -> Any:
 
 
 def add_spheres(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add to each case a forbidden sphere, 10 to 30 cm in radius, near the case's usual plan."""
+    """Add to each case a forbidden sphere, 10 to 30 cm in radius, near the plan without it."""
     place = _point_on_plan(row, cases, random)
     centre = place + random.normal(0.0, 0.08, place.shape)
     return _add_constraint(cases, pj.KeepOut(centre, random.uniform(0.1, 0.3, len(place))))
 
 
 def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add to each case a forbidden box, with sides of 20 to 60 cm, near the case's usual plan."""
+    """Add to each case a forbidden box, with sides of 20 to 60 cm, near the plan without it."""
     place = _point_on_plan(row, cases, random)
     middle = place + random.normal(0.0, 0.08, place.shape)
     half = random.uniform(0.1, 0.3, place.shape)
@@ -108,9 +106,10 @@ def add_boxes(row: Row, cases: Any, random: np.random.Generator) -> Any:
 
 
 def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
-    """Add to each case a wall beside the straight line from the start to a point of the usual plan.
+    """Add to each case a wall beside a straight line from the start to a point of the plan.
 
-    The wall is parallel to the line, up to 15 cm from it, on a random side.
+    The plan is the plan without a wall. The wall is parallel to the line, up to 15 cm from it, on a
+    random side.
     """
     start, place = cases.head_state[:, 0], _point_on_plan(row, cases, random)
     along = place - start
@@ -192,7 +191,7 @@ ROWS = {
 
 
 def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
-    """Plan and judge the cases of one row, and count agreement of status and referee, by name."""
+    """Plan and judge the cases of one row; count how status and referee agree, by name."""
     cases, planner = row.cases(num, seed), row.planner
     began = time.perf_counter()
     plans = jax.device_get(pj.plan(planner, cases))
@@ -241,7 +240,6 @@ def _counts(found: Mapping[str, Any]) -> str:
 
 
 def main() -> None:
-    """Parse the arguments, and print the table of the requested rows."""
     parser = argument_parser("status_against_referee", __doc__, num=200, seed=0)
     parser.add_argument(
         "--rows", default=",".join(ROWS), help="rows, comma-separated; default: all"

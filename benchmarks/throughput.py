@@ -4,17 +4,17 @@
     python -m benchmarks.throughput [--tasks hit,catch] [--out DIR]
 
 The table has one row for each batch size. It lists the first call with its compile time, the
-fastest and the median of later calls, the share of plans that the referee accepts, and the cost
-above a longer search (`cost_gap`). Before later calls are timed, calls run for half a second, so
-that the device reaches its highest clock frequency. For several devices there is also the
-efficiency relative to one device, and the time that each device alone takes for its part of the
-batch.
+fastest and the median of later calls, the share of plans that the referee (an independent check in
+float64) accepts, and the relative cost above a longer search (`cost_gap`). Before later calls are
+timed, calls run for half a second, so that the device reaches its highest clock frequency. For
+several devices there is also the efficiency relative to one device, and the time that each device
+alone takes for its part of the batch.
 
 A time is for a whole call of `plan`, by any planner of any task, with the benchmark options of the
-task specification: for example, catches use the greedy order. It includes tables of the balls'
-flights, initial guesses, all rounds of the search, and the check of the limits, from arrays on the
-devices to arrays on the devices. Each device holds an equal part of the batch. The referee is not
-part of the time.
+task specification. For example, catches use the greedy order: the target that can be caught first
+comes first. The time includes tables of the balls' flights, initial guesses, all searches, and the
+check of the limits, from arrays on the devices to arrays on the devices. Each device holds an equal
+part of the batch. The referee is not part of the time.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ from planner_jax.planning.decided import DecidedPlanner
 from planner_jax.planning.plan import plan
 from planner_jax.runs.timing import CompileClock
 
-_WARM_UP = 0.5  # [s] Duration of calls before the measurement, so that the device's clock rises.
+_WARM_UP = 0.5  # [s] Time of calls before the measurement, in which the device's clock rises.
 _JUDGED = 300_000  # Maximum number of plans of a batch that the referee judges.
 
 
@@ -65,7 +65,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
     """Measure plans per second, and print a row for each batch size.
 
     Raises:
-        ArgumentError: a number of iterations is set for a planner that does not search in rounds.
+        ArgumentError: a number of iterations is set for a planner that does not minimise a cost.
         UnknownName: there is no such task, planner or suite.
     """
     devices, iterations = settings.devices, settings.iterations
@@ -103,7 +103,7 @@ def measure(bench: Bench, settings: ThroughputSettings) -> None:
 
 
 def _with_iterations(planner: Any, iterations: int) -> Any:
-    """Return a copy of the planner with another number of iterations in its first round."""
+    """Return a copy of the planner with another number of iterations in its first search."""
     if isinstance(planner, DecidedPlanner):
         return dataclasses.replace(planner, planner=_with_iterations(planner.planner, iterations))
     first, *rest = planner.rounds
@@ -147,7 +147,7 @@ def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
         call()
     seconds, plans = [], None
     for _ in range(repeat):
-        del plans  # The plans of two calls at once would raise the measured peak of memory.
+        del plans  # Plans of two calls at once would raise the measured peak of memory.
         took, plans = call()
         seconds.append(took)
     return _Timed(first, clock.seconds, seconds, plans)
@@ -193,7 +193,7 @@ def _add_row(
 
 
 def _compare_devices(planner: Any, host: Any, devices: list, repeat: int, timed: _Timed) -> str:
-    """Compare the time of several devices with one device, and return text.
+    """Compare the time of several devices with one device, and return the result as text.
 
     The text has the time of one device for the whole batch, the efficiency of all devices, and the
     time of each device alone for its part of the batch.
@@ -242,7 +242,6 @@ def _compare_with_cpu(card: Task, planner: Any, cases: Any, devices: list) -> st
 
 
 def main() -> None:
-    """Parse the arguments, and measure each requested task with the default batch sizes."""
     parser = argument_parser("throughput", __doc__, seed=0)
     parser.add_argument(
         "--tasks", default="hit,catch", help="tasks, comma-separated (default: hit,catch)"

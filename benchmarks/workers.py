@@ -18,8 +18,9 @@ cores, as a usual sweep does. On GPUs use --num 10000000 --batch 65536 or more. 
 then needs 3 kB per hit and GPU.
 
 Plans per second are the slope of the number of written chunks over time. The first few chunks,
-during which the workers start, are left out. The cost gap is computed for a thousand of the hits.
-The benchmark runs on Linux only, because processes are bound to cores.
+during which the workers start, are left out. A thousand of the planned hits are compared with a
+longer search, to print how far their costs are from the optimum. The benchmark runs on Linux only,
+because it binds processes to cores.
 """
 
 import os
@@ -41,7 +42,7 @@ from planner_jax.benchmarks.run import argument_parser, begin, parse_names
 from planner_jax.runs.run_folder import RunFolder
 from planner_jax.sweep.cluster import WORKERS_OF_GPU
 
-_FIRST = 9  # At least this number of first chunks of a sweep is left out of its plans per second.
+_FIRST = 9  # Least number of first chunks that the measurement of plans per second leaves out.
 _GPUS, _PREALLOCATE = "CUDA_VISIBLE_DEVICES", "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 
@@ -58,7 +59,7 @@ class _Share(NamedTuple):
 
 
 class _Sweep:
-    """Sweep of hits in a separate process, on some cores and GPUs; records its chunks' times."""
+    """Sweep of hits in a separate process; records when each of its chunks was written."""
 
     def __init__(self, out: Path, num: int, batch: int, share: _Share, ray: bool):
         self._out, self._batch, self._first, self._times = out, batch, share.first, list[float]()
@@ -68,7 +69,7 @@ class _Sweep:
         environ = {**os.environ, "NPROC": str(len(share.cores))}
         if share.gpus:
             environ[_GPUS] = ",".join(share.gpus)
-            del environ[_PREALLOCATE]  # This variable is meant for the benchmark's process only.
+            del environ[_PREALLOCATE]  # Only the benchmark needs this setting.
         with open(self._errors, "wb") as errors:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "planner_jax", "sweep", *what],
@@ -102,10 +103,10 @@ class _Sweep:
 
 
 def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
-    """Return the four set-ups by name.
+    """Return the four set-ups of sweeps by name.
 
-    A set-up is the list of machine parts on which sweeps run at the same time, one sweep on each
-    part, and whether the sweeps use Ray.
+    A set-up is a list of machine parts, and whether the sweeps use Ray. One sweep runs on each
+    part, all sweeps at the same time.
     """
     whole, num = _Share(cores, gpus), len(gpus or cores)
     if not gpus:
@@ -131,9 +132,9 @@ def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Sha
 
 
 def _core_order(core: int) -> tuple[int, ...]:
-    """Return a sort key of a core, by which cores of the same processor are neighbours.
+    """Return a sort key of a core: processor, physical core, and number.
 
-    Hardware threads of the same physical core are neighbours, too.
+    Sorted by it, cores of the same processor and threads of the same physical core are neighbours.
     """
     topology = Path(f"/sys/devices/system/cpu/cpu{core}/topology")
     try:
@@ -152,7 +153,6 @@ def _list_gpus() -> list[str]:
 
 
 def main() -> None:
-    """Run the requested set-ups in turns, and print their plans per second."""
     parser = argument_parser("workers", __doc__, num=60000, batch=2000, turns=3)
     known = "1,2,3,4"
     parser.add_argument("--ways", default=known, help=f"set-ups, by number; default: {known}")

@@ -5,21 +5,22 @@ The program plans catches of one ball. It minimises the objective of
 another, without a heap allocation. It shares no code with the library. `benchmarks.catch_reference`
 runs it to compare its speed with the planners' speed.
 
-The settings of each search were tuned by a random search of 500 to 1,500 steps on the 240 throws of
-both published sets. The aim was the least time with at least 97 % of the costs within 1e-3 of the
-published cost. These settings were varied:
+The settings of each kind of search were tuned by a random search of 500 to 1,500 steps on the 240
+throws of both published sets. The aim was the least time with at least 97 % of the costs within
+1e-3 (relative) of the published cost. These settings were varied:
 * the memory of L-BFGS from 8 to 64 pairs, or BFGS with a dense matrix;
-* the stopping rule: the cost must change by less than `delta` (1e-7 to 1e-5) over `past` (2 to 20)
-  iterations;
+* the stopping rule: the search ends if the cost changes by less than the relative amount `delta`
+  (1e-7 to 1e-5) over `past` (2 to 20) iterations;
 * the line search: both constants of the weak Wolfe conditions, bisection or cubic interpolation;
-* the variables: a scale for each kind of variable, and either the published variables or variables
-  relative to the smoothest trajectory and to the ball.
+* the variables: a scale for each kind of variable, and either the published variables (waypoints
+  and end position) or relative variables (offsets from the smoothest trajectory, and the net's
+  position relative to the ball).
 
 The table lists plans per CPU second on one core of an AMD EPYC (Zen 3 or later). Other programs ran
 on the same machine, so differences below 10 % are not significant. In brackets are the percentage
 of costs within 1e-3 of the published cost, and the mean number of iterations. As a check, 960 other
-throws were made by shifting these throws by some 0.1 m and 0.15 m/s. The settings in `SEARCHES` end
-within 1e-3 of the cost of a long search on 98 to 100 % of them.
+throws were made by shifting these throws by some 0.1 m and 0.15 m/s. With the settings in
+`SEARCHES`, 98 to 100 % of these costs are within 1e-3 of the cost of a long search.
 
 | variables | search | `past`, `delta` | easy set | hard set |
 |---|---|---|---|---|
@@ -50,15 +51,15 @@ COMPILERS = ("g++", "c++")
 FLAGS = ("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math")
 FLAGS += ("-fno-signed-zeros", "-fassociative-math", "-freciprocal-math", "-Wno-psabi")
 NO_COMPILER = f"C++: not measured, there is no compiler ({' or '.join(COMPILERS)})"
-AS_GOOD = 1e-3  # A relative cost above the published cost up to this value counts as equal.
+AS_GOOD = 1e-3  # A cost counts as equal to the published cost up to this relative excess.
 
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
     """Settings of the C++ program's search. The fields are its command-line arguments."""
 
-    # Whether the variables are whitened waypoint offsets from the smoothest trajectory and the
-    # net's position relative to the ball. If not, they are waypoints q and the end position p(T).
+    # True: the variables are scaled offsets of the waypoints from the smoothest trajectory, and the
+    # net's position relative to the ball. False: they are the waypoints and the end position.
     relative: bool = False
     memory: int = 48  # number of pairs that L-BFGS stores, at most 64; 0 for BFGS
     past: int = 10  # iterations over which the cost is compared
@@ -66,7 +67,8 @@ class Settings:
     decrease: float = 1e-4  # constant of sufficient decrease in the weak Wolfe conditions
     curvature: float = 0.9  # constant of the slope in the weak Wolfe conditions
     interpolate: bool = True  # line search by cubic interpolation, else by bisection
-    # Scales of the variables: waypoints or offsets, log T, end position, velocity, acceleration.
+    # Scales of the variables: waypoints or their offsets, the logarithm of the duration, and the
+    # position, velocity and acceleration at the end.
     scale_q: float = 1.0
     scale_t: float = 1.0
     scale_p: float = 1.0
@@ -106,11 +108,10 @@ class Figures:
     share_within: float  # share of cases whose cost is at most `AS_GOOD` above the published one
     median_gap: float  # median over cases of the relative cost above the published cost
     mean_iterations: float
-    success_rate: float  # by the published test: limits at 200 samples with a tolerance of 5 %
+    success_rate: float  # share of plans that keep the limits up to 5 % at 200 samples
     guess_error: float  # largest relative error of the cost at the initial guess
 
     def __str__(self) -> str:
-        """Format speed, cost gap, iterations and success in one line of text."""
         return (
             f"{self.plans_per_second:.0f} plans/s, gap <= {AS_GOOD:.0e} on "
             f"{100 * self.share_within:.1f} %, median {self.median_gap:.1e}, "
@@ -136,7 +137,7 @@ def measure(program: Path, table: Path, settings: Settings, repeats: int = 5) ->
         program: path of the compiled program, from `build`.
         table: CSV file with the columns of tests/data/catch_paper.csv.
         settings: settings of the search.
-        repeats: number of times that all cases are planned; the fastest time counts.
+        repeats: number of times that all throws are planned; the fastest time counts.
     """
     with table.open(newline="", encoding="utf-8") as file:
         published = list(csv.DictReader(file))

@@ -1,4 +1,5 @@
-"""A slow, independent solver of hits, by direct transcription with IPOPT.
+"""A slow, independent solver of hits: a nonlinear program for IPOPT by direct transcription.
 
-It tells infeasible cases from failures of a planner. `benchmarks.oracle_hit` runs it.
+It shows whether a case that a planner does not solve is infeasible. `benchmarks.oracle_hit` runs
+it.
 """

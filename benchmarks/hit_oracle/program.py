@@ -1,9 +1,10 @@
 """The nonlinear program that searches a feasible hit, for CasADi and IPOPT.
 
-The quadrotor's snap is constant on each piece of the trajectory. The impact is described by
-equality constraints, and limits by inequalities at samples. The program is built once with
-symbols, and the numbers of a case are its parameters. It shares no code with the planners.
-Positions are in the world frame, with z up, in SI units.
+A quadrotor hits a ball with a racket such that it lands at a target. The quadrotor's snap is
+constant on each piece of its trajectory. Equality constraints describe the impact, and inequalities
+at samples the limits. The program is built once with symbols, and the numbers of a case are its
+parameters. It shares no code with the planners. Positions are in the world frame, with z up, in SI
+units.
 """
 
 import dataclasses
@@ -21,15 +22,15 @@ ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extr
 
 # Degree of the polynomial that approximates the ball's path until it lands, to 1e-7 m.
 BALL_DEGREE = 10
-# Typical sizes of position [m], velocity, acceleration and jerk, and of snap [m/s^4]. The variables
-# of the program are divided by these numbers.
+# Typical sizes of position [m], velocity [m/s], acceleration [m/s^2] and jerk [m/s^3], and of snap
+# [m/s^4]. The variables of the program are divided by these numbers.
 STATE_SCALE, SNAP_SCALE = np.array([1.0, 3.0, 10.0, 60.0]), 600.0
-# [m/s^2] Least thrust. With less thrust the attitude could turn too far between two samples.
+# [m/s^2] Least thrust per mass. With less thrust the attitude could turn too far between samples.
 LEAST_THRUST = 1.0
 GUESSED_EXCESS = 0.5  # Initial guess of the greatest relative excess over a limit.
 
-# Names of the program's parameters, and of how many numbers each consists. They describe a case, in
-# SI units.
+# Name of each parameter of the program -> number of its values. Parameters describe a case, in SI
+# units.
 PARAMETERS = {
     "ball": 3 * (BALL_DEGREE + 1),  # position = sum_k ball[k] (t / landing_time)^k
     "landing_time": 1,
@@ -47,8 +48,8 @@ PARAMETERS = {
     "max_apex": 1,
 }
 
-# Options of IPOPT. With the adaptive barrier strategy it converges from poor initial guesses, and
-# also from a solution with fewer pieces.
+# Options of IPOPT. With the adaptive strategy for the barrier parameter, IPOPT also converges from
+# poor initial guesses and from a solution of the program with fewer pieces.
 OPTIONS = {
     "max_iter": 250,
     "max_cpu_time": 10.0,
@@ -60,7 +61,7 @@ OPTIONS = {
 
 
 def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
-    """Return the values of `PARAMETERS` for one case, which has no batch axis.
+    """Return the parameters `PARAMETERS` of one case, which has no batch axis.
 
     The ball's path with drag is integrated numerically and approximated by a polynomial.
     """
@@ -90,13 +91,13 @@ def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
 
 
 def unpack(vector, sizes: dict[str, int]) -> dict:
-    """Split a vector, numeric or symbolic, into parts by name; `sizes` has the part lengths."""
+    """Split a vector, numeric or symbolic, into parts; `sizes` has the length of each part."""
     ends = np.cumsum([0, *sizes.values()]).tolist()
     return {name: vector[ends[i] : ends[i + 1]] for i, name in enumerate(sizes)}
 
 
 def advance(motion: list, time) -> list:
-    """Return position and derivatives `time` [s] later; the last derivative stays constant."""
+    """Return position and derivatives `time` [s] later; the highest derivative is constant."""
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])
@@ -105,11 +106,9 @@ def advance(motion: list, time) -> list:
 
 
 def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
-    """Compute the impact of a hit from its time and from the ball's flight time to the target.
+    """Compute the impact from its time and from the ball's flight time to the target.
 
-    The racket's normal is parallel to the change of the ball's velocity. Returns the ball's
-    position, its velocities before and after the impact, the racket's unit normal, and the length
-    of the velocity change [m/s].
+    The racket's normal is parallel to the change of the ball's velocity.
 
     Args:
         case: parameters, numeric or symbolic.
@@ -118,6 +117,10 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
         flight_time: [s], from the impact to the target, under gravity alone.
         up: (3,) unit vector along z.
         norm: function that returns the length of a vector.
+
+    Returns:
+        The ball's position, its velocities before and after the impact, the racket's unit normal,
+            and the length of the velocity change [m/s].
     """
     share = impact_time / case["landing_time"]
     pos = sum(c * share**k for k, c in enumerate(ball))
@@ -130,9 +133,10 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
 def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
     """Return the limits at one sample as expressions that must be <= 0, and the body z axis.
 
-    `allowance` is 1 + the permitted relative excess. The body rate (Hopf fibration, zero heading)
-    is a quotient with the squared thrust as denominator. Its limit is multiplied by the squared
-    thrust, because the solver diverges for the quotient if the thrust is small.
+    `motion` has position to snap, and `allowance` is 1 + the permitted relative excess. The body
+    rate is that of zero heading in the Hopf fibration. It is a quotient with the squared thrust as
+    denominator. The limit on it is multiplied by the squared thrust, because with the quotient
+    IPOPT diverges if the thrust is small.
     """
     pos, vel, acc, jerk = motion[:4]
     gravity = case["gravity"]
@@ -156,7 +160,8 @@ def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
 def impact_limits(case: dict, unknown: dict, end: list, impact_time) -> tuple[list, list]:
     """Return the constraints at the impact: expressions that must be 0, and that must be <= 0.
 
-    `end` holds the quadrotor's position, velocity and acceleration at the impact.
+    `unknown` has the program's unknowns by name. `end` holds the quadrotor's position, velocity and
+    acceleration at the impact.
     """
     ball = ca.horzsplit(ca.reshape(case["ball"], 3, BALL_DEGREE + 1))
     up, allowance = ca.DM([0.0, 0.0, 1.0]), 1.0 + unknown["excess"]
@@ -186,12 +191,13 @@ class Program:
 
     The unknowns are the durations of the pieces, the states at their ends, their snaps, the ball's
     flight time after the impact, the thrust at the impact [g], and the excess. The excess is the
-    greatest relative amount by which any limit is exceeded. It is minimised.
+    greatest relative amount by which any limit is exceeded. IPOPT minimises it.
 
     Args:
         pieces: number of pieces of the trajectory.
         samples: number of samples of a piece at which limits are checked, including its end.
-        floor: lower bound of the excess, negative for solutions with a margin to the limits.
+        floor: lower bound of the excess; a negative bound gives solutions with a margin to the
+            limits.
     """
 
     def __init__(self, pieces: int, samples: int, floor: float):
@@ -231,8 +237,8 @@ class Program:
             duration = unknown["durations"][k]
             motion = [*self._motion(states[:, k]), SNAP_SCALE * unknown["snaps"][3 * k : 3 * k + 3]]
             allowance = 1.0 + unknown["excess"] - case["margins"][k]
-            # The body z axis may turn between two samples by no more than the body rate permits.
-            # Otherwise the quadrotor could flip over between samples without exceeding a limit.
+            # Between two samples the body z axis must not turn farther than the limit of the body
+            # rate permits. Otherwise the quadrotor could flip over between samples.
             turn = case["body_rate"] * allowance * duration / samples
             ends = self._motion(states[:, k + 1])
             inside = [advance(motion, duration * i / samples) for i in range(1, samples)]
@@ -260,9 +266,9 @@ class Program:
         Args:
             case: values of `PARAMETERS`.
             guess: initial guess of the unknowns.
-            margins: (M,), relative amounts by which the limits on each piece are tightened. Then
-                the durations keep their initial values, so that a margin that was computed for one
-                part of the trajectory applies to this part.
+            margins: (M,), relative amounts by which the limits on each of M pieces are tightened.
+                With margins the durations keep their initial values, so that each piece remains the
+                same part of the trajectory.
         """
         bounds = dict(self._bounds)
         if margins is not None:
@@ -273,7 +279,7 @@ class Program:
         return np.asarray(found["x"]).ravel(), self._solver.stats()["success"]
 
     def guess(self, case: dict, start: tuple) -> np.ndarray:
-        """Return unknowns that follow a polynomial of degree 7 from the initial state to an impact.
+        """Return an initial guess: a polynomial of degree 7 from the initial state to an impact.
 
         `start` defines the impact: its time over the ball's landing time, the ball's flight time
         [s] after the impact, and the thrust at the impact [g].

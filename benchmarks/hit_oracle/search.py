@@ -1,8 +1,9 @@
 """Decide whether a hit is feasible, by searches from many starting points.
 
-Each search solves the nonlinear program with few pieces. If the limits nearly hold, it solves the
-program with halved pieces, and tightens limits that are exceeded between samples. A hit counts as
-found only if the referee accepts it. `benchmarks.oracle_hit` calls this module.
+Each search solves the nonlinear program of `program.py` with few pieces. If the limits nearly hold,
+it solves the program with twice as many pieces, and tightens limits that are exceeded between
+samples. A hit counts as found only if the referee, an independent check in float64, accepts it.
+`benchmarks.oracle_hit` calls this module.
 """
 
 import dataclasses
@@ -24,22 +25,22 @@ from planner_jax.trajectory.polynomial import PiecewisePolynomial
 
 # An excess is the greatest relative amount by which a trajectory exceeds any limit.
 TOLERANCE = 1e-3  # The referee accepts an excess up to this value.
-COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Pieces of the coarse program, and samples of each piece.
-FINE_SAMPLES = 4  # Samples of each piece of the fine program, including its end.
-COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess in both programs.
-# A coarse solution with a larger excess is not refined, because halving the pieces reduces the
-# excess by 0.03 at most.
+COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Number of pieces, and of samples of each piece, at first.
+FINE_SAMPLES = 4  # Number of samples of each piece after the pieces were halved.
+COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before and after halving.
+# The pieces of a solution with a larger excess are not halved, because this reduces the excess by
+# 0.03 at most.
 REFINED_BELOW = 0.06
-# A coarse solution is refined only if its excess is at least this much below the excess of every
-# coarse solution whose refinement has failed.
+# The pieces of a solution are halved only if its excess is at least this much below the excess of
+# every solution for which halving has failed.
 NEW_BELOW = 0.001
-# The search of a case ends early if the least excess of HOPELESS_STARTS starts is above this value.
+# The search of a case ends after HOPELESS_STARTS starting points if all excesses are greater.
 HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5  # Maximum number of times that limits of a solution are tightened.
 INFEASIBLE_ABOVE = 0.01  # A case counts as infeasible if its least excess is above this value.
 
 # Starting points: impact time over the ball's landing time, the ball's flight time after the impact
-# [s], and thrust at the impact [g]. The fifth is a smash of a ball above the least permitted apex.
+# [s], and thrust at the impact [g]. The fifth is a smash, after which the ball flies fast.
 STARTS = (
     (0.93, 1.6, 1.2),
     (0.80, 1.3, 1.0),
@@ -56,7 +57,7 @@ START_RANGES = ((0.5, 0.98), (0.6, 2.3), (0.8, 2.3))
 
 
 def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) -> np.ndarray:
-    """Return for each piece (M,) the largest ratio of a quantity to its limit.
+    """Return for each of M pieces (M,) the largest ratio of a quantity to its limit.
 
     The quantities are speed, acceleration and body rate. They are evaluated at 41 times of each
     piece, more densely than in the program.
@@ -76,7 +77,7 @@ def worst_ratios(motion: list[np.ndarray], durations: np.ndarray, values: dict) 
 
 @dataclasses.dataclass
 class Finding:
-    """Result of the oracle for one case: whether a hit exists, and the best trajectory."""
+    """Result of the search for one case: whether a hit exists, and the best trajectory."""
 
     feasible: bool = False  # whether the referee accepts a hit
     least_excess: float = math.inf  # least relative excess over the limits, of converged programs
@@ -108,7 +109,7 @@ class Finding:
 
 
 class Oracle:
-    """Search for a feasible hit, with a coarse program and one with twice as many pieces."""
+    """Search for a feasible hit, first with `COARSE_PIECES` pieces, then with twice as many."""
 
     def __init__(self):
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
@@ -143,10 +144,11 @@ class Oracle:
         return finding
 
     def _refine(self, case: HitCase, values: dict, coarse: np.ndarray, finding: Finding) -> float:
-        """Refine a coarse solution, and store the result in `finding`; return the final excess.
+        """Solve with halved pieces from the solution `coarse`, store the result, return its excess.
 
-        The pieces are halved. Then the limits of pieces that exceed them between samples are
-        tightened repeatedly, until the referee accepts the hit.
+        Limits of pieces that exceed them between samples are tightened, and the program is solved
+        again, until the referee (an independent check) accepts the hit, but at most
+        `MOST_TIGHTENINGS` times.
         """
         guess, margins = self.coarse.halve(values, coarse), np.zeros(self.fine.pieces)
         unknowns, converged = self.fine.solve(values, guess)
@@ -172,7 +174,10 @@ class Oracle:
 
 
 def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> bool:
-    """Return whether the referee accepts a trajectory, (M, 5, 3) and (M,) [s], as a hit."""
+    """Return whether the referee, an independent check in float64, accepts a trajectory as a hit.
+
+    `coeffs` (M, 5, 3) and `durations` (M,) [s] define a polynomial with M pieces.
+    """
     none: Any = np.zeros(1)
     path: Any = coeffs[None], durations[None]
     stroke = Stroke(
@@ -205,12 +210,12 @@ def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
 
 @functools.cache
 def oracle() -> Oracle:
-    """Return the oracle of this process, which is built at the first call, in about a second."""
+    """Return the solver of this process, which the first call builds in about a second."""
     return Oracle()
 
 
 def find_hit(case: HitCase, starts) -> Finding:
-    """Search for a feasible hit in one case, with the oracle of this process."""
+    """Search for a feasible hit in one case, with the solver of this process."""
     return oracle().find(case, starts)
 
 

@@ -1,7 +1,8 @@
 """The coefficients of one minimum-snap trajectory, with the chain rule through its samples.
 
-`program.py` builds IPOPT's nonlinear program on these functions: they convert derivatives by the
-samples of a trajectory to derivatives by its coefficients, and these to derivatives by x.
+`program.py` builds IPOPT's nonlinear program on these functions. They convert derivatives with
+respect to samples of a trajectory to derivatives with respect to its coefficients, and then to
+derivatives with respect to the decision variables x.
 """
 
 import importlib
@@ -12,18 +13,20 @@ import numpy as np
 ca: Any = importlib.import_module("casadi")  # CasADi is installed with the extra `oracle`.
 
 ORDERS = 4  # Number of boundary conditions at each end: position, velocity, acceleration and jerk.
-# Components of a sample as (order of the derivative, axis): height, velocity, acceleration, jerk.
+# The ten components of a sample as (order of the derivative, axis): height, then velocity,
+# acceleration and jerk along x, y and z.
 PLACES = ((0, 2), *((order, axis) for order in (1, 2, 3) for axis in range(3)))
 Places = list[tuple[int, int]]  # indices (row, column) of the entries of a sparse matrix
 
 
 class Basis:
-    """Linear maps from the coefficients of a trajectory, (C, 3), to its samples and to x.
+    """Linear maps from the C coefficients per axis of a trajectory to its samples and to x.
 
-    Coefficients are ordered by axis; for each axis the boundary conditions come before the
-    offsets. In x the offsets are ordered by waypoint. Coefficients that are variables of x, the
-    offsets, are called outer. Boundary conditions, which depend on x through the function of
-    the end, are called inner, and h, the mean duration of a piece, follows them.
+    The coefficients of an axis are the boundary conditions (position to jerk at both ends) and then
+    the offsets of the waypoints from the smoothest trajectory. IPOPT's decision variables x contain
+    the offsets, ordered by waypoint, and a few variables of the trajectory's end, which determine
+    the boundary conditions and the mean duration h of a piece. Offsets are called outer
+    coefficients, boundary conditions and h inner coefficients.
 
     Args:
         planner: the `ExactHit` or `ExactCatch` whose settings and constant matrices are used.
@@ -41,26 +44,34 @@ class Basis:
         self.scale = ca.DM(planner.scale).T
 
     def join(self, outward: Any, offsets: Any) -> tuple[Any, Any]:
-        """Return the trajectory's coefficients (C, 3), and the mean duration h of a piece [s]."""
+        """Return the C coefficients per axis (C, 3), and the mean duration h of a piece [s]."""
         rows = 2 * ORDERS
         columns = ca.vertcat(ca.reshape(outward[: 3 * rows], rows, 3), offsets)
         return columns, outward[3 * rows]
 
     def sample(self, columns: Any) -> Any:
-        """Return the components (10, K) of K samples in units of h, from coefficients (C, 3)."""
+        """Return the components `PLACES` (10, K) of K samples, from coefficients (C, 3).
+
+        The unit of time is the mean duration of a piece.
+        """
         sampled = [matrix @ columns for matrix in self._matrices]
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
 
     def to_x(self, by_outer: Any, by_natural: Any) -> Any:
-        """Convert derivatives by offsets, ordered by axis, and by the end's variables.
+        """Convert derivatives of R quantities to derivatives by the n variables x, (R, n).
 
-        Returns derivatives by x, (R, n).
+        The arguments are derivatives by the offsets, ordered by axis, and by the variables of the
+        end.
         """
         wide = ca.horzcat(by_outer[:, self.place], by_natural)
         return wide * ca.repmat(self.scale, wide.shape[0], 1)
 
     def limit_slopes(self, value: int, slopes: Any, places: Places) -> tuple[Any, Any]:
-        """Return derivatives of one limit at K samples, by coefficients (K, 3 C) and h (K, 1)."""
+        """Return derivatives of one limit at K samples with respect to coefficients and h.
+
+        The shapes are (K, 3 C) for C coefficients per axis, and (K, 1) for the mean duration h of a
+        piece.
+        """
         parts = [ca.MX.zeros(self._num_samples, self.num)] * 3
         by_h = ca.MX.zeros(self._num_samples, 1)
         for k, (i, j) in enumerate(places):
@@ -73,19 +84,22 @@ class Basis:
         return ca.horzcat(*parts), by_h
 
     def gradient(self, of_samples: Any) -> Any:
-        """Convert derivatives by samples (11, K) to derivatives by coefficients (1, 3 C)."""
+        """Convert derivatives by K samples (11, K) to derivatives by the coefficients (1, 3 C)."""
         parts = [ca.MX.zeros(1, self.num)] * 3
         for i, (order, axis) in enumerate(PLACES):
             parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
         return ca.horzcat(*parts)
 
     def hessian(self, bends: Any, places: Places) -> Any:
-        """Convert the samples' Hessians to one by coefficients and h, (3 C + 1, 3 C + 1)."""
+        """Convert the samples' Hessians to one Hessian (3 C + 1, 3 C + 1).
+
+        Its variables are the C coefficients of each axis, and the mean duration h of a piece.
+        """
         last, num = len(PLACES), self.num
         factors = {place: bends[k, :].T for k, place in enumerate(places)}
         sizes = (num, num, num, 1)
         blocks = [[ca.MX.zeros(a, b) for b in sizes] for a in sizes]
-        # The loops are ordered such that each product with a sample matrix is computed only once.
+        # In this order of the loops each product with a sample matrix is computed only once.
         for i, (order, axis) in enumerate(PLACES):
             inside: dict[int, Any] = {}
             for j, (other, of) in enumerate(PLACES):

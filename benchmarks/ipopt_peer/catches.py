@@ -9,9 +9,9 @@ from typing import Any
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 from planner_jax.core.protocol import FEASIBILITY_TOLERANCE
 
-RIM = 0.9  # A planned catch is within this share of the net's radius from its centre.
+RIM = 0.9  # Greatest distance of a planned catch from the net's centre, over the net's radius.
 
-# Names of a catch's parameters in SI units, and of how many numbers each consists.
+# Name of each parameter of a catch, in SI units -> number of its values.
 SIZES = {
     "gravity": 1,
     "speed": 1,
@@ -32,7 +32,7 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Collect the parameters `SIZES` of one case by name, from the planner's prepared data.
+    """Return the parameters of one case, as named in `SIZES`, from the planner's prepared data.
 
     `context` is the result of the planner's `prepare` for a case with one ball, with NumPy leaves.
     """
@@ -60,7 +60,8 @@ def make_problem(planner: Any) -> Problem:
 def ball_at(time: Any, params: dict) -> tuple[Any, Any]:
     """Return a ball's position and velocity at a time, with linear drag [Yu2023catch, eq. 9].
 
-    For small drag times time, a power series replaces the closed form, which would be inaccurate.
+    If the product of drag coefficient and time is small, a power series replaces the closed form,
+    which would be inaccurate.
     """
     x = params["ball_drag"] * time
     small = ca.fabs(x) < 0.5
@@ -76,9 +77,10 @@ def ball_at(time: Any, params: dict) -> tuple[Any, Any]:
 def ends(natural: Any, params: dict, time_weight: float) -> tuple[Any, Any, list, Any]:
     """Compute the end of a trajectory at which the ball is caught, from the end's variables.
 
-    The variables `natural` are log T, the ball's position in the net (2), and velocity,
-    acceleration and jerk of the quadrotor (3 each). Returns the state at the end, the duration, the
-    relative excesses over the limits of the catch, and the cost, as specified by `Problem.ends`.
+    The variables `natural` are the logarithm of the duration, the ball's position in the net (2),
+    and velocity, acceleration and jerk of the quadrotor (3 each). Returns the state at the end, the
+    duration, the relative excesses over the limits of the catch, and the cost, as specified by
+    `Problem.ends`.
     """
     time, place = ca.exp(natural[0]), natural[1:3]
     pos, vel = ball_at(time, params)

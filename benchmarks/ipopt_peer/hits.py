@@ -9,7 +9,7 @@ import numpy as np
 
 from planner_jax.benchmarks.ipopt_peer.program import Problem, body_axes, ca, rate_squared
 
-# Names of a hit's parameters in SI units, and of how many numbers each consists.
+# Name of each parameter of a hit, in SI units -> number of its values.
 SIZES = {
     "gravity": 1,
     "speed": 1,
@@ -28,7 +28,7 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Collect the parameters `SIZES` of one case by name, from the planner's prepared data.
+    """Return the parameters of one case, as named in `SIZES`, from the planner's prepared data.
 
     `context` is the result of the planner's `prepare` for the case, with NumPy leaves. It has a
     table of the ball's path.
@@ -55,9 +55,10 @@ def make_problem(planner: Any) -> Problem:
 
 
 def keys_kernel(distance: Any) -> Any:
-    """Return the weight of a table node in cubic convolution (Keys, a = -1/2) [Yu2023bat, eq. 10b].
+    """Return the weight of a table node in cubic convolution by Keys [Yu2023bat, eq. 10b].
 
-    `distance` is from the node to the interpolated point, in units of the node spacing.
+    The kernel's parameter is a = -1/2. `distance` is from the node to the interpolated point, in
+    units of the node spacing.
     """
     u = ca.fabs(distance)
     near = (1.5 * u - 2.5) * u * u + 1.0
@@ -77,10 +78,10 @@ def ball_at(time: Any, params: dict, nodes: int) -> tuple[Any, Any]:
 def ends(natural: Any, params: dict, nodes: int) -> tuple[Any, Any, list, Any]:
     """Compute the end of a trajectory at which the ball is hit, from the end's variables.
 
-    The variables `natural` are log T, the logarithms of the ball's flight time after the impact and
-    of the thrust, two speeds of the racket in its plane, and the jerk (3). Returns the state at
-    the end, the duration, the relative excesses over the limits of the hit, and the cost (zero), as
-    specified by `Problem.ends`.
+    The variables `natural` are the logarithms of the duration, of the ball's flight time after the
+    impact and of the thrust, two speeds of the racket in its plane, and the jerk (3). Returns the
+    state at the end, the duration, the relative excesses over the limits of the hit, and the cost
+    (zero), as specified by `Problem.ends`.
     """
     time, flight, thrust = (ca.exp(natural[k]) for k in range(3))
     gravity, up = params["gravity"], ca.DM([0.0, 0.0, 1.0])

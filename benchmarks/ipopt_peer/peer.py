@@ -16,16 +16,16 @@ from planner_jax.benchmarks.ipopt_peer.program import COMPILER, Program, ca
 from planner_jax.core.protocol import take
 from planner_jax.cost.along import BETWEEN_NODES
 
-# Options of the linear solver MUMPS: its defaults, or neither scaling nor an expensive reordering,
-# because the matrices are small.
+# Options of the linear solver MUMPS: its defaults; or no scaling and a cheap reordering, because
+# the matrices are small.
 _USUAL: dict[str, Any] = {}
 _PLAIN = {"mumps_scaling": 0, "mumps_permuting_scaling": 0, "mumps_pivot_order": 0}
 _ADAPTIVE = {"mu_strategy": "adaptive"}
 # Options of IPOPT for initial guesses that are close to the optimum.
 _NEAR = {"mu_init": 1e-3, "bound_push": 1e-3, "slack_bound_push": 1e-3}
 _QUASI_NEWTON = {"hessian_approximation": "limited-memory", "max_iter": 100}
-# Form of the problem -> settings to try: (tolerance, options of IPOPT, whether the functions are
-# compiled C code).
+# For limits as constraints and for limits as penalties, the settings to try: (tolerance, options of
+# IPOPT, whether the functions are compiled C code).
 TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     "limits": (
         (1e-6, _PLAIN, True),
@@ -51,8 +51,8 @@ TRIED: dict[str, tuple[tuple[float, dict[str, Any], bool], ...]] = {
     ),
 }
 MOST_STEPS = 300  # Maximum number of IPOPT's iterations.
-# A setting is good enough if its objective exceeds the least objective of all settings by at most
-# this relative amount, in nine of ten cases.
+# A setting of IPOPT is accepted if in nine of ten cases its objective exceeds the least objective
+# of all settings by at most this relative amount.
 AS_GOOD = 1e-3
 
 
@@ -60,8 +60,8 @@ AS_GOOD = 1e-3
 class Batch:
     """B cases for IPOPT: their parameters and initial guesses."""
 
-    params: np.ndarray  # (B, P), parameters of the cases
-    starts: np.ndarray  # (B, n), initial guesses of the decision variables
+    params: np.ndarray  # (B, P), the P parameters of each case
+    starts: np.ndarray  # (B, n), initial guesses of the n decision variables
 
 
 @dataclasses.dataclass
@@ -76,7 +76,7 @@ class Solutions:
 
 
 def stack_params(module: ModuleType, planner: Any, contexts: Any) -> np.ndarray:
-    """Return the parameters (B, P) of IPOPT's problems for a batch of cases.
+    """Return the P parameters of IPOPT's problem for each of B cases, (B, P).
 
     `contexts` are the planner's prepared data of the cases. `module` is `hits` or `catches`.
     """
@@ -190,14 +190,15 @@ class _Recorder(ca.Callback):
 def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
     """Select the fastest setting of IPOPT among those with the highest success rate.
 
-    The setting's objective must also be within `AS_GOOD` of the least objective of all settings, in
-    nine of ten cases. If no setting qualifies, the one with the least such excess is selected.
+    In nine of ten cases the setting's objective must also be within `AS_GOOD` (relative) of the
+    least objective of all settings. If no setting fulfils this, the one with the least excess is
+    selected.
 
     Args:
         peer: IPOPT on one form of the problem; the settings for this form are tried.
         batch: cases that are used for tuning only.
-        accepted: function that maps decision variables (B, n) to whether the referee accepts the
-            plan, (B,) bool.
+        accepted: function that maps n decision variables of B cases (B, n) to whether the referee,
+            an independent check, accepts the plans, (B,) bool.
 
     Returns:
         The selected setting, and a row of figures for each tried setting.

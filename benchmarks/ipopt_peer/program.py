@@ -1,15 +1,16 @@
 """The nonlinear program of one minimum-snap trajectory with exact derivatives, for IPOPT.
 
-`benchmarks.ipopt` compares the planners with IPOPT on this program. It has the decision variables x
-of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in scaled
-("whitened") coordinates, and a few variables that describe the state at the end of the trajectory.
-The program shares only the trajectory's constant matrices and the settings with the planners.
+`benchmarks.ipopt` compares the planners with IPOPT on this program. Its decision variables x are
+those of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in
+scaled ("whitened") coordinates, and a few variables that describe the state at the end of the
+trajectory. The program shares only the trajectory's constant matrices and the settings with the
+planners.
 
 The program is computed in three steps:
 1. The variables of the end determine the boundary conditions: position to jerk at both ends, in
    units of the mean duration h of a piece. They also determine h.
-2. Boundary conditions and offsets form the coefficients C of the trajectory. The samples of the
-   trajectory, in units of h, are constant matrices times C.
+2. Boundary conditions and offsets form the coefficients of the trajectory. The samples of the
+   trajectory, in units of h, are constant matrices times the coefficients.
 3. The limits are evaluated at each sample.
 
 CasADi differentiates only the small functions of steps 1 and 3 symbolically. The chain rule through
@@ -44,13 +45,13 @@ class Problem:
     planner: Any  # the `ExactHit` or `ExactCatch` whose settings are used
     sizes: dict[str, int]  # names of the parameters of a case, with their numbers of values
     num_natural: int  # number of variables that describe the end of the trajectory
-    # Function of these variables and `params`. Returns the state at the end (4, 3), the duration
-    # [s], a list of excesses over limits at the end, and a cost.
+    # Function of the end's variables and `params`. Returns position to jerk at the end (4, 3), the
+    # duration [s], a list of excesses over limits at the end, and a cost.
     ends: Callable[[Any, dict], tuple[Any, Any, list, Any]]
     # Function of height, velocity, acceleration and jerk at a sample, and `params`. Returns a list
     # of excesses over limits.
     limits: Callable[[Any, Any, Any, Any, dict], list]
-    factors: tuple[float, ...]  # factors of the planner's margin, one for each excess at a sample
+    factors: tuple[float, ...]  # the planner's margin is multiplied by one factor for each limit
     impact_weight: float  # [s], weight of the penalties at the end
 
 
@@ -128,9 +129,10 @@ class Program:
             self.functions = compile_functions(self.functions)
 
     def solver(self, options: dict[str, Any], callback: Any = None) -> Callable:
-        """Return a function that runs IPOPT from an initial guess (n,) with parameters (P,).
+        """Return a function that runs IPOPT from an initial guess of the n variables x.
 
-        The function returns CasADi's result and statistics. `callback` is called in each iteration.
+        The function's arguments are the initial guess (n,) and the parameters of a case. It returns
+        CasADi's result and statistics. `callback` is called in each iteration.
         """
         nlp, gradient, jacobian, hessian = self.functions
         settings: dict[str, Any] = {"print_level": 0, "sb": "yes", "linear_solver": "mumps"}
@@ -160,7 +162,7 @@ class Program:
         """Build the function of the end's variables, its Jacobian, and its weighted Hessian.
 
         Its outputs are the boundary conditions by axis, the mean duration of a piece, the cost, and
-        the excesses at the end.
+        the excesses over limits at the end.
         """
         problem, planner = self.problem, self.problem.planner
         natural = ca.SX.sym("natural", problem.num_natural)
@@ -192,8 +194,9 @@ class Program:
     def _build_limits(self) -> None:
         """Build the functions of the limits at a sample with derivatives, mapped over all samples.
 
-        Their inputs are the sample in units of h, h itself, and the parameters. If limits are
-        penalties, the functions return one value: the sum of the sample's penalties times h.
+        Their inputs are the sample, in units of the mean duration h of a piece, h itself, and the
+        parameters. If limits are penalties, the functions return one value: the sum of the sample's
+        penalties times h.
         """
         planner, factors = self.problem.planner, self.problem.factors
         unit, h = ca.SX.sym("unit", len(PLACES)), ca.SX.sym("h")
@@ -227,9 +230,9 @@ class Program:
         self._bends = map_samples("bends", [multipliers], [ca.densify(gradient), filled(bend)])
 
     def _point(self) -> tuple[Any, Any, Any, Any]:
-        """Return symbols of x and of the parameters, and split x.
+        """Return symbols of the decision variables x and of the parameters, and the parts of x.
 
-        The parts are the unscaled variables of the end, and the waypoint offsets (M - 1, 3).
+        The parts are the unscaled variables of the end, and the offsets (M - 1, 3) for M pieces.
         """
         num = self.problem.planner.num_offsets
         scale = self._basis.scale
@@ -238,7 +241,7 @@ class Program:
         return x, params, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
 
     def _offset_energy(self, offsets: Any, h: Any) -> Any:
-        """Return the weighted snap energy of the offsets, which adds to the smoothest energy."""
+        """Return the snap energy that the offsets add to the smoothest trajectory's, weighted."""
         return self._own * ca.sumsqr(offsets) / h**self._power
 
     def _worst(self) -> Any:
@@ -317,7 +320,7 @@ class Program:
         of_samples, bends = self._bends(self._basis.sample(columns), h, params, multipliers)
         by_columns = self._basis.gradient(of_samples)
         full = self._basis.hessian(bends, self._bend_places)
-        # The blocks below are sums of derivatives of the limits and of the offsets' snap energy.
+        # The following blocks add the second derivatives of the limits and of the snap energy.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
         outer, place = self._basis.outer, self._basis.place
