@@ -81,7 +81,6 @@ def measure_planner(bench: Bench, name: str, planner: Any, cases: Any) -> None:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Build or load the library of motions, draw balls, and measure all planners on them."""
     path = options.library
     if path is None:
         path = bench.path / "library.bin"

@@ -275,7 +275,6 @@ def measure_repair(bench: Bench, library: Library, shift: float, num: int) -> No
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Build or load the library, and report all measurements that this module's text lists."""
     if options.library is None:
         path = bench.path / "library.bin"
         library = build_timed(bench, path, options.layout, options.regime)

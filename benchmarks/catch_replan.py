@@ -208,7 +208,6 @@ def cut_trajectory(path: PiecewisePolynomial, elapsed: float) -> PiecewisePolyno
 
 
 def join_trajectories(paths: list[PiecewisePolynomial]) -> PiecewisePolynomial:
-    """Concatenate trajectories, each starting where the one before it ends."""
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *paths)
 
 
@@ -356,7 +355,6 @@ def main() -> None:
 def fly_all(
     bench: Bench, cases: CatchCase, observations: np.ndarray, period: float, noise: float
 ) -> None:
-    """Simulate every throw with compiled programs, and report times and success."""
     lanes = [pj.take(cases, k) for k in range(len(observations))]
     path = balls_of(lanes[0])
     estimator = Estimator(period, noise, path.drag[0], path.gravity[0])

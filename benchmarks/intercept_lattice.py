@@ -143,7 +143,6 @@ class Lattice:
         self.free = functools.cache(self._free)
 
     def _lay_grid(self) -> None:
-        """Define a grid of cells for the rear axle. The start is the middle of one cell."""
         scene = self.scene
         first = np.ceil((scene.start[:2] - scene.lower + scene.middle) / CELL).astype(int)
         last = np.ceil((scene.upper + scene.middle - scene.start[:2]) / CELL).astype(int)
@@ -151,7 +150,6 @@ class Lattice:
         self.origin = scene.start[:2] - first * CELL
 
     def _draw_movers(self) -> None:
-        """Store each moving obstacle's blocked cells, for every position of it within a cell."""
         drawn = []
         for corners in self.scene.movers:
             low = np.floor((corners.min(axis=0) - self.radius) / _FINE).astype(int)
@@ -228,7 +226,6 @@ class Lattice:
         return levels, shifts, turns.astype(int).tolist()
 
     def _place_movers(self) -> list:
-        """Return moving obstacles' cells as bits, and their shifts, by half layer and heading."""
         scene, num = self.scene, 2 * self.layers + 1
         times = 0.5 * scene.dt * np.arange(num)
         drawn: list[list[list]] = [[[] for _ in range(HEADINGS)] for _ in range(num)]
@@ -246,7 +243,6 @@ class Lattice:
         return drawn
 
     def _free(self, half: int, heading: int) -> int:
-        """Return the cells where a car with a given heading touches nothing at a half layer."""
         blocked = 0
         for stencil, shift in self.placed[half][heading]:
             blocked |= shift_bits(stencil, shift)
@@ -254,7 +250,6 @@ class Lattice:
         return walls ^ (walls & blocked)
 
     def _goal(self, layer: int) -> list[int]:
-        """Return for each heading the cells from which the car meets the target at a time layer."""
         scene = self.scene
         reach = scene.tolerance + CELL * np.sqrt(0.5)
         place = (scene.target[layer] - self.origin - scene.middle * self.direction) / CELL
@@ -293,7 +288,6 @@ class Lattice:
             yield planes
 
     def _neighbours(self, planes: list[list[int]], k: int) -> list[list[int]]:
-        """Return the reached cells of speed level k - 1, of level k, and of level k + 1."""
         last = len(planes) - 1
         return [planes[max(k - 1, 0)], planes[k], planes[min(k + 1, last)]]
 

@@ -146,7 +146,6 @@ def search_all(found: list[Scene], workers: int) -> tuple[np.ndarray, np.ndarray
 
 
 def format_indices(indices: np.ndarray) -> str:
-    """Format the indices of cases as comma-separated text; "none" if there are no indices."""
     return ", ".join(map(str, indices)) or "none"
 
 

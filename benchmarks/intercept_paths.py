@@ -106,7 +106,6 @@ def is_clear(case: Any, poses: np.ndarray, num: int = 513) -> bool:
 
 
 def row_of(cases: list, paths: list[HybridPath], ms: np.ndarray) -> Row:
-    """Build the table row of this library's paths and their search times (B,) [ms]."""
     found = np.array([path.found for path in paths])
     pairs = zip(cases, paths, strict=True)
     clear = [path.found and is_clear(case, path.poses) for case, path in pairs]

@@ -142,7 +142,6 @@ def time_parts(planner: Any, lanes: list) -> dict[str, np.ndarray]:
 
 
 def mean_of(values: np.ndarray) -> float:
-    """Return the mean of an array, or NaN if the array is empty."""
     return float(values.mean()) if len(values) else np.nan
 
 

@@ -131,7 +131,6 @@ def bounds(path: TurningPath) -> tuple[jax.Array, jax.Array]:
 
 
 def report(bench: Bench, mode: str, num: int, seed: int) -> None:
-    """Predict `num` targets of one kind with all methods, and print the table of errors."""
     paths, seen = draw(mode, num, seed)
     truth = np.asarray(places(paths, AHEAD))
     off, nearer, residual, turning = map(np.asarray, predict(truth, seen))

@@ -207,7 +207,6 @@ def seconds_to(
 
 
 def measure(bench: Bench, name: str, options: Any) -> None:
-    """Tune IPOPT, run planner and IPOPT on one task, and print all tables of this task."""
     peer_module: Any = importlib.import_module("planner_jax.benchmarks.ipopt_peer.peer")
     setup = Setup(name, options.num, options.seed)
     tuning = Setup(name, options.tune, options.seed + 1)

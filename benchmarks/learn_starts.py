@@ -338,7 +338,6 @@ def compare(bench: Bench, task: str, num: int) -> None:
 
 
 def locate_file(task: str) -> Path:
-    """Return the path of the file with the shipped network of a task."""
     return Path(planner_jax.task.__path__[0]) / TASKS[task].file
 
 

@@ -230,7 +230,6 @@ def measure(bench: Bench, task: str, num: int, seed: int) -> dict[str, np.ndarra
 
 
 def locate_file(task: str) -> Path:
-    """Return the path of the file with the shipped scales of a task."""
     return Path(planner_jax.task.__path__[0]) / task / "measured_scales.json"
 
 

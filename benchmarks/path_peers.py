@@ -29,7 +29,6 @@ _START_UP, _EACH = 30.0, 20.0  # [s] Time limits for the start of a process and 
 
 
 def is_installed() -> bool:
-    """Return whether the Python package of fastsim-navigation is installed."""
     return importlib.util.find_spec(PEER) is not None
 
 

@@ -169,7 +169,6 @@ def train_own(suite: str, decisions: int, seed: int) -> Any:
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Train policies with both trainings, judge them, and print the table."""
     bench.say(
         f"{options.suite}, {options.decisions:,} decisions, {options.seeds} seeds, judged on "
         f"{options.num} cases of seed {options.seed}, {jax.devices()[0]}",

@@ -55,7 +55,6 @@ def train_on_suite(suite: str, options: argparse.Namespace) -> tuple[Policy, flo
 
 
 def measure(bench: Bench, sizes: list[str], options: argparse.Namespace) -> None:
-    """Train a policy for each suite, judge it beside the other methods, and print the table."""
     bench.say(
         f"{options.num} cases each, seed {options.seed}; trained with {options.decisions:,} "
         f"decisions, {jax.devices()[0]}",

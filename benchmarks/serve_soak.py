@@ -230,7 +230,6 @@ class Soak:
         return sum(any(a < end and b > begin for a, b in gaps) for begin, end in self.missed)
 
     def end(self) -> None:
-        """Close the connection to the server."""
         self._socket.close()
 
 

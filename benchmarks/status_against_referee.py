@@ -122,7 +122,6 @@ def add_planes(row: Row, cases: Any, random: np.random.Generator) -> Any:
 
 
 def _hits() -> dict[str, Row]:
-    """Return the definitions of all rows for hits, by name."""
     late = {f"late-{delay}": Row("hit", "court", {"delay": delay}) for delay in (0.3, 0.5, 0.6)}
     weak = {
         f"limits-{scale}": Row("hit", "court", {"limit_scale": scale}) for scale in (0.7, 0.5, 0.35)
@@ -146,7 +145,6 @@ def _hits() -> dict[str, Row]:
 
 
 def _catches() -> dict[str, Row]:
-    """Return the definitions of all rows for catches, by name."""
     robots = ("crazyflie", "racer-net", "x500-net")
     return {
         **{suite: Row("catch", suite) for suite in CATCHES},
@@ -164,7 +162,6 @@ def _catches() -> dict[str, Row]:
 
 
 def _others() -> dict[str, Row]:
-    """Return the definitions of all rows for interceptions, groups and blocks, by name."""
     blocks = {
         f"{suite}-{regime}": Row("block", suite, {"regime": regime}, every=10)
         for suite in ("pole", "open")

@@ -98,7 +98,6 @@ class _Sweep:
         return self._batch * np.polyfit(np.array(late) - late[0], np.arange(len(late)), 1)[0]
 
     def summary(self) -> dict:
-        """Read the summary of the sweep from the manifest in its run folder."""
         return RunFolder(self._out).read_manifest()["summary"]
 
 

@@ -76,7 +76,6 @@ class Settings:
     scale_a: float = 1.0
 
     def words(self) -> list[str]:
-        """Return these settings as command-line arguments of the C++ program."""
         given = dataclasses.asdict(self)
         return [f"{name}={float(value):g}" for name, value in given.items()]
 

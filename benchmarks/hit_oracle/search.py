@@ -215,7 +215,6 @@ def oracle() -> Oracle:
 
 
 def find_hit(case: HitCase, starts) -> Finding:
-    """Search for a feasible hit in one case, with the solver of this process."""
     return oracle().find(case, starts)
 
 

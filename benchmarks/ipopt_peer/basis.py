@@ -58,20 +58,10 @@ class Basis:
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))
 
     def to_x(self, by_outer: Any, by_natural: Any) -> Any:
-        """Convert derivatives of R quantities to derivatives by the n variables x, (R, n).
-
-        The arguments are derivatives by the offsets, ordered by axis, and by the variables of the
-        end.
-        """
         wide = ca.horzcat(by_outer[:, self.place], by_natural)
         return wide * ca.repmat(self.scale, wide.shape[0], 1)
 
     def limit_slopes(self, value: int, slopes: Any, places: Places) -> tuple[Any, Any]:
-        """Return derivatives of one limit at K samples with respect to coefficients and h.
-
-        The shapes are (K, 3 C) for C coefficients per axis, and (K, 1) for the mean duration h of a
-        piece.
-        """
         parts = [ca.MX.zeros(self._num_samples, self.num)] * 3
         by_h = ca.MX.zeros(self._num_samples, 1)
         for k, (i, j) in enumerate(places):
@@ -84,17 +74,12 @@ class Basis:
         return ca.horzcat(*parts), by_h
 
     def gradient(self, of_samples: Any) -> Any:
-        """Convert derivatives by K samples (11, K) to derivatives by the coefficients (1, 3 C)."""
         parts = [ca.MX.zeros(1, self.num)] * 3
         for i, (order, axis) in enumerate(PLACES):
             parts[axis] = parts[axis] + of_samples[i, :] @ self._matrices[order]
         return ca.horzcat(*parts)
 
     def hessian(self, bends: Any, places: Places) -> Any:
-        """Convert the samples' Hessians to one Hessian (3 C + 1, 3 C + 1).
-
-        Its variables are the C coefficients of each axis, and the mean duration h of a piece.
-        """
         last, num = len(PLACES), self.num
         factors = {place: bends[k, :].T for k, place in enumerate(places)}
         sizes = (num, num, num, 1)

@@ -154,7 +154,6 @@ class Program:
         return solve_case
 
     def _split(self, vector: Any) -> dict:
-        """Split a vector of parameters into a dict of parameters by name."""
         ends = np.cumsum([0, *self.problem.sizes.values()]).tolist()
         return {n: vector[ends[i] : ends[i + 1]] for i, n in enumerate(self.problem.sizes)}
 
@@ -241,7 +240,6 @@ class Program:
         return x, params, natural[num:], ca.reshape(natural[:num], 3, num // 3).T
 
     def _offset_energy(self, offsets: Any, h: Any) -> Any:
-        """Return the snap energy that the offsets add to the smoothest trajectory's, weighted."""
         return self._own * ca.sumsqr(offsets) / h**self._power
 
     def _worst(self) -> Any:
