@@ -18,8 +18,8 @@ the C++ program, and `exact`, the default. It prints
 * the speed of this project's own C++ program (`benchmarks.catch_peer`), which is faster than the
   published program.
 
-The success and cost in the run's summary are those of `exact`. Run this benchmark on an idle
-machine. The command `taskset -c 0` binds it to one core.
+The run's summary has the success and cost of `exact`. Run this benchmark on an idle machine. The
+command `taskset -c 0` binds it to one core.
 """
 
 import csv

@@ -4,9 +4,9 @@
 
 Each row of the table is planned by two new processes, one after the other. The first process finds
 an empty compile cache on the disk. The second process loads the programs that the first one
-compiled. The CPU time is that of the whole process, from its start until the first call of
-`pj.plan` returns; it includes imports and the drawing of cases. The device is JAX's default, or the
-one that the variable JAX_PLATFORMS names.
+compiled. The CPU time is measured from the start of the process until the first call of `pj.plan`
+returns; it includes imports and the drawing of cases. The device is JAX's default, or the one that
+the variable JAX_PLATFORMS names.
 
 Planners search unsolved cases again in later rounds, which need other programs. A row whose name
 starts with "later" measures a case that needs later rounds. Its process first plans a usual case of

@@ -2,7 +2,7 @@
 
     python -m benchmarks.intercept_group [--num 20] [--seed 1] [--out DIR]
 
-A case is a group of moving targets from the suite `group`, of which the first three are used. Four
+A case has the first three targets of a group of moving targets, drawn from the suite `group`. Four
 methods are compared:
 * plan all six orders, and use the best plan;
 * plan the three orders with the earliest estimated last meeting, and use the best plan;
@@ -18,7 +18,7 @@ distance is within the case's tolerance. The bound is the earliest last meeting 
 
 Planning times are for a second call, which compiles nothing, with all groups at once. The compile
 time of the first listed method is the longest, because the other methods use the same programs. The
-success rate in the run's summary is that of the first method.
+run's summary has the success rate of the first method.
 """
 
 import argparse

@@ -8,8 +8,8 @@ check in float64. Each row of the table counts
 * the plans whose status reports that every limit holds ("solved");
 * the plans that the referee accepts;
 * solved plans that the referee rejects, with the limits that fail;
-* accepted plans that are not solved. In brackets are those of them that exceed a limit by no more
-  than the referee's tolerance; a status permits no tolerance.
+* accepted plans that are not solved. In brackets is the number of them that exceed a limit by no
+  more than the referee's tolerance; a status permits no tolerance.
 
 In rows with obstacles, an obstacle is placed on the trajectory that the planner finds without
 obstacles. Rows whose planning is slow use only a tenth or a fortieth of the cases.

@@ -134,7 +134,7 @@ def path_limits(motion: list, case: dict, allowance) -> tuple[list, Any]:
     """Return the limits at one sample as expressions that must be <= 0, and the body z axis.
 
     `motion` has position to snap, and `allowance` is 1 + the permitted relative excess. The body
-    rate is that of zero heading in the Hopf fibration. It is a quotient with the squared thrust as
+    rate follows from the Hopf fibration at zero heading: a quotient with the squared thrust as
     denominator. The limit on it is multiplied by the squared thrust, because with the quotient
     IPOPT diverges if the thrust is small.
     """

@@ -1,10 +1,9 @@
 """The nonlinear program of one minimum-snap trajectory with exact derivatives, for IPOPT.
 
-`benchmarks.ipopt` compares the planners with IPOPT on this program. Its decision variables x are
-those of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in
-scaled ("whitened") coordinates, and a few variables that describe the state at the end of the
-trajectory. The program shares only the trajectory's constant matrices and the settings with the
-planners.
+`benchmarks.ipopt` compares the planners with IPOPT on this program. It has the decision variables x
+of `ExactHit` and `ExactCatch`: offsets of the waypoints from the smoothest trajectory, in scaled
+("whitened") coordinates, and a few variables that describe the state at the end of the trajectory.
+The program shares only the trajectory's constant matrices and the settings with the planners.
 
 The program is computed in three steps:
 1. The variables of the end determine the boundary conditions: position to jerk at both ends, in
