@@ -57,7 +57,7 @@ def save_checkpoint(
 
 
 def name_and_sizes(network: Any) -> tuple[str, dict[str, int]]:
-    """Return a network's key in `NETWORKS`, and the fields that determine its shapes, by name."""
+    """Return a network's name, "attention" or "mlp", and its sizes by the names of its fields."""
     (name,) = (name for name, kind in NETWORKS.items() if isinstance(network, kind))
     fields = (field.name for field in dataclasses.fields(network))
     return name, {field: getattr(network, field) for field in fields if field not in _OF_FLAX}

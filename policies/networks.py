@@ -28,7 +28,7 @@ def _head(features: Array) -> Array:
 
 
 class Mlp(nn.Module):
-    """A multilayer perceptron: two hidden layers with ReLU [Yu2023catch, Section IV-B]."""
+    """A policy network of two hidden layers with ReLU [Yu2023catch, Section IV-B]."""
 
     size: int = 6  # greatest number of targets
     width: int = 64  # number of units in each hidden layer

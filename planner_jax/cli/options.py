@@ -32,7 +32,7 @@ class Unfinished(PlannerJaxError):
 def fail(
     error: str | PlannerJaxError, flags: Mapping[str, str] | None = None, code: int = BAD_ARGUMENT
 ) -> int:
-    """Print an error in one line, with options from `flags` for arguments; return `code`."""
+    """Print an error in one line, with the options in `flags` as argument names; return `code`."""
     if isinstance(error, ArgumentError | MissingExtra):
         error = error.with_names(flags or {})
     print(f"planner-jax: error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -56,7 +56,7 @@ class Parser(argparse.ArgumentParser):
         self._negative_number_matcher = re.compile(r"-\.?[0-9]")
 
     def parse_known_args(self, *arguments: Any, **how: Any) -> Any:
-        """Add the parser's options, then parse; `flags` of the result are options by argument."""
+        """Add the parser's options, then parse; the result's `flags` map arguments to options."""
         self._fill(self)
         self.set_defaults(flags=self._flags)
         return super().parse_known_args(*arguments, **how)

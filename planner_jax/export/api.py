@@ -197,7 +197,7 @@ def bring_to_rest(plan: Plan, recovery: str | None, case: Case | None = None) ->
 
 
 def lacks_recovery(plan: Plan) -> bool:
-    """Test whether a plan does not end at standstill; raise if it is of no robot known here."""
+    """Test whether a plan does not end at standstill; raise if the plan cannot be exported."""
     robot_of(plan)
     return not is_rested(plan)
 
@@ -219,7 +219,7 @@ def _require_format(to: str, plan: Plan) -> Format:
 
 
 def _resolve(writer: str, purpose: str) -> Callable:
-    """Import and return the function "module:name" of this package, or raise `MissingExtra`."""
+    """Import the function "module:name"; raise `MissingExtra` if a package is not installed."""
     try:
         return pkgutil.resolve_name(f"planner_jax.export.{writer}")
     except ModuleNotFoundError as error:

@@ -29,7 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make the course of a plan alone; pieces of zero duration replace the stop at its end."""
+    """Make a course of a plan's pieces; the pieces for the way to standstill have no duration."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 

@@ -59,7 +59,7 @@ class HitServe(ServeSettings):
         require(0.0 <= self.drag <= 1.0, "drag", "from 0 to 1", self.drag)
 
     def stroke(self) -> "HitStroke":
-        """Make the task to hit balls to the target with this robot and drag."""
+        """Make the task to hit balls to the target, with the robot and drag of these options."""
         from planner_jax.live.strokes import HitStroke
         from planner_jax.robot.quadrotor_model import PAPER_HITTER
 
@@ -79,7 +79,7 @@ class CatchServe(ServeSettings):
         require(0.0 <= self.drag <= 10.0, "drag", "from 0 to 10", self.drag)
 
     def stroke(self) -> "CatchStroke":
-        """Make the task to catch balls with this robot and drag."""
+        """Make the task to catch balls, with the robot and drag of these options."""
         from planner_jax.live.strokes import CatchStroke
         from planner_jax.robot.quadrotor_model import PAPER_CATCHER
 

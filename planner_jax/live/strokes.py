@@ -55,7 +55,7 @@ PlanT = TypeVar("PlanT", HitPlan, CatchPlan)
 
 
 class Stroke(abc.ABC, Generic[CaseT, PlanT]):
-    """Base class of the tasks of live planning. Cases and plans have NumPy leaves."""
+    """Base class of the tasks of live planning: to hit, or to catch, one ball at a time."""
 
     shortest: ClassVar[float]  # [s], time before the contact with the ball at which planning ends
 

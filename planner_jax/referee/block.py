@@ -345,7 +345,7 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Test at the contact the ball's position on the shield, the shield's tilt, and the boxes."""
+    """Test at the contact that the ball is on the shield and between the boxes; test the tilt."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])

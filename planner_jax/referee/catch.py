@@ -182,7 +182,7 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Return the catch times (B, N) [s]: the ends of N groups of pieces of equal number."""
+    """Return the catch times [s] of plans whose pieces form `num` groups, one for each catch."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 
@@ -232,8 +232,8 @@ def _follow_targets(targets, order: np.ndarray, times: np.ndarray) -> tuple[np.n
 def _ball_states(start, vel, drag, gravity, times) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities (B, N, 3) of N balls of B cases, with linear drag.
 
-    With the drag K [1/s], the start s_0, v_0, the gravity g and x = K t, the position is
-    s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K [Yu2023catch, eq. 9]. It is computed as
+    For position s_0 and velocity v_0 at time 0, drag K [1/s], gravity g and x = K t it is at
+    s_0 + (v_0 - g / K) (1 - e^-x) / K + g t / K [Yu2023catch, eq. 9]. This is computed as
     s_0 + v_0 t f(x) + g t^2 h(x) with f = (1 - e^-x) / x and h = (1 - f) / x, which allows K = 0.
     For small x, the series h = 1/2! - x/3! + x^2/4! - ... is summed to rounding.
     """

@@ -218,7 +218,7 @@ def above(value: np.ndarray, limit: np.ndarray, tolerance: float, time: np.ndarr
 
 
 def derivative(coeffs: np.ndarray, times: np.ndarray, order: int) -> np.ndarray:
-    """Evaluate a derivative of polynomials at `times` [s]; `coeffs` are of rising powers."""
+    """Evaluate the `order`-th derivative of polynomials; the first axis of `coeffs` is powers."""
     value = np.zeros(np.broadcast_shapes(coeffs.shape[1:], times.shape))
     for k in range(len(coeffs) - 1, order - 1, -1):
         value *= times

@@ -114,7 +114,7 @@ def intervals_of(num_pieces: int) -> int:
 
 
 def check_coeffs(value: ArrayLike) -> np.ndarray:
-    """Convert coefficients to an array; raise a ValueError unless it has four axes, the last 3."""
+    """Convert coefficients to an array; raise a ValueError unless it is (B, pieces, powers, 3)."""
     coeffs = np.asarray(value)
     if coeffs.ndim != 4 or coeffs.shape[-1] != 3 or 0 in coeffs.shape[1:]:
         raise ValueError(f"coeffs must be (B, M, D + 1, 3), got {coeffs.shape}")

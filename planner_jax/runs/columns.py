@@ -107,8 +107,8 @@ OUTCOME = [
 def leaf_columns(batch: RefereedBatch) -> list[Column]:
     """Return a column for every leaf of the cases, the plans and the verdict.
 
-    A column's name is the path of its leaf, such as "plan.cost". Unit and meaning are the metadata
-    of the dataclass field. The columns of `SOLVER` and `OUTCOME` have the same names in all runs.
+    A column's name is the path of its leaf, such as "plan.motion.durations", or just the last name
+    if all runs have it, such as "cost". Unit and meaning are metadata of the dataclass field.
     """
     known = {f"plan.{c.name}" for c in SOLVER} | {f"verdict.{c.name}" for c in OUTCOME}
     found = [INDEX]

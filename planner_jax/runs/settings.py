@@ -83,7 +83,7 @@ class SweepSettings:
         require_seed(self.seed)
 
     def of(self, task: Task) -> Self:
-        """Return the settings with the task's first planner and suite in place of None."""
+        """Return the settings; None as planner or suite is replaced by the task's default."""
         planners, suites = task.all_planners(), task.all_suites()
         filled = dataclasses.replace(
             self,

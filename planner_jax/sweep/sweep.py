@@ -121,7 +121,7 @@ class Sweep(Generic[AnySettings]):
         return f"{name} sweep, suite {settings['suite']}, planner {settings['planner']}"
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return the report's table of success rates, here with one row for the suite."""
+        """Return the report's table of success rates, by default with one row for all cases."""
         summary, settings = manifest["summary"], manifest["parameters"]
         header = ["suite", "cases", f"{settings['planner']} %", "95 % interval"]
         cells = rate_cells(summary["successes"], summary["num"])

@@ -56,7 +56,7 @@ class SingleSettings:
                 require(sound, field.name, "finite", number)
 
     def of(self, task: Task) -> "SingleSettings":
-        """Return a copy with the planner's name checked, and None replaced by the first planner."""
+        """Check the planner's name; return a copy in which None is replaced by the default."""
         name = next(iter(task.all_planners())) if self.planner is None else self.planner
         task.split_planner(name)
         return dataclasses.replace(self, planner=name)

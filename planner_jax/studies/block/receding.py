@@ -82,7 +82,7 @@ class Decided:
     motions: Array  # (B,) int32, number of started motions
 
     def fit_errors(self, place: int) -> tuple[Array, Array]:
-        """Return errors and estimated standard deviations [m] of the B fits at moment `place`."""
+        """Return errors and standard deviations [m] of the B fits at one moment, index `place`."""
         return fit_errors(self.cases, take(self.fits, place))
 
 

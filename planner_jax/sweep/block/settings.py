@@ -44,5 +44,5 @@ class BlockSettings(StudySettings):
             require(self.delay == 0.0, "delay", rule, self.delay)
 
     def draw_options(self) -> Entries:
-        """Return the arguments for drawing cases, with the time `delay` at which arms may move."""
+        """Return the arguments for drawing cases, also `delay`, the time before arms may move."""
         return {**super().draw_options(), "delay": self.delay + self.first_motion}

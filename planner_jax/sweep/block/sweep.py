@@ -21,7 +21,7 @@ from planner_jax.sweep.sweep import Sweep
 
 
 class BlockTally(Tally):
-    """Counts of successes, and means of execution times, flight-fit errors and planning times."""
+    """Counts of successes, and means of execution times, errors of fitted flights and others."""
 
     MEANS = ("execution_time",)
     READS = (*COUNTED, *MEANS, *StudyCounts.READS)
@@ -67,7 +67,7 @@ class BlockSweep(Sweep[BlockSettings]):
             planner.check(cases)
 
     def findings(self, manifest: Entries) -> list[str]:
-        """Return sentences on execution time, errors of the flight fits, and planning time."""
+        """Return sentences on execution time, position errors of fitted flights, planning time."""
         summary, found = manifest["summary"], []
         if (mean := summary["mean_execution_time"]) is not None:
             found.append(f"The arm moves for {mean:.3f} s, in the mean of the successes.")

@@ -94,7 +94,7 @@ class CatchSweep(Sweep[CatchSettings]):
         return CatchTally(decides=settings.planner != "mpp")
 
     def table(self, manifest: Entries) -> RateTable:
-        """Return success rate and optimal time ratio, beside [Yu2023catch, Tables I and III]."""
+        """Return the table of success rates, beside rates of [Yu2023catch, Tables I and III]."""
         return make_table(manifest)
 
     def findings(self, manifest: Entries) -> list[str]:

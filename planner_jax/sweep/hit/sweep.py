@@ -85,7 +85,7 @@ class HitTally(Tally):
         self._scenarios.add(rows)
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first."""
+        """Return masks of rows that may be the example in figures, the preferred mask first."""
         scenario = rows["scenario"].to_numpy()
         left_to_far = success & np.array([name[0] + name[2] == "LF" for name in scenario])
         return [left_to_far, *super().examples(rows, success)]
@@ -119,7 +119,7 @@ class HitSweep(Sweep[HitSettings]):
     failure_words = {"case": "index", "scenario": "scenario", **Sweep.failure_words}
 
     def open_source(self, settings: HitSettings, batch: int) -> ServeSource:
-        """Return the source of a sweep's cases; a folder of published serves is read completely."""
+        """Return the source of a sweep's cases: drawn serves, or a folder of published serves."""
         # Suites that other packages add cannot be used, since they define cases without serves.
         require_one_of(TASK.suites, "suite", str(settings.suite))
         folder = None if settings.serves is None else read_serves(settings.serves)

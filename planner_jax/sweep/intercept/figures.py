@@ -62,7 +62,7 @@ class SampledDrive:
 
 
 def sample_drive(row: Row, setting: Entries, num: int) -> SampledDrive:
-    """Sample a stored row's plan at `num` even times; `setting` holds the size of the car."""
+    """Sample the plan in a run's row at `num` evenly spaced times; `setting` has the car's size."""
     start, speed, curvature = (
         jnp.asarray(row[name], jnp.float32) for name in ("start", "speed", "curvature")
     )
@@ -184,7 +184,7 @@ def draw_drive(axes: Axes, drive: SampledDrive, colours: ScalarMappable) -> None
 
 
 def entries(colours: ScalarMappable) -> list[Artist]:
-    """Return the entries of the legend of `plane_figure`."""
+    """Return the legend's entries for walls, moving obstacles, target, car and meeting point."""
     early = colours.get_cmap()(0.3)
     look: Look = {"linestyle": "", "marker": "o"}
     return [

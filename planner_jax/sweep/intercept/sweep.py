@@ -25,7 +25,7 @@ class InterceptTally(Tally):
     NEAR = 0.1  # [m] the figures prefer a case whose car passes a moving obstacle at less than this
 
     def examples(self, rows: pa.Table, success: np.ndarray) -> list[np.ndarray]:
-        """Return masks (B,) of B rows whose cases a figure may show, the preferred mask first."""
+        """Return masks of rows that may be the example in figures, the preferred mask first."""
         is_near = rows["mover_clearance"].to_numpy() < self.NEAR
         return [success & is_near, *super().examples(rows, success)]
 
@@ -48,7 +48,7 @@ class InterceptSweep(Sweep[InterceptSettings]):
     )
 
     def other_planners(self, settings: InterceptSettings) -> Entries:
-        """Return few of the other planners, because the programs of each compile for a minute."""
+        """Return only the planners named in `COMPARED`, because each compiles for a minute."""
         others = super().other_planners(settings)
         return {name: others[name] for name in COMPARED if name in others}
 
