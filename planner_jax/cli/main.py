@@ -82,7 +82,8 @@ def _make_parser() -> Parser:
         tasks = among.add_subparsers(title="tasks", required=True, metavar="task")
         for task in all_tasks().values():
             if {"sweep": task.sweep, "fly": task.flight, "plan": task.single}[name] is not None:
-                # `fill` imports the settings' module, so it runs for the requested task only.
+                # `fill` imports the module of the task's settings, which is slow. The parser calls
+                # it for the requested task only.
                 fill = functools.partial(add, task)
                 tasks.add_parser(task.name, help=task.summary, fill=fill, argument_default=SUPPRESS)
     words = "train a policy that decides about catches"

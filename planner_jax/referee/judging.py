@@ -78,7 +78,8 @@ class FlightVerdict(Verdict):
 # [s] Greatest allowed difference between the time of a contact with the ball or target that a plan
 # reports, and the time at the end of the trajectory's last piece before the contact.
 CONTACT_TIME_TOLERANCE = 1e-4
-# A relative excess is (value - limit) / limit. A limit below this number is replaced by it there.
+# A relative excess is (value - limit) / |limit|; if |limit| is smaller than this number, the excess
+# is divided by this number.
 SMALLEST_LIMIT = 1e-3
 _FEWEST_LANES = 256  # least number of plans of a thread; starting a thread for fewer takes longer
 # Least number of plans, and of cores, for which processes judge a batch instead of threads.

@@ -80,7 +80,7 @@ class Single(abc.ABC, Generic[SingleT]):
 
     @abc.abstractmethod
     def case(self) -> PyTree:
-        """Make the case from the settings."""
+        """Make the case that the command's options specify."""
 
     @abc.abstractmethod
     def contact(self, answer: Answer) -> list[str]:

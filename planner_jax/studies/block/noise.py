@@ -32,7 +32,7 @@ class StereoNoise:
     disparity_std: Array  # () [px], standard deviation of the disparity, averaged over the ball
     speckle_std: Array  # () [px], additional standard deviation of the disparity of one pixel
     # () Probability that a pixel of a depth image has no depth. Where no images are rendered
-    # (`sightings`), it is the probability that a frame does not show the ball.
+    # (`sightings`), it is the probability that the ball has no depth in a frame.
     dropout: Array
     mismatch: Array  # () probability that a pixel has the depth of another object
 

@@ -52,9 +52,9 @@ def mast_camera(size: tuple[int, int] = (1280, 720)) -> Camera:
     Position and field of view (120 degrees) are assumptions, chosen so that the camera sees the
     throws of all suites almost until they enter the outer box, the region in which the arm may
     block them. From the mast it looks over the arm; it is 0.3 m to the left of the arm's axis, so
-    that it looks past the pole. [Natarajan2024] mounts its camera on the beams of the rig, in front
-    of the arm. There, 110 degrees do not cover throws that come from up to 60 degrees to either
-    side.
+    that it looks past the pole. [Natarajan2024] mounts its camera on the beams of the rig. In the
+    model of its authors the camera is in front of the arm, where 110 degrees do not cover throws
+    that come from up to 60 degrees to either side.
     """
     place = np.array([-RIG_HALF, 0.3, 1.6])
     ahead = np.array([1.0, np.tan(np.deg2rad(-1.0)), np.tan(np.deg2rad(-8.0))])
