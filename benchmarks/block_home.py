@@ -66,10 +66,10 @@ def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
 
 
 def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
-    """Draw `num` random home poses (num, 6) [rad] without a collision.
+    """Draw `num` random home poses, joint angles (num, 6) [rad], without a collision.
 
-    Joint angles are uniform between `LOWEST` and `HIGHEST` if `around` is None. Otherwise they are
-    normal, with the mean and standard deviation of the poses `around` (E, 6) [rad].
+    The angles are uniform between fixed bounds if `around` is None. Otherwise they are normal, with
+    the mean and standard deviation of the poses `around` (E, 6) [rad].
     """
     arm, scene = irb1600(), paper_scene()
 

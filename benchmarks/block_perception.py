@@ -131,7 +131,7 @@ def middle_of(cases: Any) -> Array:
 class Table:
     """Printed table of position errors, with a column for each time at which flights are fitted.
 
-    An entry has the median error, and the share of errors below `ROOM`.
+    An entry has the median error, and the share of errors below 0.1 m (`ROOM`).
     """
 
     def __init__(self, bench: Bench):

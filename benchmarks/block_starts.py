@@ -4,17 +4,17 @@
 
 The planner first tries straight motions of the arm, in which all joints move in proportion. If none
 of them blocks the ball, it searches by least squares. The search starts from a straight motion plus
-a bump: each joint deviates smoothly to one side, by a given angle in the middle of the motion. A
-starting point consists of a bump and of the rank of the motion's end pose. The planner sorts the
-end poses in which the shield meets the ball.
+a bump: each joint deviates smoothly to one side, by a given angle in the middle of the motion. The
+planner sorts the end poses in which the shield meets the ball. A starting point consists of the
+rank of the end pose in this order, and of a bump.
 
-Throws are drawn from the suite `pole` with seed 1001 and the joint limits R2. They are met at a
-right angle, and the arm may start after 0.05 s. No reported result uses these throws. Throws that
-no straight motion blocks are planned from random bumps and end poses. Then there are two kinds of
+Throws are drawn from the suite `pole` with seed 1001 and R2, a set of joint limits. They are met at
+a right angle, and the arm may start after 0.05 s. No reported result uses these throws. Throws that
+no straight motion blocks are planned from random starting points. Then there are two kinds of
 candidates for the bumps: random bumps that led to plans, and typical deviations of these plans from
-straight motions. Each candidate is tried with the ten best end poses, on all throws that were
-solved. The starting points are selected greedily: each is the one that blocks most of the throws
-that the points before it do not block.
+straight motions. Each candidate is tried with the first ten end poses, on all throws for which a
+plan was found. The starting points are selected greedily: each is the one that blocks most of the
+throws that the points before it do not block.
 
 --write replaces the file that the library ships. The shipped file was learned with the options
 --num 2400 --tries 384 --lanes 16384, in half a minute on one H200.
@@ -82,7 +82,7 @@ def follow(
         planner: defines the unknowns and residuals.
         case: one case.
         bump: (6,) [rad], greatest deviation of each joint from the straight motion.
-        rank: () int < `LATER_RANKS`, index of the motion's end pose in the planner's order.
+        rank: () int < 24, index of the motion's end pose in the planner's order of end poses.
         steps: maximum number of least-squares steps; a number, or () int.
     """
     flight = flight_of(case)
@@ -149,7 +149,7 @@ def select_starts(solves: np.ndarray) -> list[int]:
     """Select starting points greedily from a table `solves` (throws, points) bool.
 
     An entry is true if a plan from the point blocks the throw. Each selected point solves most of
-    the throws that the points before it do not solve. Returns at most `MOST` column indices.
+    the throws that the points before it do not solve. Returns at most 16 column indices.
     """
     left, chosen = np.ones(len(solves), bool), []
     while left.any() and len(chosen) < MOST:

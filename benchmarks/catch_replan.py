@@ -102,7 +102,7 @@ class Times:
     replans: list[tuple[Any, CatchPlan]] = dataclasses.field(default_factory=list)
 
     def keep(self, left: Any, found: CatchPlan) -> None:
-        """Store a re-planning problem and its plan, unless `COMPARED` of them are stored."""
+        """Store a re-planning problem and its plan, unless 1,024 of them are stored."""
         if len(self.replans) < COMPARED:
             self.replans.append((left, found))
 

@@ -26,7 +26,10 @@ SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan every suite with every effort, and print one row for each suite and effort."""
+    """Plan every suite with every effort, and print one row for each pair.
+
+    The effort "feasible", "good" or "best" sets how long a planner searches for a lower cost.
+    """
     bench.say(
         f"{options.num:,} cases, {jax.devices()[0].device_kind}, jax {jax.__version__}",
         "| task | suite | effort | refereed | cost above the optimum (median, p90, p99) | "

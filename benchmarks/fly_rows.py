@@ -121,7 +121,10 @@ def contact_errors(flown: Flown) -> tuple[np.ndarray, np.ndarray]:
 
 
 def prediction_errors(flown: Flown) -> None:
-    """Print quantiles of the errors of the predicted contact position, for each of `HORIZONS`."""
+    """Print quantiles of the errors of the predicted contact position.
+
+    The errors are grouped by the time from the prediction until the contact, see `HORIZONS`.
+    """
     assert flown.record is not None
     horizon, error = flown.record.horizon[:, :, 0], np.abs(flown.record.error[:, :, 0])
     for low, high in HORIZONS:

@@ -35,8 +35,8 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
     origin = middle - first * CELL
     radius = 0.5 * scene.width - _SLACK
     columns, rows = (origin[k] + CELL * np.arange(count[k]) for k in (0, 1))
-    # Positions of moving obstacles are rounded to whole cells. Their radius is therefore reduced by
-    # the greatest rounding error, so that no free cell counts as blocked.
+    # Positions of moving obstacles are rounded to whole cells. The distance by which obstacles are
+    # enlarged is therefore reduced by the greatest rounding error, so that no free cell is blocked.
     movers = [_draw_polygon(corners, radius - _SLACK) for corners in scene.movers]
     steps = _limit_steps(scene)
     guard = max([int(steps.max() / CELL) + 2, *(drawn.shape[1] for _, drawn in movers)])

@@ -79,7 +79,7 @@ def search(case: Any, meeting: np.ndarray, share: float = 1.0, **options: Any) -
 
 
 def time_fastest(run: Callable[[], Any]) -> tuple[Any, float]:
-    """Call a function `REPEATS` times; return its result, and the fastest call's duration [ms]."""
+    """Call a function three times; return its result, and the fastest call's duration [ms]."""
     seconds, result = [], None
     for _ in range(REPEATS):
         began = time.perf_counter()

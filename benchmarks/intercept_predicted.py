@@ -80,10 +80,10 @@ def predict(times: jax.Array, seen: jax.Array, weights: jax.Array) -> TurningPat
 @jax.jit
 @jax.vmap
 def compute_bound(path: TurningPath, times: jax.Array, end: jax.Array) -> jax.Array:
-    """Return the probabilities (B,) that a best unbiased prediction is within `SUCCESS` [m].
+    """Return the probabilities (B,) that the error of a best unbiased prediction is below 0.3 m.
 
-    The predictions are for B targets at the times `end` (B,) [s], from observations at the times
-    `times` (B, L) [s]. Their covariance is the Cramer-Rao bound.
+    The predictions are for B targets at the times `end` (B,) [s], from observations at L times
+    each, `times` (B, L) [s]. The covariance of the errors is the Cramer-Rao bound.
     """
     straight, turning = (
         share_within(cramer_rao(path, times, NOISE, end, turning=turning), SUCCESS)
@@ -305,7 +305,7 @@ def report(
 def report_bound(
     bench: Bench, observed: Observations, truth: InterceptCase, turning: np.ndarray
 ) -> None:
-    """Print the share of first predictions within `SUCCESS` of the target at the case's time.
+    """Print the share of first predictions that are within 0.3 m of the target at the case's time.
 
     Also print this share for the best unbiased predictor, by the Cramer-Rao bound.
     """

@@ -220,7 +220,7 @@ def table_of_planners(bench: Bench, problems: Any) -> dict[str, Judged]:
 def _compare_pairs(
     bench: Bench, judged: dict[str, Judged], seconds: dict[str, np.ndarray]
 ) -> list[str]:
-    """Return the lines of a table that compares each pair of `PAIRS` on problems that both solve.
+    """Return the lines of a table that compares pairs of planners on problems that both solve.
 
     `seconds` has by planner the planning time [s] of each problem.
     """

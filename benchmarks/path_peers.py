@@ -73,7 +73,7 @@ def run_searches(searches: Sequence[dict], folder: Path) -> list[dict]:
 
 
 def search_one(given: dict) -> dict:
-    """Solve one path problem `REPEATS` times; return the path and the fastest time [ms]."""
+    """Solve one path problem three times; return the path and the fastest time [ms]."""
     peer: Any = importlib.import_module(PEER)
     # A cell of the cost map counts as wall if a wall is within half a cell of the cell's centre.
     cells = np.where(np.array(given["distance"]) <= 0.5 * CELL, 254, 0).astype(np.uint8)

@@ -89,7 +89,7 @@ class CatchVecEnv(vec_env.VecEnv):
         """Do nothing, because the environment has no open resources."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of the environment, repeated for each of the `LANES` environments."""
+        """Return an attribute of the environment, once for each of 100 parallel environments."""
         return [getattr(self.env, attr_name, None)] * LANES
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

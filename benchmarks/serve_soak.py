@@ -74,7 +74,7 @@ while os.getppid() == asker:
 
 
 def draw_paths(task: str, rate: float) -> np.ndarray:
-    """Draw `NUM` balls of a task; return K positions of each, (NUM, K, 3) [m], at a rate [Hz]."""
+    """Draw 200 balls of a task; return K positions of each, (200, K, 3) [m], at a rate [Hz]."""
     steps = int(SECONDS * rate)
     if task == "hit":
         cases = pj.hit.draw(NUM)

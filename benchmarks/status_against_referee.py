@@ -179,7 +179,7 @@ def _others() -> dict[str, Row]:
     }
 
 
-# All rows by "task:name", the form in which --rows selects them.
+# All rows of the table; the option --rows selects them by their keys "task:name".
 ROWS = {
     f"{row.task}:{name}": row
     for rows in (_hits(), _catches(), _others())
@@ -188,7 +188,11 @@ ROWS = {
 
 
 def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
-    """Plan and judge the cases of one row; count how status and referee agree, by name."""
+    """Plan and judge the cases of one row; return counts of plans, by name.
+
+    The counts are of plans that are solved by their status, that the referee accepts, and that only
+    one of status and referee accepts.
+    """
     cases, planner = row.cases(num, seed), row.planner
     began = time.perf_counter()
     plans = jax.device_get(pj.plan(planner, cases))

@@ -104,8 +104,8 @@ class _Sweep:
 def _list_setups(cores: list[int], gpus: list[str]) -> dict[str, tuple[list[_Share], bool]]:
     """Return the four set-ups of sweeps by name.
 
-    A set-up is a list of machine parts, and whether the sweeps use Ray. One sweep runs on each
-    part, all sweeps at the same time.
+    A set-up has a list of parts of the machine (cores and GPUs), and whether its sweeps use Ray.
+    One sweep runs on each part, all at the same time.
     """
     whole, num = _Share(cores, gpus), len(gpus or cores)
     if not gpus:

@@ -61,7 +61,7 @@ OPTIONS = {
 
 
 def case_parameters(case: HitCase) -> dict[str, np.ndarray]:
-    """Return the parameters `PARAMETERS` of one case, which has no batch axis.
+    """Return the program's parameters, as named in `PARAMETERS`, for one case without batch axis.
 
     The ball's path with drag is integrated numerically and approximated by a polynomial.
     """

@@ -109,7 +109,7 @@ class Finding:
 
 
 class Oracle:
-    """Search for a feasible hit, first with `COARSE_PIECES` pieces, then with twice as many."""
+    """Search for a feasible hit with a trajectory of 20 pieces, then with twice as many pieces."""
 
     def __init__(self):
         self.coarse = Program(COARSE_PIECES, COARSE_SAMPLES, COARSE_FLOOR)
@@ -148,7 +148,7 @@ class Oracle:
 
         Limits of pieces that exceed them between samples are tightened, and the program is solved
         again, until the referee (an independent check) accepts the hit, but at most
-        `MOST_TIGHTENINGS` times.
+        five times.
         """
         guess, margins = self.coarse.halve(values, coarse), np.zeros(self.fine.pieces)
         unknowns, converged = self.fine.solve(values, guess)
@@ -202,7 +202,7 @@ def passes_referee(case: HitCase, coeffs: np.ndarray, durations: np.ndarray) -> 
 
 
 def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
-    """Return `num` starting points: first those of `STARTS`, then random ones."""
+    """Return `num` starting points of the search: eight fixed points, then random ones."""
     low, high = np.transpose(START_RANGES)
     draws = np.random.default_rng(seed).uniform(low, high, (max(num - len(STARTS), 0), 3))
     return [*STARTS, *map(tuple, draws)][:num]
@@ -210,7 +210,7 @@ def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
 
 @functools.cache
 def oracle() -> Oracle:
-    """Return the solver of this process, which the first call builds in about a second."""
+    """Return the program that searches feasible hits; the first call takes a second to build it."""
     return Oracle()
 
 

@@ -50,9 +50,10 @@ class Basis:
         return columns, outward[3 * rows]
 
     def sample(self, columns: Any) -> Any:
-        """Return the components `PLACES` (10, K) of K samples, from coefficients (C, 3).
+        """Return samples of the trajectory with coefficients `columns` (C, 3).
 
-        The unit of time is the mean duration of a piece.
+        The result (10, K) has ten components (`PLACES`) of each of K samples. The unit of time is
+        the mean duration of a piece.
         """
         sampled = [matrix @ columns for matrix in self._matrices]
         return ca.vertcat(*(sampled[order][:, axis].T for order, axis in PLACES))

@@ -32,7 +32,7 @@ SIZES = {
 
 
 def read_params(context: Any) -> dict[str, Any]:
-    """Return the parameters of one case, as named in `SIZES`, from the planner's prepared data.
+    """Return the parameters of IPOPT's problem for one case, by name.
 
     `context` is the result of the planner's `prepare` for a case with one ball, with NumPy leaves.
     """

@@ -190,8 +190,8 @@ class _Recorder(ca.Callback):
 def best_setting(peer: Peer, batch: Batch, accepted: Any) -> tuple[tuple, list[dict[str, Any]]]:
     """Select the fastest setting of IPOPT among those with the highest success rate.
 
-    In nine of ten cases the setting's objective must also be within `AS_GOOD` (relative) of the
-    least objective of all settings. If no setting fulfils this, the one with the least excess is
+    In nine of ten cases the setting's objective must also exceed the least objective of all
+    settings by at most 0.1 %. If no setting fulfils this, the one with the least excess is
     selected.
 
     Args:
