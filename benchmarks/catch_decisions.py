@@ -64,9 +64,9 @@ def decision_time(decision: Any, cases: Any, num: int) -> float:
 
 
 def run_row(bench: Bench, suite: str, name: str, decision: Any, options: Any) -> dict[str, Any]:
-    """Plan the cases of one suite with one decision; return success rates, times and ratios.
+    """Plan the cases of one suite; return success rates, times and ratios by name.
 
-    The successes are added to the run's summary. A decision sets the order and times of catches.
+    `decision` sets the order and times of catches. The successes are added to the run's summary.
     """
     cases: Any = jax.tree.map(np.asarray, pj.catch.draw(options.num, suite, options.seed))
     plans = pj.plan(DecidedPlanner(ExactCatch(), decision), cases)

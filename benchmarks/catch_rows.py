@@ -25,7 +25,7 @@ from planner_jax.task.catch.spec import DECISIONS, SUITES, TASK
 
 
 def run_row(bench: Bench, suite: str, name: str, options: argparse.Namespace) -> dict[str, Any]:
-    """Plan the cases of one suite with one planner; return success rates, costs and times by name.
+    """Plan the cases of one suite with the planner `name`; return rates, costs and times by name.
 
     The successes are added to the run's summary.
     """

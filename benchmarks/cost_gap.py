@@ -45,7 +45,7 @@ def cost_gaps(
 
     Returns:
         (K,), cost / best cost - 1 for the K cases that both searches solve. None if the planner
-            does not minimise a cost and the task names no other planner for this class of cases.
+        does not minimise a cost and the task names no other planner for this class of cases.
     """
     cases, plans = jax.tree.map(lambda leaf: np.asarray(leaf[:COMPARED]), (cases, plans))
     if isinstance(planner, DecidedPlanner):

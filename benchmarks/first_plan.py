@@ -90,8 +90,8 @@ def plan_in_new_process(row: Row, caches: str) -> dict[str, Any]:
 
     Returns:
         "cpu" and "wall", the times [s] until the first plans; "programs", the number of programs
-            that took more than 0.1 s to compile or load; "again", the CPU time [s] of a second
-            call; and "success" of each case.
+        that took more than 0.1 s to compile or load; "again", the CPU time [s] of a second
+        call; and "success" of each case.
     """
     usual = {name: text for name, text in os.environ.items() if not name.startswith("JAX_PERS")}
     command = [sys.executable, "-c", _PROCESS, json.dumps(dataclasses.asdict(row))]

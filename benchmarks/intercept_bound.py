@@ -87,7 +87,7 @@ def _draw_polygon(corners: np.ndarray, radius: float) -> tuple[np.ndarray, np.nd
 
 
 def _grow(plane: int, distance: float, stride: int) -> int:
-    """Return all cells that the point can reach from a set of cells by moving `distance` cells.
+    """Return all cells that a point can reach from a set of cells by moving `distance` cells.
 
     A set of cells is an integer with one bit for each cell, and `stride` bits for each row of
     cells.

@@ -43,8 +43,8 @@ def count_recoveries(cases: Any, plans: Any, passed: np.ndarray, to: str) -> tup
 
     Returns:
         The numbers of plans that already end at a standstill ("rests"), of recovery trajectories
-            that were found ("found"), and of failures by the name of the limit. Then the median
-            duration of one computation [s].
+        that were found ("found"), and of failures by the name of the limit. Then the median
+        duration of one computation [s].
     """
     counts: Counter[str] = Counter()
     seconds = []

@@ -120,7 +120,7 @@ def impact(case: dict, ball: list, impact_time, flight_time, up, norm) -> tuple:
 
     Returns:
         The ball's position, its velocities before and after the impact, the racket's unit normal,
-            and the length of the velocity change [m/s].
+        and the length of the velocity change [m/s].
     """
     share = impact_time / case["landing_time"]
     pos = sum(c * share**k for k, c in enumerate(ball))
