@@ -67,7 +67,7 @@ def time_call(function: Any, *arguments: Any, **how: Any) -> tuple[Any, float]:
 def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
     """Build a library, write it to the file `path`, and report build time and compile time.
 
-    `layout` names the division of the boxes' faces into cells, `regime` the joint limits.
+    `layout` names the division of two boxes around the arm into cells, `regime` the joint limits.
     """
     given: Any = REGIMES[regime]
     at_rest: Any = np.asarray(given.ends_at_rest)

@@ -117,7 +117,6 @@ class Times:
 
 
 def stack(trees: list) -> Any:
-    """Stack pytrees of equal structure into one batch, with a new leading axis."""
     return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 

@@ -1,4 +1,4 @@
-"""Compare the costs of plans with the optimum that a long search finds, for the benchmarks."""
+"""Compare the costs of plans with the optimum, which a long search finds. Benchmarks use it."""
 
 from collections.abc import Sequence
 from typing import Any

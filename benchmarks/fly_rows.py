@@ -184,7 +184,7 @@ def hits(
 
 
 def exact_rows(args: Any) -> None:
-    """Print lines without noise: errors of the flown contact, and of the hit ball's landing."""
+    """Print lines without sensor noise: errors of the contact, and of the hit ball's landing."""
     for rate in (0.0, CATCH_RATE):
         name = f"no noise, catch, re-planned {rate:g} Hz"
         if flights := catches(name, Loop(CATCH_WORLD, replan=rate), args, 0.0):
@@ -214,7 +214,7 @@ def report_contact(flown: Flown) -> None:
 
 
 def catch_rows(args: Any) -> None:
-    """Print lines with noise for catches of one, two and three balls, thrown 0.8 s apart."""
+    """Print lines with sensor noise for catches of one, two and three balls, thrown 0.8 s apart."""
     for number in (1, 2, 3):
         world = dataclasses.replace(CATCH_WORLD, num_balls=number)
         loop = Loop(world, LAB, replan=CATCH_RATE)
@@ -225,7 +225,10 @@ def catch_rows(args: Any) -> None:
 
 
 def hit_rows(args: Any) -> None:
-    """Print lines with noise for hits in the six scenarios of [Yu2023bat], re-planned and not."""
+    """Print lines with sensor noise for hits in the six scenarios of [Yu2023bat].
+
+    Each scenario is simulated with and without re-planning.
+    """
     for rate in (HIT_RATE, 0.0):
         for name, regions in REAL_SCENARIOS.items():
             loop = Loop(HIT_WORLD, LAB, replan=rate, record=name == "S.6")

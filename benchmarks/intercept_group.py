@@ -57,7 +57,6 @@ def draw(num: int, seed: int) -> InterceptGroup:
 @jax.jit
 @jax.vmap
 def _places(paths: PlanePath, times: jax.Array) -> jax.Array:
-    """Return the positions (N, T, 2) [m] of N targets at times (T,) [s]."""
     at = jax.vmap(lambda path, time: path.at(time).pos, (None, 0))
     return jax.vmap(at, (0, None))(paths, times)
 

@@ -204,9 +204,10 @@ class Lattice:
         """Compute the lattice's speed levels, and all moves between its states.
 
         Returns:
-            levels: (S,) [m/s], speed levels.
-            shifts: bit shifts of a straight move, indexed by half layer, speed and heading.
-            turns: greatest numbers of heading steps of a turn, indexed by layer and speed.
+            levels: (S,) [m/s], the S speed levels.
+            shifts: bit shifts of a straight move, indexed by half of a time layer, speed and
+                heading.
+            turns: greatest numbers of heading steps of a turn, indexed by time layer and speed.
         """
         scene = self.scene
         level = scene.acceleration * scene.dt

@@ -60,7 +60,7 @@ SEARCHES = ("bound", "minimal", "strict")
 
 
 def scenes(cases: InterceptCase) -> list[Scene]:
-    """Convert a batch of cases to scenes: plain numbers, with target positions at all layers."""
+    """Convert cases to scenes: plain numbers, with the target's position at each layer of time."""
     ends = np.asarray(cases.time, float)
     layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
     times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)
@@ -105,7 +105,6 @@ def scenes(cases: InterceptCase) -> list[Scene]:
 @jax.jit
 @jax.vmap
 def _places(path: PlanePath, times: jax.Array) -> jax.Array:
-    """Return the positions (T, 2) [m] of a target at times (T,) [s]."""
     return jax.vmap(lambda time: path.at(time).pos)(times)
 
 

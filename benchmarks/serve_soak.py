@@ -106,10 +106,7 @@ def distance_off(answer: Answer, height: float, gravity: float, ball: np.ndarray
 
 
 class Naps:
-    """Process that sleeps repeatedly, and records when the system woke it too late.
-
-    It is bound to one core, or runs on any core if `core` is None.
-    """
+    """Process that sleeps repeatedly, and records when the system woke it too late."""
 
     def __init__(self, core: int | None = None) -> None:
         words = [sys.executable, "-S", "-c", SLEEPER, str(NAP), str(GAP)]

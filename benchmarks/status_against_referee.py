@@ -49,7 +49,6 @@ class Row:
 
     @property
     def card(self) -> Any:
-        """The specification of the row's task."""
         return pj.task_named(self.task)
 
     @property

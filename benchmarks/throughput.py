@@ -154,7 +154,6 @@ def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
 
 
 def _tell(text: str) -> None:
-    """Print to stderr what the command waits for, or a first figure."""
     print(text, file=sys.stderr, flush=True)
 
 

@@ -210,7 +210,6 @@ def starting_points(num: int, seed: int) -> list[tuple[float, ...]]:
 
 @functools.cache
 def oracle() -> Oracle:
-    """Return the program that searches feasible hits; the first call takes a second to build it."""
     return Oracle()
 
 

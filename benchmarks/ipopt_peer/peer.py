@@ -138,7 +138,7 @@ class Peer:
     def iterates(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch
     ) -> list[np.ndarray]:
-        """Solve all cases without timing; return IPOPT's iterates (steps + 1, n) for each case."""
+        """Return for each case the n variables after each iteration of IPOPT, (steps + 1, n)."""
         size = batch.starts.shape[1]
         program = self.programs[False]
         callback = _Recorder(size, program.num_constraints, batch.params.shape[1])
