@@ -46,7 +46,7 @@ STRAIGHT = OnlineBlock(searches=(Search(straight=48, tries=0),))
 
 
 def from_home(cases: Any, homes: np.ndarray) -> Any:
-    """Combine B cases with H home poses (H, 6) [rad]: return H x B cases, ordered by pose."""
+    """Combine B cases with H start poses (H, 6) [rad]: return H x B cases, ordered by pose."""
     num = len(homes)
 
     def repeat(leaf: Any) -> np.ndarray:
@@ -60,13 +60,13 @@ def from_home(cases: Any, homes: np.ndarray) -> Any:
 
 
 def share_solved(planner: Any, cases: Any, homes: np.ndarray) -> np.ndarray:
-    """Return the share of cases that a planner reports as solved, for H home poses, (H,)."""
+    """Return for H start poses of the arm the share of cases that a planner solves, (H,)."""
     plans = pj.plan(planner, from_home(cases, homes))
     return pj.are_solved(plans).reshape(len(homes), -1).mean(axis=1)
 
 
 def draw_candidates(random: np.random.Generator, num: int, around: np.ndarray | None) -> np.ndarray:
-    """Draw `num` random home poses, joint angles (num, 6) [rad], without a collision.
+    """Draw `num` random poses of the arm, joint angles (num, 6) [rad], without a collision.
 
     The angles are uniform between fixed bounds if `around` is None. Otherwise they are normal, with
     the mean and standard deviation of the poses `around` (E, 6) [rad].

@@ -120,7 +120,7 @@ def search_long(cases: pj.block.BlockCase, index: np.ndarray, starts: int, lanes
 
 
 def find_blocked(cases: pj.block.BlockCase, planner: Any) -> np.ndarray:
-    """Return for each case (B,) whether the referee accepts the planner's motion as a block."""
+    """Return for each case (B,) whether an independent check accepts the planner's block."""
     plans = pj.plan(planner, cases)
     return np.asarray(pj.block.judge(cases, plans).success & pj.are_solved(plans))
 

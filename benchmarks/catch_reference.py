@@ -2,9 +2,9 @@
 
     python -m benchmarks.catch_reference [--data tests/data] [--repeats 5] [--out DIR]
 
-A quadrotor catches a thrown ball with a net. The authors of [Yu2023catch] published a C++ program,
-an easy and a hard set of throws, and the program's optima. The program uses the reference headers
-of MINCO and L-BFGS, in one thread and in double precision. On the easy set it takes 2.96 ms and 220
+A quadrotor catches a thrown ball with a net. A C++ program for this problem [Yu2023catch] is
+published, with its optima for an easy and a hard set of throws. It uses the reference headers of
+MINCO and L-BFGS, in one thread and in double precision. On the easy set it takes 2.96 ms and 220
 iterations a plan, and makes 320 plans/s on a core. On the hard set it takes 4.40 ms a plan and
 solves 98 % of the throws. With better settings of its search it makes 582 plans/s on the easy set
 and 453 on the hard set.

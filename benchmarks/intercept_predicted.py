@@ -214,7 +214,7 @@ class Drives:
         self.curvature[lanes, first:] = setpoints.curvature
 
     def judge(self, truth: InterceptCase) -> InterceptVerdict:
-        """Judge the whole drives against the true targets; return the referee's verdict."""
+        """Judge the whole drives against the true targets by the referee, an independent check."""
         loose = dataclasses.replace(truth, tolerance=np.full_like(truth.tolerance, SUCCESS))
         whole = dataclasses.replace(
             self.plans,

@@ -74,7 +74,7 @@ class CatchVecEnv(vec_env.VecEnv):
         return np.array(self._state.obs)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Plan all cases with the A action values of each, (LANES, A), and draw the next cases."""
+        """Plan all cases with the policy's actions, A numbers for each; draw the next cases."""
         self._state = self._step(self._state, jnp.asarray(actions, jnp.float32))
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:

@@ -189,8 +189,8 @@ ROWS = {
 def compare(row: Row, num: int, seed: int) -> dict[str, Any]:
     """Plan and judge the cases of one row; return counts of plans, by name.
 
-    The counts are of plans that are solved by their status, that the referee accepts, and that only
-    one of status and referee accepts.
+    The counts are of plans that are solved by their status, that the referee (an independent check)
+    accepts, and that only one of status and referee accepts.
     """
     cases, planner = row.cases(num, seed), row.planner
     began = time.perf_counter()

@@ -119,7 +119,7 @@ class Oracle:
         """Search for a feasible hit in one case from several starting points.
 
         The case has NumPy leaves without a batch axis. The search ends at the first hit that the
-        referee accepts.
+        referee, an independent check, accepts.
         """
         began, finding, in_vain = time.process_time(), Finding(), math.inf
         values = case_parameters(case)
