@@ -196,10 +196,7 @@ def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the basis (S, m) of a spline at S samples, and a pseudo-inverse.
-
-    The pseudo-inverse is of the columns 2 to `stop` - 1, whose control points are fitted.
-    """
+    """Return the spline basis at S samples (S, m), and the pseudo-inverse of its fitted columns."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 

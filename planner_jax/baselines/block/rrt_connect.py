@@ -32,7 +32,7 @@ def _ompl() -> tuple[ModuleType, ModuleType]:
 
 @dataclasses.dataclass(frozen=True)
 class RrtConnectBlock(PathThenTime):
-    """The planner `rrt-connect`, which tries end poses one by one; needs the extra `arm-peers`."""
+    """The planner `rrt-connect`: RRT-Connect to one end pose after another (extra `arm-peers`)."""
 
     packages: ClassVar[tuple[str, ...]] = ("toppra", "ompl")
     reach: float = 1.0  # [rad], greatest length of a tree's edge in joint space
@@ -86,7 +86,6 @@ def _validator(base: ModuleType, information: object, free: FreeSpace) -> object
 
     class Edges(base.MotionValidator):
         def checkMotion(self, begin: Sequence[float], end: Sequence[float]) -> bool:  # noqa: N802
-            """Return whether an edge is collision-free; OMPL prescribes the method's name."""
             return bool(free.are_edges_free(_numbers(begin), _numbers(end)[None])[0])
 
     return Edges(information)

@@ -50,13 +50,12 @@ class Candidates:
 def falling_time(target, height: Array, horizon: Array, nodes: int) -> tuple[Array, Array]:
     """Return the time () [s] at which a target first falls through a height, and whether it does.
 
-    The horizon is divided into `nodes` equal intervals. The first interval in which the target
-    starts above and ends below the height is bisected. Without such an interval the time is the
-    horizon.
+    The time from 0 to `horizon` () [s] is divided into `nodes` equal intervals. The first interval
+    in which the target starts above and ends below the height is bisected. Without such an interval
+    the horizon is returned.
     """
 
     def above(time: Array) -> Array:
-        """Return whether the target is above the height at a time [s]."""
         return state_at(target, time).pos[2] > height
 
     times = horizon * jnp.asarray(np.arange(nodes + 1) / nodes, horizon.dtype)
@@ -173,7 +172,7 @@ class MppCatch(Planner):
         find = lambda target, end: falling_time(target, height, end, self.time_nodes)  # noqa: E731
         fall, found = jax.vmap(find)(context.targets, context.horizon)
         before = jnp.concatenate([jnp.zeros_like(fall[:1]), fall[:-1]])
-        # An invalid time becomes a short segment, so that later segments stay finite.
+        # If a target falls earlier than the previous one, its segment is short, but not negative.
         duration = jnp.maximum(fall - before, _SHORTEST)
         times = jnp.cumsum(jnp.where(context.active, duration, 0.0))
         late = jnp.maximum(_SHORTEST - (fall - before), jnp.where(found, -1.0, 1.0))

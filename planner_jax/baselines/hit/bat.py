@@ -276,7 +276,10 @@ class BatHit(OptimisedPlanner):
         return self.terminal_weight * (jnp.sum(smooth_hinge(excess, self.hinge_width)) + defect)
 
     def _penalty(self, motion: Motion, duration: Array, case: HitCase) -> Array:
-        """Return the penalty on limits along the trajectory (eq. 18a), with squares in SI units."""
+        """Return the penalty on limits along the trajectory (eq. 18a).
+
+        It penalises the differences between squared quantities and squared limits, in SI units.
+        """
         limits = case.limits
         along = jnp.stack(motion_excess(motion, case.gravity, limits))
         one = jnp.ones_like(limits.speed)

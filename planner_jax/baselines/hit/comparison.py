@@ -125,5 +125,4 @@ def explain_table(manifest: Entries) -> str:
 
 
 def _knows_same_serves(summary: Entries, other: str) -> bool:
-    """Return whether the published planner's outcomes on the run's own serves are known."""
     return any(other in c["published_on_these_serves"] for c in summary["per_scenario"].values())

@@ -194,7 +194,7 @@ class PublishedRates:
 
 
 def read_published_rates() -> PublishedRates:
-    """Read the success rates of [Yu2023bat] from a CSV file, columns by court.PLANNERS."""
+    """Read the success rates of [Yu2023bat]; columns are planners in the order `court.PLANNERS`."""
     text = (resources.files("planner_jax.baselines.hit") / "published_rates.csv").read_text(
         encoding="utf-8"
     )

@@ -123,7 +123,7 @@ def least_length(pose, goal, middle, curvature, lengths):
 
     Args:
         pose: (3,) x, y [m] of the rear axle and heading [rad].
-        goal: a `Goal`.
+        goal: pose of the rear axle, or point for the body's centre if its heading is free.
         middle: [m], distance of the body's centre ahead of the rear axle.
         curvature: [1/m], greatest curvature.
         lengths: (6, 3), workspace.

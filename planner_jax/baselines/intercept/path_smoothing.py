@@ -42,7 +42,7 @@ _CURVATURE_TOLERANCE = 1e-3
 
 @dataclasses.dataclass(frozen=True)
 class Smoothing:
-    """Weights and step of [Qu2022, Section V-C], and sizes of the compiled program."""
+    """Weights, step size and numbers of the gradient descent [Qu2022, Section V-C]."""
 
     obstacle: float = 0.1  # weight of the cost of obstacles
     curvature: float = 0.1  # weight of the cost of curvature above the limit

@@ -123,7 +123,7 @@ class PathThenSpeed(Planner):
 
     def solve_at_once(self, cases: InterceptCase, attempt: Search) -> InterceptPlan:
         """Return the plans of a batch, computed together with `vmap`."""
-        # Every case uses the largest number of time layers, so that all loops have equal lengths.
+        # All cases search with the same number of time steps, so that all loops are equally long.
         layers = jnp.max(jax.vmap(lambda case: make_grid(case, attempt.lattice).num)(cases))
         return jax.vmap(lambda case: self.solve_in_layers(case, attempt, layers))(cases)
 
@@ -177,7 +177,10 @@ def best_of(plans: InterceptPlan) -> Array:
 
 
 def lattice(**fields: object) -> PathThenSpeed:
-    """Create the planner `lattice`, which tries eight paths; `fields` are the planner's options."""
+    """Create the planner `lattice`, which plans a speed along each of eight paths.
+
+    `fields` are the planner's options.
+    """
     return dataclasses.replace(PathThenSpeed(), **fields)
 
 

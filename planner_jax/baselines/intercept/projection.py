@@ -149,7 +149,7 @@ def overlap(
         mine = [x * corner[None, :, 0] + y * corner[None, :, 1] for corner in own]
         other = [x * theirs[:, k, :1] + y * theirs[:, k, 1:] for k in range(theirs.shape[1])]
         rate = x * movers.velocity[:, :1] + y * movers.velocity[:, 1:]
-        # Body and polygon overlap while -after < rate t < before.
+        # Along this axis body and polygon overlap at the times t with -after < rate t < before.
         before = _most(mine) - _least(other)
         after = _most(other) - _least(mine)
         is_still = jnp.abs(rate) < 1e-7
@@ -197,14 +197,15 @@ def _cover_run(
     middle = (start + 0.5 * width)[:, None]
     begin, finish = begin[None], finish[None]
     is_in = own[None] & (begin < start[:, None] + width) & (finish > start[:, None])  # (slabs, N)
-    # Every point blocks a rectangle. The times of its sides are relative to the slab's middle.
+    # Every path point blocks a rectangle of station and time. `left` and `right` are the times of
+    # its sides, relative to the middle of the slab (time interval).
     left = jnp.clip(begin - middle, -0.5 * width, 0.5 * width)
     right = jnp.clip(finish - middle, -0.5 * width, 0.5 * width)
 
     def edge(side: float) -> Array:
-        """Return the lowest line above the rectangles' upper corners (side 1).
+        """Return the lowest straight line above all rectangles (side 1).
 
-        Side -1 gives the highest line below their lower corners.
+        Side -1 gives the highest line below all rectangles. The slopes are those of `_SLOPES`.
         """
         height = side * station + half_step
         highest = jnp.max(jnp.where(is_in, height, -jnp.inf), axis=1)

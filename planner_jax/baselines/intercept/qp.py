@@ -28,8 +28,9 @@ from planner_jax.core.protocol import Status
 class QpTemplate:
     """The arrays that programs with equal matrices share, computed by `qp_template`.
 
-    A program has n unknowns x = base e + Z y, q equalities E x = e and M bounded rows R x. If the
-    equalities fix a row of R x, its row of `normals` is 0 and its scale 1.
+    A program has n unknowns x, q equalities E x = e and M bounded rows R x. The vectors that fulfil
+    the equalities are x = base e + Z y, with d free coordinates y. If the equalities fix a row of
+    R x, its row of `normals` is 0 and its scale 1.
     """
 
     base: Array | np.ndarray  # (n, q), maps e to the optimum without bounds

@@ -138,7 +138,7 @@ def without_movers(case: InterceptCase) -> InterceptCase:
     """Return the case without moving obstacles, with a target that stands at the meeting point."""
     goal = case.target.at(case.time).pos
     still = TurningPath(pos=goal, vel=jnp.zeros_like(goal), turn_rate=jnp.zeros_like(case.time))
-    # A single absent obstacle, so that moving obstacles need no computing time.
+    # One obstacle that is marked as absent, since arrays without obstacles are not supported.
     none = Obstacles(
         centre=jnp.zeros((1, 2), goal.dtype),
         corners=jnp.zeros((1, 3, 2), goal.dtype),

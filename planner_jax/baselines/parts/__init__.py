@@ -1,1 +1,1 @@
-"""Motion primitives that several published methods share."""
+"""Trajectories in closed form (motion primitives) that several published methods share."""

@@ -1,4 +1,4 @@
-"""Minimum-jerk primitives: quintics between two given states [Yu2023bat, eqs 15-17]."""
+"""Minimum-jerk trajectories between two given states [Yu2023bat, eqs 15-17]."""
 
 import jax.numpy as jnp
 from jax import Array

@@ -37,8 +37,8 @@ from planner_jax.task.block.plan import BlockPlan, explain_status, make_empty_pl
 from planner_jax.task.block.scene import Box
 
 _HIGHEST = lax.Precision.HIGHEST
-# Weights of the squared joint changes. The wrist joints have low weights, since they carry little
-# mass; the flange joint keeps its stored angles.
+# Weights of the squared changes of six joints by a warp. The wrist joints have low weights, since
+# they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
 # [rad^2], penalty of the squared distance between the motion's cells and the ball, in cell sizes.
 _AWAY = 0.02
@@ -138,7 +138,8 @@ class AdaptBlock(Planner):
         total = jnp.asarray(step_weights(pieces, (1.0,))[1][0], dtype)
         ends = case.angles[None] + jnp.einsum("k,nki->ni", total, steps, precision=_HIGHEST)
         angles, is_pose = poses.angles.reshape(num, 8, 6), jnp.isfinite(poses.effort)
-        # Select the branch nearest to the stored end pose; angles are equal modulo full turns.
+        # Of the eight solutions of inverse kinematics, select the one nearest to the stored end
+        # pose; full turns make no difference.
         turn = angles - ends[:, None, None]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
         weights = jnp.asarray(_WEIGHTS, dtype)[None, None, None]

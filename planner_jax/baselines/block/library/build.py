@@ -202,10 +202,7 @@ def plan_pairs(
         home: (6,) [rad], joint angles at which motions start.
         tunnel: tunnels (spaces between the two cells) of all pairs.
         pairs: (N,), numbers of the pairs to plan for.
-        old: (N, W), the pairs' rows of W numbers in another scene, used as initial guesses.
-
-    Returns:
-        (N, W), rows as of `pack_rows`.
+        old: (N, W), the pairs' table rows for another scene, used as initial guesses.
     """
     straight = StraightPair(setting, host_leaf(home))
     bent = BentPair(setting, host_leaf(home))
@@ -325,11 +322,7 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Return the least distance from obstacles along each of N motions, (N,) [m].
-
-    `steps` (N, K, 6) [rad] are joint rates at K knots times the duration, and `shares` the sample
-    times as fractions of the duration.
-    """
+    """Return the least distance from obstacles along each of N motions, (N,) [m]."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 
@@ -368,7 +361,7 @@ class _Parts:
         }
         text = json.dumps(header, sort_keys=True)
         known = folder / "what.json"
-        # Parts of another library or version are discarded.
+        # Delete files of another library, or of another version of the planning method.
         if not known.exists() or known.read_text() != text:
             self.remove()
             folder.mkdir(parents=True)

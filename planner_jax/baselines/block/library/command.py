@@ -86,10 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print for which share of the pairs of cells a library has motions.
-
-    With a path `map`, also draw the shares on the faces of both boxes.
-    """
+    """Print which share of the pairs of cells has motions; draw it at the path `map`, if given."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -119,10 +116,9 @@ def check_library(path: str, *, num: int = 2000, seed: int = 0) -> None:
 
 
 def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = False) -> None:
-    """Plan the motions again that touch a pole at the new position `pole` (x, y) [m].
+    """Plan the motions again that touch a pole at a new position (x, y) [m]; write the file `out`.
 
-    The new library is written to `out`. With `retry`, pairs of cells without a motion are planned
-    again, too.
+    With `retry`, pairs of cells without a motion are planned again, too.
     """
     library = load_library(path)
     require(len(pole) == 2, "pole", "two numbers [m]", shown=f"{len(pole)} numbers")

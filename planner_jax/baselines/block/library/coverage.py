@@ -39,7 +39,7 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction (H,) of the pairs in the mask `of` (P,) that have a motion."""
+        """Return the fraction (H,) of the pairs in the mask `of` (P,) that have stored motions."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
@@ -54,7 +54,7 @@ def coverage(library: Library) -> Coverage:
         is_feasible=tunnel.is_feasible,
         is_centred=tunnel.is_centred,
         found=found,
-        # A shield counts as large enough with a tolerance of 0.1 mm.
+        # Half of the shield's edge may be 0.1 mm too short, because of rounding errors.
         is_sure=found & (far <= half + 1e-4),
     )
 

@@ -3,8 +3,8 @@
 A pair is one cell of the outer and one cell of the inner box around the arm that a ball passes.
 `build` calls these planners for every pair. The paper plans to equidistant points of the line
 between the two cells' centres, and stores the motion of least duration. Here a ball flies from
-centre to centre, and the planners store the motion that still arrives in time if this ball enters
-the outer box as early as possible. Early means a short time after the start of the motion.
+centre to centre, and the planners store the motion with which this ball may enter the outer box
+earliest after the start of the motion.
 """
 
 import dataclasses
@@ -98,10 +98,7 @@ class PairPlanner(Planner):
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return case and flight of a ball through both cells' centres.
-
-        `entry` () [s] is the time at which the ball enters the outer box.
-        """
+        """Return case and flight of a ball through both cells' centres, which enters at `entry`."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -232,7 +229,7 @@ class StraightPair(PairPlanner):
         return (Attempt(),)
 
     def solve(self, pair: PairCase, attempt: Attempt) -> PairPlan:
-        """Return the plan of one pair: the first straight motion that keeps all limits."""
+        """Return the plan of one pair of cells: the first straight motion that keeps all limits."""
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)
         possible = jnp.sum(poses.effort < 0.5 * _TOUCHING)
@@ -324,7 +321,7 @@ class BentPair(PairPlanner):
         first = jnp.where(none, high, 0.5 * (quickest + high))
 
         def shift(point: Array, old: Array, new: Array) -> Array:
-            """Shift the end of a motion for a ball whose entry time changes from `old` to `new`."""
+            """Change the duration of a motion by the change of the ball's entry time."""
             return point.at[-1].set(jnp.maximum(point[-1] + new - old, 0.02))
 
         def one_round(k: Array, state: tuple) -> tuple:

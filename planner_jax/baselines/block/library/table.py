@@ -130,7 +130,6 @@ def lookup(table: Table, ball: BallState, gravity: Array, home: Array | int = 0)
     layout = table.layout
 
     def at(time: Array) -> tuple[list[Array], list[Array]]:
-        """Return the position [m] and the velocity [m/s] of the ball at a time."""
         x, y, z = (ball.pos[k] + ball.vel[k] * time for k in range(3))
         fall = gravity * time
         return [x, y, z - 0.5 * fall * time], [ball.vel[0], ball.vel[1], ball.vel[2] - fall]
@@ -197,13 +196,9 @@ class Library:
 def library_of(
     rows: Array | np.ndarray, homes: Array | np.ndarray, layout: Layout, setting: Setting
 ) -> Library:
-    """Create a library from its table's rows and H start poses.
+    """Create a library from H start poses `homes` (H, 6) [rad] and the motions that start there.
 
-    Args:
-        rows: (H, P, W), for P pairs of cells, as from `pack_rows`.
-        homes: (H, 6) [rad], joint angles at which motions start.
-        layout: the division of the two boxes around the arm into cells.
-        setting: arm, joint limits and scene.
+    `rows` (H, P, W) has the motions for P pairs of cells, as rows of `pack_rows`.
     """
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
