@@ -40,7 +40,7 @@ def _compile(tree: Hashable, layout: tuple, dtype: np.dtype) -> None:
 
 
 class FreeSpace:
-    """The joint angles of one case's arm that are within limits and collision-free."""
+    """Collision checks of the arm of one case: joint angles within limits, and free of contacts."""
 
     def __init__(self, case: BlockCase, margin: float) -> None:
         """Compile the checks; `margin` [m] is the least distance from obstacles that is free."""

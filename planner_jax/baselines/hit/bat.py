@@ -252,7 +252,7 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return waypoint offsets, end states, piece duration, impact and defect of `point`."""
+        """Return waypoint offsets, end states, piece duration, impact and defect of eqs 13-14."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
@@ -326,5 +326,8 @@ class BatHit(OptimisedPlanner):
 
 
 def bat_lite(**options: Any) -> BatHit:
-    """Create the baseline `bat-lite`, a `BatHit` without transition; `options` are its fields."""
+    """Create the baseline `bat-lite`: `BatHit` without the state at which a swing starts.
+
+    `options` are other fields of `BatHit`.
+    """
     return BatHit(transition=False, **options)

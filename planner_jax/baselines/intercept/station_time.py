@@ -30,7 +30,10 @@ class Blocked:
     present: Array  # (P,) bool, which of the P quadrangles are used
 
     def edges_at(self, time: Array) -> tuple[Array, Array]:
-        """Return stations (..., P) [m] of lower and upper edges at times (..., P) [s]."""
+        """Return the stations [m] of the lower and upper edges of P quadrangles at times [s].
+
+        `time` and both results have the shape (..., P).
+        """
         lead = range(time.ndim - 1)
         start, end, lower, upper = (
             jnp.expand_dims(each, lead) for each in (self.start, self.end, self.lower, self.upper)

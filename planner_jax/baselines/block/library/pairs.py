@@ -41,7 +41,7 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps
 # FINE, since a shield that blocks some balls of a pair of cells is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], greatest entry time of a ball minus the entry time for the quickest motion without obstacles.
+# [s], a ball may enter at most this time later than the quickest motion without obstacles allows.
 _PATIENCE = 0.8
 # [rad], greatest angle of the shield's edge from horizontal, if it must block all balls of a pair.
 _ROLL = np.deg2rad(1.0)

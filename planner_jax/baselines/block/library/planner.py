@@ -76,7 +76,8 @@ class LibraryBlock(Planner):
     def home_of(self, case: BlockCase) -> tuple[Array, Array]:
         """Return the index of the start pose nearest to the arm, and whether the library fits.
 
-        The library fits if the arm stands at this pose, and arm, limits and scene are equal.
+        The library fits if the arm stands still at this pose, and if arm, limits and scene equal
+        the library's.
         """
         off = jnp.max(jnp.abs(jnp.asarray(self.library.table.homes) - case.angles[None]), axis=1)
         home = jnp.argmin(off)
