@@ -252,7 +252,7 @@ class BatHit(OptimisedPlanner):
         )
 
     def _unpack(self, point: Array, context: HitContext):
-        """Return waypoint offsets, end states, piece duration, impact and defect of eqs 13-14."""
+        """Return waypoint offsets, end states, piece duration, impact, and the impact's defect."""
         natural = point * jnp.asarray(self.scale, point.dtype)
         waypoints = natural[: self.num_offsets].reshape(-1, 3)
         impact, defect = self.impact(natural[self.num_offsets :], context)
