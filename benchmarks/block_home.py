@@ -33,7 +33,7 @@ from planner_jax.task.block.clearance import clearances, num_of_pole
 from planner_jax.task.block.default_planner import OnlineBlock, Search
 from planner_jax.task.block.scene import paper_scene
 
-# [rad] Bounds of the six joint angles from which the first round draws poses.
+# [rad] Bounds between which the first round draws the six joint angles of a pose.
 LOWEST = np.array([-0.8, -1.05, -2.0, -0.5, -1.9, -0.8])
 HIGHEST = np.array([0.8, 1.5, 0.95, 0.5, 1.9, 0.8])
 # [m] Least distance between the arm at home and the obstacles or itself, and from the pole.

@@ -65,8 +65,7 @@ def _reference_planner(planner: Any, cases: Any, card: Task | None) -> Any:
     if card is None or card.yardstick is None:
         return None
     yardstick = card.planner(card.yardstick)
-    # The reference planner cannot plan re-planning problems and groups of targets, which have other
-    # classes.
+    # Re-planning problems and groups of targets have other classes of cases.
     return yardstick if isinstance(cases, yardstick.case_type) else None
 
 

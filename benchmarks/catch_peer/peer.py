@@ -81,7 +81,7 @@ class Settings:
 
 
 # The fastest settings of three kinds of search. On at least 98 % of both published sets their cost
-# is within `AS_GOOD` of the published cost. This leaves a margin above the required 97 %, because
+# is within 0.1 % of the published cost. This leaves a margin above the required 97 %, because
 # another processor may round differently.
 SEARCHES = {
     "C++, own L-BFGS, one core, double": Settings(

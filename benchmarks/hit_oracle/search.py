@@ -28,13 +28,13 @@ TOLERANCE = 1e-3  # The referee accepts an excess up to this value.
 COARSE_PIECES, COARSE_SAMPLES = 20, 3  # Number of pieces, and of samples of each piece, at first.
 FINE_SAMPLES = 4  # Number of samples of each piece after the pieces were halved.
 COARSE_FLOOR, FINE_FLOOR = -0.01, -0.003  # Lower bounds of the excess before and after halving.
-# The pieces of a solution with a larger excess are not halved, because this reduces the excess by
-# 0.03 at most.
+# Excess up to which the pieces of a solution are halved, to refine it. Halving reduces the excess
+# by 0.03 at most.
 REFINED_BELOW = 0.06
 # The pieces of a solution are halved only if its excess is at least this much below the excess of
 # every solution for which halving has failed.
 NEW_BELOW = 0.001
-# The search of a case ends after HOPELESS_STARTS starting points if all excesses are greater.
+# A case is abandoned after HOPELESS_STARTS starting points if every excess is > HOPELESS_ABOVE.
 HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5  # Maximum number of times that limits of a solution are tightened.
 INFEASIBLE_ABOVE = 0.01  # A case counts as infeasible if its least excess is above this value.
