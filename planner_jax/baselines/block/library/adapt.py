@@ -101,7 +101,7 @@ class AdaptBlock(Planner):
         return self.efforts
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the library was built for the first of the cases."""
+        """Raise `ArgumentError` if the first case's arm, limits, scene or start does not fit."""
         self.stored.check(cases)
 
     def solve(self, case: BlockCase, attempt: Effort) -> BlockPlan:

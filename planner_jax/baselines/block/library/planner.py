@@ -54,7 +54,7 @@ class LibraryBlock(Planner):
         return (Attempt(),)
 
     def check(self, cases: BlockCase) -> None:
-        """Raise `ArgumentError` unless the library was built for the first of the cases."""
+        """Raise `ArgumentError` if the first case's arm, limits, scene or start does not fit."""
         first = jax.tree.map(lambda leaf: np.asarray(leaf), cases)
         if cases.batch_shape:
             first = jax.tree.map(lambda leaf: leaf[0], first)
