@@ -48,7 +48,7 @@ def draw_noise(lattice: Lattice, num: int, seed: int, candidates: int) -> PathNo
     ends = rng.gumbel(size=(num, candidates, lattice.levels, lattice.headings, 9))
     steps = rng.gumbel(size=(num, candidates, lattice.layers, 3 * (2 * SPAN + 1)))
     layers = rng.gumbel(size=(num, lattice.layers + 1))
-    return PathNoise(*(jnp.asarray(each, jnp.float32) for each in (layers, ends, steps)))
+    return PathNoise(*(each.astype(np.float32) for each in (layers, ends, steps)))
 
 
 def _velocity(level: Array, heading: Array, grid: Grid) -> Array:

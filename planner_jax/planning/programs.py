@@ -153,6 +153,9 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
+# XLA's older generator of code for a CPU takes 40 % less time. Programs for one case of a planner
+# that works in step are as fast with it; large batches, and loops over cases, are slower.
+_QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
@@ -207,7 +210,8 @@ def program_key(planner: Planner, attempt: Attempt, num: int, cases: PyTree) -> 
 
 def solve_one(planner: Planner, case: PyTree, attempt: Attempt) -> PyTree:
     """Return the plan of one case, with NumPy leaves; the case is sent as one vector."""
-    return call_packed(_solve_one, None, (planner, planner.load_attempt(attempt, case)), case)
+    own = planner, planner.load_attempt(attempt, case)
+    return call_packed(_solve_one, None, own, case, compiles_quickly=not planner.is_sequential)
 
 
 def _solve_one(_: None, own: PyTree, case: PyTree) -> PyTree:
@@ -215,17 +219,26 @@ def _solve_one(_: None, own: PyTree, case: PyTree) -> PyTree:
     return solve_cases(planner, case, loaded)
 
 
-def call_packed(function: Callable, static: Hashable, own: PyTree, case: PyTree) -> PyTree:
+def call_packed(
+    function: Callable,
+    static: Hashable,
+    own: PyTree,
+    case: PyTree,
+    *,
+    compiles_quickly: bool = False,
+) -> PyTree:
     """Return `function(static, own, case)` with NumPy leaves; the case is sent as one vector.
 
     The pure function is compiled once for each hashable `static` and each layout of the other
     arguments. `own` is a pytree that stays on the device, such as a planner. `case` has NumPy
-    leaves, at least one of them of a floating-point type.
+    leaves, at least one of them of a floating-point type. `compiles_quickly` selects a generator of
+    code that takes less time.
     """
     leaves, tree = jax.tree.flatten(case)
     arrays = [np.asarray(leaf) for leaf in leaves]
     kept, own_tree = jax.tree.flatten(own)
-    program = _program(function, static, own_tree, _layout(kept), tree, _layout(arrays))
+    layouts = _layout(kept), _layout(arrays)
+    program = _program(function, static, own_tree, tree, *layouts, compiles_quickly)
     pieces = [array.ravel() for array in arrays]
     vector = np.concatenate(pieces, dtype=program.dtype, casting="unsafe")
     packed = np.asarray(program.run(kept, vector))
@@ -264,9 +277,10 @@ def _program(
     function: Callable,
     static: Hashable,
     own_tree: PyTree,
-    own: _Layout,
     tree: PyTree,
+    own: _Layout,
     layout: _Layout,
+    compiles_quickly: bool,
 ) -> _Program:
     canonical = jax.dtypes.canonicalize_dtype
     dtype = canonical(np.result_type(*[d for _, d in layout if np.issubdtype(d, np.floating)]))
@@ -289,4 +303,5 @@ def _program(
         result.others = [(k, leaf.dtype) for k, leaf in enumerate(leaves) if leaf.dtype != dtype]
         return jnp.concatenate([leaf.ravel().astype(dtype) for leaf in leaves])
 
-    return _Program(jax.jit(run), dtype, result)
+    options = _QUICK_OPTIONS if compiles_quickly else None
+    return _Program(jax.jit(run, compiler_options=options), dtype, result)

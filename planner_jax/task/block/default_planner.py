@@ -30,7 +30,7 @@ from planner_jax.core.protocol import (
     select_first_solved,
     status_of,
 )
-from planner_jax.core.run_time import place_numbers, with_run_time_numbers
+from planner_jax.core.run_time import Fixed, place_numbers, with_run_time_numbers
 from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,
@@ -196,9 +196,14 @@ class OnlineBlock(Planner):
         """The searches for a plan, in the order in which they are tried."""
         return self.searches
 
-    def load_attempt(self, attempt: Search, cases: BlockCase) -> Search:
-        """Return a search as arguments of one compiled program, which all searches share."""
-        return place_numbers(attempt)
+    def load_attempt(self, attempt: Search, cases: BlockCase) -> Search | Fixed:
+        """Return a search as arguments of one compiled program, which all searches share.
+
+        For a single case, searches of straight motions alone have small programs of their own, so
+        that the first plan comes soon.
+        """
+        is_small = cases.batch_shape == () and not attempt.tries
+        return Fixed(attempt) if is_small else place_numbers(attempt)
 
     def solve(self, case: BlockCase, attempt: Search) -> BlockPlan:
         """Return the plan of one case: a straight motion, else least squares from the starts.
@@ -208,9 +213,12 @@ class OnlineBlock(Planner):
         cost after these steps.
         """
         flight, poses, order = self._rank(case)
+        straight = self._count_straight(flight, poses, attempt)
+        if isinstance(attempt.tries, int) and attempt.tries == 0:
+            plan = self._plan_straight(case, flight, poses, order, straight)
+            return dataclasses.replace(plan, status=explain_status(poses, plan.status))
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver, tries = attempt.solver, jnp.where(flight.comes, attempt.tries, 0)
-        straight = self._count_straight(flight, poses, attempt)
         kept = jnp.where(attempt.in_turn, 0, jnp.minimum(attempt.kept, tries))
 
         def take_turn(turn: tuple[Array, LevenbergState, Array, BlockPlan]) -> tuple:
@@ -264,17 +272,7 @@ class OnlineBlock(Planner):
         """
         flight, poses, order = self._rank(case)
         straight = self._count_straight(flight, poses, attempt)
-
-        def plan_straight(k: Array) -> BlockPlan:
-            point = self.encode_straight(case, poses, order[k])
-            return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
-
-        best = make_empty_plan(case, self.pieces)
-        if self.brisk:
-            keep_quicker = lambda k, best: select(plan_straight(k), best)  # noqa: E731
-            best = lax.fori_loop(0, straight, keep_quicker, best)
-        else:
-            best = select_first_solved(plan_straight, straight, best)
+        best = self._plan_straight(case, flight, poses, order, straight)
         is_open = ~is_solved(best.status)
         model = lambda point: self.model(point, case, flight)  # noqa: E731
         solver = attempt.solver
@@ -309,6 +307,20 @@ class OnlineBlock(Planner):
         groups = (attempt.tries + _GROUP - 1) // _GROUP
         plan = lax.fori_loop(0, groups, try_group, best)
         return dataclasses.replace(plan, status=explain_status(poses, plan.status))
+
+    def _plan_straight(
+        self, case: BlockCase, flight: Flight, poses: EndPoses, order: Array, num: Array
+    ) -> BlockPlan:
+        """Return the first solved plan of `num` straight motions, or the quickest if `brisk`."""
+
+        def plan_to(k: Array) -> BlockPlan:
+            point = self.encode_straight(case, poses, order[k])
+            return self.finish(case, flight, point, jnp.zeros((), jnp.int32))
+
+        best = make_empty_plan(case, self.pieces)
+        if self.brisk:
+            return lax.fori_loop(0, num, lambda k, best: select(plan_to(k), best), best)
+        return select_first_solved(plan_to, num, best)
 
     def _rank(self, case: BlockCase) -> tuple[Flight, EndPoses, Array]:
         flight = flight_of(case)
