@@ -14,8 +14,8 @@ from sweeps import RunTests, columns, quick_hit, stop_after
 import planner_jax as pj
 from planner_jax.baselines.hit.published import read_published_rates
 from planner_jax.core.errors import ArgumentError
+from planner_jax.planning import programs
 from planner_jax.planning.plan import plan
-from planner_jax.planning.programs import solve_on_devices
 from planner_jax.referee.hit import referee_hits
 from planner_jax.robot import quadrotor
 from planner_jax.runs.dataset import ROW_GROUP, Dataset, encode
@@ -201,7 +201,7 @@ def test_published_outcomes_stand_beside_the_plans_of_the_same_serves(tmp_path, 
 
 
 def test_a_single_chunk_is_timed_warm_too(tmp_path, no_report):
-    solve_on_devices.clear_cache()  # that program alone, and not all others' of the process
+    programs._solve_on_devices.clear_cache()  # no program of another kind
     serves = trial_files(tmp_path / "serves")
     manifest = start_sweep(TASK, HitSettings(serves=serves), tmp_path / "run", progress=False)
     times = manifest["times"]

@@ -17,11 +17,10 @@ from jax import Array, lax
 from jaxtyping import PyTree
 
 from planner_jax.core.choices import EFFORTS, require_one_of
+from planner_jax.core.compiled import Fixed, has_only_cpu, traced_platform
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
-from planner_jax.core.platforms import has_only_cpu, traced_platform
 from planner_jax.core.protocol import Attempt, Plan
 from planner_jax.core.rules import Case
-from planner_jax.core.run_time import Fixed
 
 CaseT = TypeVar("CaseT", bound=Case)
 PlanT = TypeVar("PlanT", bound=Plan)
@@ -101,7 +100,7 @@ class Planner(Generic[CaseT, PlanT]):
         """Convert an attempt to the pytree that the compiled `solve` takes as its second argument.
 
         By default each attempt is static, and compiles a program of its own. Attempts that are
-        pytrees of the same structure share one program; see `run_time`. Only the class and the
+        pytrees of the same structure share one program; see `compiled`. Only the class and the
         shapes of the cases may be used.
         """
         return Fixed(attempt)

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 
-from planner_jax.core.platforms import traced_platform
+from planner_jax.core.compiled import traced_platform
 from planner_jax.lanes import kernels
 from planner_jax.lanes.kernels import shape_of
 

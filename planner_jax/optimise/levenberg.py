@@ -15,7 +15,7 @@ from flax import struct
 from jax import Array, lax
 from jax.scipy.linalg import cho_factor, cho_solve
 
-from planner_jax.core.run_time import with_run_time_numbers
+from planner_jax.core.compiled import with_run_time_numbers
 
 
 @struct.dataclass

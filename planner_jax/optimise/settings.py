@@ -10,10 +10,10 @@ from jax import Array
 
 from planner_jax.core.checks import require_kind, require_number, require_numbers
 from planner_jax.core.choices import require_size
+from planner_jax.core.compiled import Fixed, cached_by_precision, with_run_time_numbers
 from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
-from planner_jax.core.run_time import Fixed, cached_by_precision, with_run_time_numbers
 
 # A search of at most this many iterations is a loop of fixed length: it never tests for its end.
 COUNTED = 16

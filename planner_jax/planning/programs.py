@@ -20,11 +20,10 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding, SingleDeviceSharding
 from jaxtyping import PyTree
 
+from planner_jax.core.compiled import Fixed, trace_for
 from planner_jax.core.planner import Planner
-from planner_jax.core.platforms import trace_for
 from planner_jax.core.protocol import Attempt, is_unsolved, mark_bad_input
 from planner_jax.core.rules import require_shapes
-from planner_jax.core.run_time import Fixed
 
 # Numbers of lanes (cases) that a device solves in one call. Each number needs its own program.
 BUCKETS = (16, 128, 1024, 8192, 65536)

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array, lax
 
+from planner_jax.core.compiled import Fixed, place_numbers, with_run_time_numbers
 from planner_jax.core.planner import Planner
 from planner_jax.core.protocol import (
     FEASIBILITY_TOLERANCE,
@@ -30,7 +31,6 @@ from planner_jax.core.protocol import (
     select_first_solved,
     status_of,
 )
-from planner_jax.core.run_time import Fixed, place_numbers, with_run_time_numbers
 from planner_jax.optimise.levenberg import (
     LevenbergConfig,
     LevenbergState,

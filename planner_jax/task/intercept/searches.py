@@ -12,9 +12,9 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from planner_jax.core.compiled import cached_by_precision, with_run_time_numbers
 from planner_jax.core.errors import ArgumentError
 from planner_jax.core.protocol import Attempt
-from planner_jax.core.run_time import cached_by_precision, with_run_time_numbers
 from planner_jax.optimise.levenberg import LevenbergConfig
 from planner_jax.plane import cell_paths, reach
 from planner_jax.plane.distance_field import DistanceField, distance_field

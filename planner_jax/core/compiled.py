@@ -1,16 +1,19 @@
-"""Settings whose numbers are arguments of compiled programs, so that other numbers compile nothing.
+"""What planners say of their compiled programs: run-time numbers of settings, and the platform.
 
 An attempt of a planner, such as a number of iterations from a starting point, is mostly numbers. If
 these are arguments of a compiled program, all attempts of a planner share one program.
 """
 
+import contextlib
+import contextvars
 import dataclasses
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax.extend.backend import backends
 
 Settings = TypeVar("Settings")
 
@@ -86,3 +89,29 @@ def cached_by_precision(load: Callable[..., Settings]) -> Callable[..., Settings
 def place_numbers(settings: Settings) -> Settings:
     """Return settings whose numbers are jax arrays, to be passed to a compiled program."""
     return settings
+
+
+_TRACED: contextvars.ContextVar[str | None] = contextvars.ContextVar("platform", default=None)
+
+
+@contextlib.contextmanager
+def trace_for(platform: str) -> Iterator[None]:
+    """Declare that programs traced within the `with` block run only on one platform ("cpu")."""
+    token = _TRACED.set(platform)
+    try:
+        yield
+    finally:
+        _TRACED.reset(token)
+
+
+def traced_platform() -> str | None:
+    """Return the only platform for which a program is being traced, or None if it is unknown.
+
+    If it is known, the methods of other platforms need not be traced.
+    """
+    return _TRACED.get()
+
+
+def has_only_cpu() -> bool:
+    """Return whether all devices of JAX are CPUs."""
+    return set(backends()) == {"cpu"}
