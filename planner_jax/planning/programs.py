@@ -152,9 +152,10 @@ def place_lanes(tree: PyTree, mesh: Mesh) -> PyTree:
 # XLA would try its own kernels for every matrix product, which takes a third of the compile time
 # on a GPU, while cuBLAS is as fast for these products. On a CPU the option has no effect.
 _COMPILER_OPTIONS: Any = {"xla_gpu_enable_triton_gemm": False}
-# XLA's older generator of code for a CPU takes 40 % less time. Programs for one case of a planner
-# that works in step are as fast with it; large batches, and loops over cases, are slower.
-_QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False}
+# Until version 0.11 of JAX, XLA's older generator of code for a CPU takes 40 % less time. Programs
+# for one hit or catch are as fast with it; large batches, and loops over cases, are slower.
+_IS_OLD = jax.__version_info__ < (0, 11)
+_QUICK_OPTIONS: Any = {"xla_cpu_use_fusion_emitters": False} if _IS_OLD else {}
 _Layout = tuple[tuple[tuple[int, ...], np.dtype], ...]  # shapes and dtypes of a tree's leaves
 
 
