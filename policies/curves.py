@@ -50,7 +50,8 @@ def draw_curves(folders: Sequence[str | os.PathLike], path: str | os.PathLike) -
 def curves_figure(figure: Figure, runs: Sequence[Rows]) -> None:
     """Draw the mean reward and its terms over the number of decisions in training.
 
-    If the rows contain evaluations, further panels show the results of each suite after each part.
+    If the rows contain evaluations, further panels show the results of each suite (family
+    of cases) after each part of the training (call of PPO).
     """
     curve = [[row for row in rows if "reward" in row] for rows in runs]
     evaluated = [[row for row in rows if "suites" in row] for rows in runs]

@@ -30,7 +30,7 @@ class KeptParts:
         folder.mkdir(parents=True, exist_ok=True)
 
     def save(self, number: int, params: Any) -> None:
-        """Store the parameters `params` after part `number` of the training, and their digest."""
+        """Store the network's parameters after part (PPO run) `number`, and their digest."""
         place = self._place(number)
         if place.exists():
             shutil.rmtree(place)
@@ -41,7 +41,7 @@ class KeptParts:
             scratch.write_text(text + "\n", encoding="utf-8")
 
     def restore(self, number: int, like: Any) -> Any | None:
-        """Read the parameters stored after a part of the training; None if missing or damaged.
+        """Read the parameters stored after one part (PPO run); None if missing or damaged.
 
         Damaged parameters are also reported on standard error.
 

@@ -108,7 +108,7 @@ class Progress:
     def part(
         self, number: int, title: str, before: int, decisions: int
     ) -> Iterator[Callable[[int, Mapping[str, Any]], None]]:
-        """Provide the callback by which Brax reports the progress of one part of a training.
+        """Provide the callback by which Brax reports progress in one part (PPO run) of a training.
 
         Brax calls it with the number of decisions and the metrics. Rows of this part and of later
         parts, which an interrupted run may have left, are removed first.

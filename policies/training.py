@@ -61,7 +61,7 @@ from planner_jax.task.catch.decide import optimal_time_ratio
 from planner_jax.task.catch.default_planner import ExactCatch
 from planner_jax.task.catch.suites import draw
 
-_ROWS = 50  # greatest number of rows that record the learning curve of one part
+_ROWS = 50  # greatest number of rows in the learning curve of one part (call of PPO)
 _EVAL_SEED = 4242  # seed of the evaluation cases, which no published figure uses
 
 
@@ -253,7 +253,7 @@ def _environment(training: Training, part: Part) -> CatchEnv:
 
 
 def _rows_and_updates(part: Part, lanes: int) -> tuple[int, int]:
-    """Return the number of rows in a part's learning curve, and of batches of cases per row."""
+    """Return numbers of rows in a part's learning curve and of batches (`lanes` cases) per row."""
     wanted = math.ceil(part.steps / lanes)
     each = math.ceil(wanted / _ROWS)
     return math.ceil(wanted / each), each
@@ -267,7 +267,7 @@ def _train_part(
     params: Any,
     tell: Callable[[int, Mapping[str, Any]], None],
 ) -> Any:
-    """Train one part, and return the parameters after the part as NumPy arrays.
+    """Run one part (call of PPO) of a training; return its final parameters as NumPy arrays.
 
     Args:
         training: settings of the training.

@@ -179,7 +179,11 @@ def require_path(
 
 @functools.lru_cache(maxsize=256)
 def _shape_of_positions(tree: PyTree, layout: tuple, axes: tuple[int, ...]) -> tuple[int, ...]:
-    """Return the shape of the positions that `at` of the paths returns; cached, as it is slow."""
+    """Return the shape of the positions that the method `at` of paths returns.
+
+    `tree` is the tree structure of the paths, `layout` the shape and type of each leaf, and `axes`
+    their batch shape. The result is cached, because tracing `at` is slow.
+    """
 
     def at(path: _Path, time: Numbers) -> PyTree:
         state = path.at(time)

@@ -53,7 +53,7 @@ class Drive(Protocol):
         """Return plans of a batch by some of a planner's attempts, by default all of them.
 
         Returns:
-            The plans, and numbers that are all zero if no case is unsolved.
+            The plans, and an array or a number that is zero everywhere if all cases are solved.
         """
         ...
 

@@ -185,7 +185,10 @@ def all_tasks() -> dict[str, Task]:
 
 
 def _other_entries(kind: str, task: str, own: Collection[str]) -> dict[str, metadata.EntryPoint]:
-    """Return the entry points of other packages for a task by name, unless the name is taken."""
+    """Return the entry points by which other packages add planners or suites to a task, by name.
+
+    `kind` is "planners" or "suites". A name in `own`, the task's own names, gives a warning.
+    """
     found = {}
     for entry in metadata.entry_points(group=f"{_GROUP}.{kind}"):
         of, _, name = entry.name.partition(".")

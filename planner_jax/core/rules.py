@@ -49,12 +49,12 @@ def within(low: float, high: float, words: str) -> Rule:
 
 
 def below(other: str) -> Rule:
-    """Return the rule that an array is less than another array of the same part and shape."""
+    """Return the rule that an array is less than the array `other` in the same part of a case."""
     return Rule("<", lambda value, part: value < part_at(part, other), other=other)
 
 
 def _is_permutation(value: Numbers, part: PyTree) -> Numbers:
-    """Return which numbers are valid indices of the last axis and occur in it only once."""
+    """Return which numbers of `value` are valid indices of its last axis and occur only once."""
     alike = (value[..., :, None] == value[..., None, :]).sum(axis=-1)
     return (alike == 1) & (value >= 0) & (value < value.shape[-1])
 
@@ -204,7 +204,7 @@ def require_shapes(cases: PyTree) -> None:
 
 
 def _usual_batch(part: PyTree) -> tuple[int, ...]:
-    """Return the batch shape that most arrays of a part have, in front of the shape of one case."""
+    """Return the batch shape that most arrays in a part of a case have before their other axes."""
     fronts: Counter[tuple[int, ...]] = Counter()
     for name, shape in {field.name: field.shape for field in type(part).rules}.items():
         if shape is not None and (value := part_at(part, name)) is not None:
@@ -252,7 +252,7 @@ def all_ruled(cases: PyTree) -> Iterator[Ruled]:
 
 
 def _parts(tree: PyTree, place: str = "") -> Iterator[tuple[str, PyTree]]:
-    """Yield dotted prefixes and parts of a case that have a table of rules, outer parts first."""
+    """Yield each part of a case whose class has `rules`, after its dotted prefix; `place` first."""
     if getattr(type(tree), "rules", None):
         yield place, tree
     children: Mapping[str, PyTree] = {}

@@ -137,7 +137,10 @@ def block_and_diagonal(
 def _at_samples(
     along: Along, motion: Array, parameters: PyTree
 ) -> tuple[Array, Array, Array, dict[tuple[Slot, Slot], Array]]:
-    """Return penalties, greatest excess, and first and second derivatives at K samples."""
+    """Return penalties, greatest excess, and first and second derivatives at K samples.
+
+    `motion` (orders, K, 3) has position, velocity, ... of the samples; derivatives are by these.
+    """
     margins, factors = (
         jnp.asarray(np.array(each)[:, None], motion.dtype)
         for each in (along.margins, along.hinge_weights)
@@ -191,7 +194,11 @@ def _product(groups: tuple[tuple[Slot, ...], ...], curvature: dict, direction: A
 def _entries(
     along: Along, given: int, places: list[tuple[int, int]], at_samples: tuple[Array, ...]
 ) -> dict[tuple[int, int], Array]:
-    """Return second derivatives of a penalty by the pairs of columns `places`, by pair of axes."""
+    """Return second derivatives of a penalty by pairs of columns, for each pair of axes (x, y, z).
+
+    `places` are the indices of the columns in each pair. `at_samples` is the field of
+    `AlongCurvature`, and `given` the number of fixed columns.
+    """
     matrices = _matrices(along, given, tuple(places))
     found = {}
     for (pairs, _), matrix, numbers in zip(

@@ -270,7 +270,10 @@ def _total(terms: Iterable[Array]) -> Array:
 def _of_sample(
     along: Along, mode: str, sample: _Sample, args: PyTree
 ) -> tuple[Array | None, tuple]:
-    """Return a sample's greatest excess, or None for "curvature", and its terms in the sums."""
+    """Return a sample's greatest excess, or None for "curvature", and its terms in the sums.
+
+    `args` are columns, duration and parameters; for "curvature" also their direction.
+    """
     (columns, duration, given), direction = args if mode == "curvature" else (args, ())
     free = unit_motion(sample.row, columns), duration
     if mode == "values":
@@ -312,7 +315,10 @@ def _penalty(along: Along, unit: Vectors, duration: Array, given: PyTree) -> tup
 
 
 def _slopes(along: Along, weight: Array, free: tuple, fixed: tuple) -> tuple[Array, tuple]:
-    """Return a sample's greatest excess, its weighted penalty, and derivatives by `free`."""
+    """Return a sample's greatest excess, its weighted penalty, and derivatives by `free`.
+
+    `free` and then `fixed` are the arguments motion, duration and parameters of `_penalty`.
+    """
     value, pull_back, worst = jax.vjp(lambda *x: _penalty(along, *x, *fixed), *free, has_aux=True)
     return worst, (weight * value, *pull_back(jnp.ones_like(value) * weight))
 

@@ -29,7 +29,7 @@ class Course:
 
 
 def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
-    """Make a course of a plan's pieces; the pieces for the way to standstill have no duration."""
+    """Make a course of a plan's pieces alone; the pieces of the recovery have zero duration."""
     end = state_on(path, np.sum(path.durations))
     return Course(_join(path, _stand_still(_REST.num_pieces, end[0])), gravity)
 
@@ -37,7 +37,7 @@ def without_recovery(path: PiecewisePolynomial, gravity: Array) -> Course:
 def with_recovery(
     path: PiecewisePolynomial, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Append a trajectory to standstill; return the course, and whether it keeps the limits."""
+    """Append a recovery trajectory to standstill; return both, and whether it keeps limits."""
     state: Any = state_on(path, np.sum(path.durations))
     case = RecoveryCase(state, state[0], gravity, limits)
     rest: RecoveryPlan = solve_one(_REST, case, _REST.rounds[0])
@@ -47,9 +47,9 @@ def with_recovery(
 def recovery_from(
     state: Float[np.ndarray, "4 3"], pieces: int, gravity: Array, limits: QuadrotorLimits
 ) -> tuple[Course, bool]:
-    """Plan a trajectory from a state to standstill; return the course, and whether it keeps limits.
+    """Plan a trajectory from a state to standstill; return it, and whether it keeps the limits.
 
-    `state` has the rows position, velocity, acceleration and jerk. The course starts with `pieces`
+    `state` has the rows position, velocity, acceleration and jerk. The result starts with `pieces`
     pieces of zero duration in the place of a plan.
     """
     path = _stand_still(pieces, state[0])
@@ -70,7 +70,7 @@ def _join(path: PiecewisePolynomial, other: PiecewisePolynomial) -> PiecewisePol
 
 @struct.dataclass
 class Query:
-    """A request for setpoints: a course, and the times at which it is sampled."""
+    """A request for setpoints: a trajectory to standstill, and the times of the setpoints."""
 
     course: Course
     elapsed: Array  # () [s], time from the start of the course to the first setpoint
@@ -78,7 +78,7 @@ class Query:
 
 
 def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
-    """Sample `num` setpoints of a course; the columns of the result are `packets.FIELDS`."""
+    """Sample a trajectory at `num` times; the columns of the result are `packets.FIELDS`."""
     path, gravity = query.course.path, query.course.gravity
     times = query.elapsed + query.period * np.arange(num)
     end = total_duration(path)
@@ -96,7 +96,7 @@ def setpoints_of(num: int, _: None, query: Query) -> Float[Array, "K 20"]:
 
 
 def state_of(course: Course, elapsed: float) -> Float[np.ndarray, "4 3"]:
-    """Return position to jerk at the time `elapsed` [s] of a course, standstill after its end."""
+    """Return position, velocity, acceleration, jerk after `elapsed` [s]; standstill at the end."""
     end = float(np.sum(course.path.durations))
     state = state_on(course.path, min(elapsed, end))
     if elapsed >= end:

@@ -45,7 +45,7 @@ from planner_jax.live.strokes import CaseT, PlanT, Stroke
 from planner_jax.planning.programs import call_packed
 
 _PATIENCE = 0.2  # fraction of the deadline for which an answer waits for a new plan
-_ASTRAY = 0.5  # [m], distance of the robot from its course above which a new course starts
+_ASTRAY = 0.5  # [m], distance from the planned position above which the robot is stopped
 # Greatest jump of position [m] and velocity [m/s] with which the robot switches to a plan that was
 # found after the time at which it starts.
 _JOIN = (0.02, 0.2)
@@ -55,12 +55,12 @@ _NOTHING = np.zeros((0, WIDTH), np.float32)
 
 @dataclasses.dataclass(frozen=True)
 class _Flight(Generic[PlanT]):
-    """A trajectory of the robot to standstill, and the plan in it. Times are by senders' clock."""
+    """A trajectory of the robot to standstill, and the plan that is its first part, if any."""
 
     course: Course
-    start: float  # [s], time at which the course starts
-    plan: PlanT | None = None  # None if the course only leads to standstill
-    contact: float = math.nan  # [s], time at which the plan meets the ball
+    start: float  # [s], time at which the trajectory starts, by the senders' clock
+    plan: PlanT | None = None  # None if the trajectory only leads to standstill
+    contact: float = math.nan  # [s], time at which the plan meets the ball, same clock
     ball: int = -1  # number of the ball that the plan meets
 
 
@@ -108,8 +108,8 @@ class LivePlanner(Generic[CaseT, PlanT]):
 
     def _forget(self) -> None:
         self._flight: _Flight[PlanT] | None = None
-        # Course before the current plan. The robot returns to it if no trajectory from the plan's
-        # end to standstill keeps the limits.
+        # Trajectory before the current plan. The robot returns to it if no trajectory from the
+        # end of the plan to standstill keeps the limits.
         self._before: _Flight[PlanT] | None = None
         self._job: _Job[PlanT] | None = None
         self._done = -1  # number of the last ball that the robot hit or caught
@@ -231,7 +231,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
     def _search(
         self, ball: BallState, flight: _Flight[PlanT], number: int, due: float
     ) -> _Flight[PlanT] | None:
-        """Plan for a ball from the time `due`; an existing plan for this ball is improved first."""
+        """Plan for ball `number` from the time `due` [s]; improve its plan in `flight`, if any."""
         elapsed, stages = due - flight.start, self.report.stages
         if flight.plan is not None and flight.ball == number:
             with stages["again"].measure():
@@ -251,7 +251,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
         return _Flight(course, due, plan, due + self.stroke.contact(plan), ball)
 
     def _collect(self, due: float) -> None:
-        """Switch to the plan that the planning thread has found, if the robot can still join it."""
+        """Switch to a plan found by the planning thread, if the robot can join it at `due` [s]."""
         flight, job = self._flight, self._job
         if flight is not None and flight.plan is not None and due >= flight.contact:
             self._done = flight.ball
@@ -271,7 +271,7 @@ class LivePlanner(Generic[CaseT, PlanT]):
             self._complete()
 
     def _complete(self) -> None:
-        """Append a trajectory to standstill to the plan, or else return to the previous course."""
+        """Append a trajectory to standstill to the plan, or else resume the one before it."""
         flight, before = self._flight, self._before
         if flight is None or flight.plan is None or before is None:
             return

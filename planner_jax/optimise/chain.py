@@ -96,7 +96,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @abc.abstractmethod
     def guess_ends(self, context: PyTree, num: int) -> Float[Array, "num N K"]:
-        """Return guesses of N segments' K end variables (SI units) for `num` starting points."""
+        """Return K end variables (SI units) of N segments, first guesses for `num` searches."""
 
     @abc.abstractmethod
     def make_plan(
@@ -139,7 +139,7 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def _usual_scale(self) -> tuple[float, ...]:
-        """Measured units of a segment's variables, from the file `measured_scales.json`."""
+        """Units of a segment's decision variables, measured, from `measured_scales.json`."""
         return load_scale(self.package, f"{self.shipped_name}-{self.num_pieces}")
 
     @property
@@ -154,11 +154,11 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """Constant linear maps from a segment's boundary states and offsets to its polynomials."""
+        """Linear maps from a segment's end states and waypoint offsets to its polynomials."""
         return proportional_minco(_ORDER, self.proportions)
 
     def guesses(self, context: PyTree, num: int) -> Float[Array, "num n"]:
-        """Return `num` starting points with zero offsets; a network may improve the first one."""
+        """Return `num` starting points with waypoint offsets 0; a network may improve the first."""
         if num > len(self.guess_table):
             raise ArgumentError("starts", f"<= {len(self.guess_table)}", num)
         natural = self.guess_ends(context, num)
@@ -172,14 +172,14 @@ class ChainPlanner(OptimisedPlanner[CaseT, PlanT]):
         return points.at[0].set(select_start(cost, points[0], learned))
 
     def split(self, point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """Split a point into offsets of O waypoints and K end variables (SI units) per segment."""
+        """Split a point into waypoint offsets (N, O, 3) and end variables (N, K) of N segments."""
         scale = jnp.asarray(self.scale, point.dtype)
         natural = point.reshape(-1, scale.size) * scale[None]
         offsets = natural[:, : self.num_offsets].reshape(natural.shape[0], -1, 3)
         return offsets, natural[:, self.num_offsets :]
 
     def join(self, offsets: Float[Array, "N O 3"], natural: Float[Array, "N K"]) -> Array:
-        """Return the point (n,) made of offsets and end variables: the inverse of `split`."""
+        """Return the point (n,) of waypoint offsets and end variables: the inverse of `split`."""
         together = jnp.concatenate([offsets.reshape(natural.shape[0], -1), natural], axis=1)
         return (together / jnp.asarray(self.scale, together.dtype)[None]).ravel()
 

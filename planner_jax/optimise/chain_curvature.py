@@ -40,10 +40,11 @@ def chain_curvature(
 ) -> Curvature:
     """Return evaluation, gradient and second derivatives of a trajectory's objective at a point.
 
-    The objective is the cost of the ends, plus for each active segment the energy of its offsets
-    and the integral of its penalties. A point lists, segment by segment, the offsets and the end
-    variables, in units of `scale`. Products with the Hessian contain all second derivatives. The
-    preconditioner contains those among the end variables, and the diagonal for the offsets.
+    The objective is the cost of the ends, plus for each active segment the integral of penalties,
+    and the energy (integral of the squared s-th derivative) due to its waypoint offsets. A point
+    lists, segment by segment, offsets and end variables, in units of `scale`. Products with the
+    Hessian contain all second derivatives. The preconditioner contains those among the end
+    variables, and the diagonal for the offsets.
 
     Args:
         maps: constants of a segment of M pieces that minimises its squared s-th derivative.

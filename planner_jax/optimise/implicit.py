@@ -95,7 +95,7 @@ def optimal_plan(
     *,
     solver: LbfgsConfig | None = None,
 ) -> PyTree:
-    """Return the plan at the local optimum near the first guess, differentiable by the case.
+    """Return the plan at the local optimum near the planner's guess, differentiable by the case.
 
     `jax.grad` and `jax.jacobian` of any number in the plan, by any leaf of the case, use the
     implicit function theorem. Use float64 (`jax.enable_x64`) where gradients must have more than

@@ -117,7 +117,7 @@ def minimise_lanes(
 
 
 def _has_steps(config: Solver, num: int) -> bool:
-    """Return whether the number of iterations is `num` and is known when JAX traces the search."""
+    """Return whether `config.max_steps` is an integer, not a traced array, and equals `num`."""
     return isinstance(config.max_steps, int) and config.max_steps == num
 
 

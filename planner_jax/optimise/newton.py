@@ -273,6 +273,9 @@ def _choose(
 ) -> tuple[NewtonNumbers, Array, Array, Array]:
     """Choose the trial step of least cost, if it lowers the cost.
 
+    `here` is the objective at the current point, `trials` at the k trial points. `decrease` ()
+    is the predicted decrease of the cost; see `solve_damped`.
+
     Returns the new scalars of the state; weights of the trial steps, 1 for the chosen step; whether
     the new point is the best so far; and whether the search was unfinished before.
     """

@@ -15,7 +15,7 @@ from planner_jax.core.errors import ArgumentError, ArgumentTypeError
 from planner_jax.core.protocol import Attempt
 from planner_jax.core.rules import NOT_NEGATIVE, Rule
 
-# A search of at most this many iterations is a loop of fixed length: it never tests for its end.
+# Greatest number of L-BFGS iterations that is compiled as a constant; see `load_round`.
 COUNTED = 16
 MOST_DAMPING = 1e4  # greatest damping of one problem in Newton's method
 

@@ -131,8 +131,9 @@ def referee_blocks(
             absolute tolerance of the start and of jumps between pieces [rad], [rad/s], and of joint
             angles beyond their limits [rad].
         contact_tolerance: [m], greatest distance of the ball from the shield's square face at the
-            contact, and greatest depth of the arm in an obstacle. The ball must be blocked between
-            two boxes: the outer box is enlarged and the inner box reduced by this length.
+            contact, and greatest depth of the arm in an obstacle. The ball must be blocked inside
+            the outer box, before it enters the protected inner box. The outer box is enlarged,
+            and the inner box reduced, by this length.
 
     Returns:
         A `BlockVerdict` of float64 arrays. A plan with numbers that are not finite fails as "not
@@ -210,7 +211,7 @@ def _judge(case: dict, links: tuple, relative: float, contact: float) -> dict:
 
 
 def _times(case: dict, stays: np.ndarray) -> tuple:
-    """Test the contact time, durations, and the time `stays` from the motion's end to contact."""
+    """Test contact time, durations, and the time `stays` (B,) [s] from motion's end to contact."""
     contact = case["plan.contact_time"]
     shortest = case["plan.motion.durations"].min(axis=1)
     off = np.maximum.reduce([case["delay"] - contact, -stays, contact - LONGEST_PLAN, -shortest])
@@ -258,7 +259,10 @@ def _worst(excess: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) -> tuple:
-    """Test the start, continuity and joint limits; return measurements, tests and worst joints."""
+    """Test start, continuity and limits of joints, from the result `extremes` of `_extremes`.
+
+    Returns measurements, tests and the worst joints, each by name.
+    """
     tests, parts, measured = {}, {}, {}
 
     def test(name: str, excess: np.ndarray, times: np.ndarray, allowed: float) -> None:
@@ -288,7 +292,10 @@ def _judge_limits(case: dict, motion: _Motion, extremes: list, relative: float) 
 
 
 def _rest(case: dict, motion: _Motion, stays: np.ndarray) -> tuple[tuple, np.ndarray]:
-    """Test that a motion ends at standstill if the case requires it or the contact is later."""
+    """Test that a motion ends at standstill if the case requires it or the contact is later.
+
+    `stays` (B,) [s] is the time from the motion's end to the contact.
+    """
     rates = np.abs(derivative(motion.coeffs[..., -1], motion.durations[:, -1], 1))
     has_to = (case["ends_at_rest"] != 0.0) | (stays > CONTACT_TIME_TOLERANCE)
     time = motion.starts[:, -1] + motion.durations[:, -1]
@@ -302,7 +309,10 @@ def _final(motion: _Motion, stays: np.ndarray) -> np.ndarray:
 
 
 def _clearances(case: dict, links: tuple, motion: _Motion, turning: np.ndarray) -> dict[str, tuple]:
-    """Return for each kind of obstacle each plan's least distance, its time and the arm's part."""
+    """Return for each kind of obstacle each plan's least distance, its time and the arm's part.
+
+    `turning` (B, M) [rad/s] bounds the norm of the joint rates in each piece.
+    """
     turning = np.fmin(np.fmax(turning, np.finfo(float).tiny), _FASTEST)
     longest = np.minimum(LONGEST_STEP, LARGEST_TURN / turning)
     count = np.maximum(np.ceil(motion.durations / longest - 1e-9), 1.0)
@@ -345,7 +355,7 @@ def _sample(
 
 
 def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: float) -> tuple:
-    """Test at the contact that the ball is on the shield and between the boxes; test the tilt."""
+    """Test the contact at joint angles (6, B): ball on shield, not in inner box; tilt in limit."""
     time, fall = case["plan.contact_time"], np.array([[0.0], [0.0], [1.0]]) * case["gravity"]
     ball = case["ball.pos"].T + case["ball.vel"].T * time - 0.5 * fall * time**2
     turns, positions = links_of(case, angles[..., None])
@@ -366,7 +376,7 @@ def _judge_contact(case: dict, angles: np.ndarray, relative: float, contact: flo
 
 
 def _tunnel(case: dict, contact: float) -> tuple:
-    """Test that at the contact the ball is in the outer box and has not entered the inner box."""
+    """Test that the contact is in the outer box, and before the ball enters the protected box."""
     time = case["plan.contact_time"]
 
     def off(grown: float) -> np.ndarray:
@@ -383,8 +393,9 @@ def times_inside(case: dict, name: str, grown: float) -> tuple[np.ndarray, np.nd
     """Return the times at which the balls of B cases enter a box and at which they leave it.
 
     Both results are (2, B) [s]: a ball may pass the box while it rises (row 0) and while it falls
-    (row 1). The box `name`, "inner" or "outer", is enlarged by `grown` [m] on all sides. A ball
-    that is never inside enters at infinity and leaves at minus infinity.
+    (row 1). The box `name` is "inner", the protected box, or "outer", the box in which the arm may
+    meet a ball. It is enlarged by `grown` [m] on all sides. A ball that is never inside enters
+    at infinity and leaves at minus infinity.
     """
     pos, vel, gravity = case["ball.pos"].T, case["ball.vel"].T, case["gravity"]
     lower = case[f"scene.{name}.lower"].T - pos - grown

@@ -344,7 +344,10 @@ def _test_order(
 
 
 def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) -> tuple[dict, dict]:
-    """Measure and test the distance and the angle between net and target at all catches."""
+    """Measure and test the distance and the angle between net and target at all catches.
+
+    `held` (B, N) is true for catches, and `ends` (B, N) [s] are their times.
+    """
     num = held.shape[1]
     each = pieces.durations.shape[1] // num
     tail = np.moveaxis(pieces.coeffs[:, :, each - 1 :: each], -1, 0)
@@ -382,7 +385,7 @@ def _judge_catches(case, pieces, held, ends, net_test: str, tolerances: dict) ->
 
 
 def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
-    """Test that catch times rise from 0, equal the ends of pieces, and keep the case's horizon."""
+    """Test that catch times rise from 0, equal `ends` (of pieces), and keep the case's horizon."""
     each = case["durations"].shape[1] // held.shape[1]
     shortest = case["durations"].reshape(*held.shape, each).min(axis=2)
     after = np.where(held, 0.0, shortest).min(axis=1, keepdims=True)
@@ -393,7 +396,7 @@ def _catch_time(case: dict, held: np.ndarray, ends: np.ndarray) -> tuple:
 
 
 def _worst(test: tuple, held: np.ndarray) -> tuple:
-    """Reduce a test of all catches to a test of each plan, with the excess of its worst catch."""
+    """Reduce a test (failed, excess, time) of catches (B, N) to the worst catch of each plan."""
     failed, excess, time = test
     failed = failed & held
     counts = failed | (held & np.isnan(excess))

@@ -285,7 +285,7 @@ def _impact_tests(case, measured, tolerances, end, apex_at, landing_at) -> dict:
 
 
 def _contact_time(case: dict, end: np.ndarray, ball: np.ndarray) -> tuple:
-    """Test that the impact is at the trajectory's end, and before the ball reaches the ground."""
+    """Test that the impact is at the time `end` of the trajectory, with `ball` above the ground."""
     shortest = case["durations"].min(axis=1)
     claim = np.abs(case["stroke.time"] - end)
     height = np.minimum(case["ball.pos"][:, 2], ball[2])

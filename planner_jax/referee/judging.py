@@ -81,8 +81,8 @@ CONTACT_TIME_TOLERANCE = 1e-4
 # A relative excess is (value - limit) / |limit|; if |limit| is smaller than this number, the excess
 # is divided by this number.
 SMALLEST_LIMIT = 1e-3
-_FEWEST_LANES = 256  # least number of plans of a thread; starting a thread for fewer takes longer
-# Least number of plans, and of cores, for which processes judge a batch instead of threads.
+_FEWEST_LANES = 256  # least number of plans that one thread judges
+# With at least so many plans and so many cores, processes judge a batch instead of threads.
 _MANY_LANES, _MANY_CORES = 16384, 4
 
 

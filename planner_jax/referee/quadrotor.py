@@ -267,7 +267,7 @@ def _time(pieces: Pieces, index: np.ndarray, u: np.ndarray) -> np.ndarray:
 
 
 def _search(name: str, pieces: Pieces, gravity, likeliest, u: np.ndarray) -> tuple:
-    """Find each plan's maximum of a quantity, and its time, near the sample number `likeliest`."""
+    """Find each plan's maximum of the quantity `name`, and its time, near sample `likeliest`."""
     orders, measure = _MEASURES[name]
     piece, sample = np.divmod(likeliest, len(u))
     lanes = np.arange(len(piece))
