@@ -93,7 +93,7 @@ def build_timed(bench: Bench, path: Path, layout: str, regime: str) -> Library:
 
 
 def describe(bench: Bench, library: Library) -> None:
-    """Report the shares of pairs of cells that have a stored motion, and the library's memory."""
+    """Report the share of pairs (outer cell, inner cell) with a stored motion, and the memory."""
     covered = coverage(library)
     shares = {
         "feasible": float(covered.share(covered.is_feasible)[0]),

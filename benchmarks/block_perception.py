@@ -123,7 +123,7 @@ def errors_after(
 
 @jax.jit
 def middle_of(cases: Any) -> Array:
-    """Return the times (B,) [s] at which balls are midway between the two boxes around the arm."""
+    """Return the times (B,) [s] at which balls are midway between the outer and the inner box."""
     flights = jax.vmap(flight_of)(cases)
     return 0.5 * (flights.earliest + flights.latest)
 

@@ -15,7 +15,7 @@ referee, an independent check in float64, judges every plan. The decisions are:
 "Caught" is the mean number of targets that successful plans catch; in some suites targets may be
 left out. "Last catch" is the mean time of the last catch over accepted plans. The optimal time
 ratio (OTR) is the mean relative difference between the proposed and the optimised times. "At 25" is
-the success rate if the planner stops after 25 iterations from one initial guess. The time of a
+the success rate if the planner stops after 25 iterations from one first guess. The time of a
 decision is for one case, without compilation, from one NumPy vector with the case's numbers to
 another vector with order and times. No policy was trained on the cases of this seed.
 """

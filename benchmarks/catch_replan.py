@@ -109,7 +109,8 @@ class Times:
     def gaps(self) -> np.ndarray | None:
         """Return by what fraction the costs of stored re-plans exceed the costs of a long search.
 
-        The long search starts from the same guess. None if no re-plan is stored.
+        The long search starts from the same initial guess as the re-plan. The result is None if no
+        re-plan is stored.
         """
         if not self.replans:
             return None

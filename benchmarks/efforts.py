@@ -26,7 +26,7 @@ SUITES = (("hit", "court"), ("catch", "throws"), ("catch", "parabola2"))
 
 
 def measure(bench: Bench, options: argparse.Namespace) -> None:
-    """Plan every suite with every effort, and print one row for each pair.
+    """Plan every suite with every effort, and print a row for each combination.
 
     The effort "feasible", "good" or "best" sets how long a planner searches for a lower cost.
     """

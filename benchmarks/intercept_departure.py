@@ -108,10 +108,11 @@ def is_free(
 def _is_apart(scene: Scene, corners, x, y, cos, sin) -> np.ndarray:
     """Return for N cars whether the body does not overlap a convex polygon (V, 2) [m], (N,) bool.
 
-    The test searches a separating axis.
+    The rear axles are at `x`, `y` [m], and `cos`, `sin` belong to the headings, all (N,). The test
+    searches a separating axis.
     """
     half = 0.5 * np.array([scene.length, scene.width])
-    from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N)
+    from_x, from_y = corners[:, 0, None] - x, corners[:, 1, None] - y  # (V, N) [m]
     along, across = cos * from_x + sin * from_y, cos * from_y - sin * from_x
     gap = np.maximum(along.min(axis=0), -along.max(axis=0)) - half[0]
     gap = np.maximum(gap, np.maximum(across.min(axis=0), -across.max(axis=0)) - half[1])

@@ -336,7 +336,8 @@ class Lattice:
     def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
         """Return a path to a state, found backwards through the reached cells of n layers.
 
-        The rows of the path, (2 n + 1, 5), are described at `Reach.path`.
+        `kept` has the items of `sets`. A state is (bit of the cell, index of the speed level, index
+        of the heading). The rows of the path, (2 n + 1, 5), are described at `Reach.path`.
         """
         rows = [self._row(2 * len(kept) - 2, state)]
         for layer in range(len(kept) - 2, -1, -1):
@@ -362,7 +363,7 @@ class Lattice:
         return np.array(rows[::-1])
 
     def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Convert a state at a half layer to time [s], x, y [m], heading [rad] and speed [m/s]."""
+        """Return time [s], x, y [m], heading [rad], speed [m/s] of a state at a half layer."""
         bit, level, heading = state
         row, column = divmod(bit, self.stride)
         x, y = self.origin + CELL * np.array([column, row])
@@ -385,8 +386,8 @@ def shift_bits(plane: int, shift: int) -> int:
 def _spread(row: list[int], turn: int) -> list[int]:
     """Add to each heading's cells the cells of up to `turn` neighbouring headings on either side.
 
-    `row` has the reached cells of every heading. The number of united headings doubles in each
-    step.
+    `row` has for every heading the set of reached cells, as bits of an integer; `turn` is a number
+    of headings. Each step of the loop doubles the number of headings whose sets are united.
     """
     # In the loop, spread[h] is the union of the cells row[h], ..., row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row

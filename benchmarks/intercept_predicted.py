@@ -174,8 +174,8 @@ class Drives:
     cases: InterceptCase  # problems that these plans solve
     began: np.ndarray  # (B,) [s], times at which the cars began to follow these plans
     had_plan: np.ndarray  # (B,) bool, whether the first plan keeps every limit
-    speed: np.ndarray  # (B, S) [m/s]
-    curvature: np.ndarray  # (B, S) [1/m]
+    speed: np.ndarray  # (B, S) [m/s], speed at each sample of the drive
+    curvature: np.ndarray  # (B, S) [1/m], curvature of the path at each sample
 
     @classmethod
     def start(cls, cases: InterceptCase) -> "Drives":

@@ -126,7 +126,7 @@ class _Timed:
 
 
 def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
-    """Plan a batch once, and then `repeat` times with compiled programs; return the durations.
+    """Plan the batch `host` once, and then `repeat` times when compiled; return the durations.
 
     Each device holds an equal part of the batch.
     """

@@ -75,7 +75,7 @@ class DriveState:
     squared_tracking: Array  # () [m^2 s], integral of the squared distance
     # (2,) [s], time during which drive and steering commands exceeded their limits
     saturated: Array
-    time: Array  # () [s]
+    time: Array  # () [s], time since the start of the drive
     pose_stds: Array  # (2,), standard deviations of a measured coordinate [m] and heading [rad]
     key: Array
 
@@ -84,7 +84,7 @@ class DriveState:
 class Frame:
     """The pose of a car at the end of a frame (some control steps), and its planned position."""
 
-    time: Array  # () [s]
+    time: Array  # () [s], time at the end of the frame
     pose: Array  # (3,) x, y [m] of the rear axle's centre and heading [rad]
     wanted: Array  # (2,) [m], planned position
 
@@ -139,7 +139,7 @@ def estimate_state(loop: DriveLoop, drive: DriveState) -> tuple[Array, Array, Ar
 
 
 def _one_frame(world: World, drive: DriveState, until: Array) -> tuple[DriveState, Frame]:
-    """Simulate a drive for one frame; sum tracking errors and saturation up to `until` () [s]."""
+    """Simulate a drive for one frame; sum tracking errors and saturation up to time `until`."""
     car, dtype, span = _car(world), drive.time.dtype, world.timestep
     steps = CONTROL_RATE // FRAME_RATE
     key, noise_key = jax.random.split(drive.key)

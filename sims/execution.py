@@ -65,12 +65,12 @@ class Executed:
     """
 
     times: np.ndarray  # (S,) [s], times of the frames; the first is 0
-    angles: np.ndarray  # (B, S, 6) [rad]
+    angles: np.ndarray  # (B, S, 6) [rad], joint angles of the simulated arms
     wanted: np.ndarray  # (B, S, 6) [rad], planned angles, without the drives' delays
     tracking: np.ndarray  # (B, 2) [m], distance of the shield's centre from its plan: rms and worst
     # (B, 6) [rad], rms error of each joint from the commanded motion, which may start late.
     error_rms: np.ndarray
-    error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from that course
+    error_worst: np.ndarray  # (B, 6) [rad], greatest error of each joint from the commanded motion
     torque_rms: np.ndarray  # (B, 6) [N m], rms torque of each joint
     torque_worst: np.ndarray  # (B, 6) [N m], greatest torque of each joint
     saturation: np.ndarray  # (B, 6), fraction of the time in which a drive was at its torque limit

@@ -127,7 +127,8 @@ class Scene:
     def _within(self, low: np.ndarray, high: np.ndarray) -> np.ndarray:
         """Return positions (K, N, 3) [m] of N balls at K samples, NaN outside the axes' bounds.
 
-        Positions in `self.balls` and `self.back` outside these bounds are replaced by NaN, too.
+        The bounds `low` and `high` are (3,) [m]. Positions in `self.balls` and `self.back` outside
+        of the bounds are replaced by NaN, too.
         """
         balls = self.recording.balls[self.flight]
         inside = ((balls >= low) & (balls <= high)).all(axis=2, keepdims=True)

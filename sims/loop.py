@@ -132,7 +132,7 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """Run search `number` of the pilot on B planning problems; return the B plans."""
+    """Run search `number` of the pilot on the B planning problems `asked`; return B plans."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -166,7 +166,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Replace the plans of flights by new plans, where the pilot accepts a new plan."""
+    """Replace plans of flights by the searches' results `found`, where the pilot accepts these."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)
@@ -234,7 +234,7 @@ def _next_period(
 def _fly_and_plan(
     loop: Loop, pilot: Pilot, flights: FlightState, cases: Any, drag: Array, num_periods: int
 ) -> tuple[FlightState, Record | None]:
-    """Simulate B flights with replanning in one program; return states and records as `_fly`."""
+    """Simulate B flights with replanning in one program; return final states and records."""
     begin = lambda part, *given: lambda: part(*given)  # noqa: E731
 
     def next_period(flights: FlightState, _: None) -> tuple[FlightState, Record | None]:

@@ -129,9 +129,9 @@ class FlightState:
 
     physics: Physics
     shown: Array  # (L, N, 3) [m], true ball positions that are still to be observed
-    estimates: Estimate  # leaves (N, ...)
+    estimates: Estimate  # leaves (N, ...), current estimates of the balls
     earlier: Estimate  # the estimates of one planning period ago
-    launched: Array  # (N,) bool
+    launched: Array  # (N,) bool, whether the ball's simulation has started
     present: Array  # (N,) bool, balls with a plan whose contact time has not passed
     plan: Any
     began: Array  # () [s], start time of the plan
@@ -151,7 +151,7 @@ class Record:
     physics: Physics
     wanted: Array  # (3,) [m], planned position of the robot
     horizon: Array  # (N,) [s], time until the planned contact with each ball
-    error: Array  # (N, 3) [m], error of the predicted ball position at that contact
+    error: Array  # (N, 3) [m], error of the predicted ball position at the contact
 
 
 @dataclasses.dataclass(frozen=True)
@@ -160,9 +160,9 @@ class Flown:
 
     contact: Contact  # leaves (B, N, ...)
     plan: Any  # the last plan of each flight
-    began: np.ndarray  # (B,) [s], start time of that plan
-    tracking: np.ndarray  # (B, 2) [m], rms and worst, up to the last planned contact
-    record: Record | None  # leaves (B, K, ...)
+    began: np.ndarray  # (B,) [s], start time of the last plan
+    tracking: np.ndarray  # (B, 2) [m], rms and worst tracking error up to the last contact
+    record: Record | None  # leaves (B, K, ...), for K observations
 
 
 def collect_flights(flights: FlightState, records: list[Record]) -> Flown:

@@ -37,11 +37,11 @@ class Recording:
     """
 
     index: np.ndarray  # (F,), index of the flight in the run
-    success: np.ndarray  # (F,) bool
+    success: np.ndarray  # (F,) bool, whether the flight succeeded
     time: np.ndarray  # (F, K) [s], times of the samples
     robot: np.ndarray  # (F, K, R), joint positions of the robot
     wanted: np.ndarray  # (F, K, 3) [m], planned position of the robot
-    balls: np.ndarray  # (F, K, N, 3) [m]
+    balls: np.ndarray  # (F, K, N, 3) [m], positions of the balls
     met: np.ndarray  # (F, N) [s], time of the contact with each ball
     contact: np.ndarray  # (F, N, 3) [m], position of the ball's centre at the contact
     target: np.ndarray  # (F, 3) [m], target of a returned ball
@@ -71,10 +71,10 @@ class Recording:
 class Frame(NamedTuple):
     """The positions of robot and balls at one sample of a recording."""
 
-    time: float  # [s]
+    time: float  # [s], time of the sample
     robot: np.ndarray  # (R,), joint positions of the robot
     wanted: np.ndarray  # (3,) [m], planned position of the robot
-    balls: np.ndarray  # (N, 3) [m]; NaN for balls that are not in flight
+    balls: np.ndarray  # (N, 3) [m], positions; NaN for balls that are not in flight
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,14 +31,14 @@ class Physics:
 class Solid(NamedTuple):
     """The surface of a closed convex body, as a mesh of triangles."""
 
-    corners: np.ndarray  # (V, 3) [m]
-    triangles: np.ndarray  # (T, 3) int, counter-clockwise when seen from outside
+    corners: np.ndarray  # (V, 3) [m], positions of the V corners
+    triangles: np.ndarray  # (T, 3) int, corner indices, counter-clockwise when seen from outside
 
 
 class Shape(NamedTuple):
     """A rigid part of a robot for drawing, in the part's own frame."""
 
-    lines: list[np.ndarray]  # each (M, 3) [m]
+    lines: list[np.ndarray]  # polygonal lines with M points, each (M, 3) [m]
     discs: list[tuple[np.ndarray, float]]  # centre (3,) [m] and radius [m], normal to the z axis
     tool: bool = False  # whether the last line is the tool's rim
     solids: tuple[Solid, ...] = ()

@@ -146,7 +146,7 @@ def part_solid(part: Part) -> Solid:
 
 
 def xml_numbers(*values: float) -> str:
-    """Format numbers as MJCF text, separated by blanks."""
+    """Format numbers for MJCF, MuJoCo's XML format: separated by spaces."""
     return " ".join(f"{value:.9g}" for value in values)
 
 

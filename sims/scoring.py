@@ -54,12 +54,12 @@ class Moment:
     Velocities are MuJoCo's stored velocities, which belong to half a step earlier.
     """
 
-    robot_pos: Array  # (3,) [m]
-    robot_vel: Array  # (3,) [m/s]
-    rate: Array  # (3,) [rad/s], world frame
-    normal: Array  # (3,)
-    ball_pos: Array  # (N, 3) [m]
-    ball_vel: Array  # (N, 3) [m/s]
+    robot_pos: Array  # (3,) [m], position of the body with the tool
+    robot_vel: Array  # (3,) [m/s], velocity of this body
+    rate: Array  # (3,) [rad/s], angular velocity of this body, world frame
+    normal: Array  # (3,), unit z axis of this body
+    ball_pos: Array  # (N, 3) [m], positions of the N balls
+    ball_vel: Array  # (N, 3) [m/s], velocities of the N balls
 
 
 def moment(world: World, physics: Physics) -> Moment:
@@ -100,7 +100,7 @@ def passage(
 
         return jax.tree.map(blend, before, after)
 
-    at, moving = at_share(share), at_share(share + 0.5)  # leaves (N, 3)
+    at, moving = at_share(share), at_share(share + 0.5)  # leaves (N, 3), states at two times
     normal = at.normal / jnp.sqrt(jnp.maximum(jnp.sum(at.normal**2, axis=1, keepdims=True), 1e-12))
     arm = at.ball_pos - at.robot_pos
     aside = arm - world.carrier.tool.height * normal

@@ -8,7 +8,7 @@ runs it to compare its speed with the planners' speed.
 The settings of each kind of search were tuned by a random search of 500 to 1,500 steps on the 240
 throws of both published sets. The aim was the least time with at least 97 % of the costs within
 1e-3 (relative) of the published cost. These settings were varied:
-* the memory of L-BFGS from 8 to 64 pairs, or BFGS with a dense matrix;
+* the memory of L-BFGS from 8 to 64 steps, or BFGS with a dense matrix;
 * the stopping rule: the search ends if the cost changes by less than the relative amount `delta`
   (1e-7 to 1e-5) over `past` (2 to 20) iterations;
 * the line search: both constants of the weak Wolfe conditions, bisection or cubic interpolation;
@@ -61,7 +61,7 @@ class Settings:
     # True: the variables are scaled offsets of the waypoints from the smoothest trajectory, and the
     # net's position relative to the ball. False: they are the waypoints and the end position.
     relative: bool = False
-    memory: int = 48  # number of pairs that L-BFGS stores, at most 64; 0 for BFGS
+    memory: int = 48  # number of steps that L-BFGS stores, at most 64; 0 for BFGS
     past: int = 10  # iterations over which the cost is compared
     delta: float = 1e-7  # relative change of the cost over `past` iterations that ends the search
     decrease: float = 1e-4  # constant of sufficient decrease in the weak Wolfe conditions

@@ -97,7 +97,7 @@ def unpack(vector, sizes: dict[str, int]) -> dict:
 
 
 def advance(motion: list, time) -> list:
-    """Return position and derivatives `time` [s] later; the highest derivative is constant."""
+    """Return `motion` (position and derivatives) `time` [s] later; the last one is constant."""
     orders = range(len(motion))
     return [
         sum(motion[n + i] * (time**i / math.factorial(i)) for i in orders[: len(motion) - n])
@@ -226,7 +226,11 @@ class Program:
         return np.repeat(values, list(self.sizes.values()))
 
     def _build(self, unknown: dict, case: dict, samples: int) -> tuple:
-        """Return cost, expressions that must be 0, and expressions that must be <= 0."""
+        """Return cost, expressions that must be 0, and expressions that must be <= 0.
+
+        `unknown` and `case` have the symbols of unknowns and parameters by name, and `samples` is
+        the number of samples of a piece.
+        """
         states = ca.horzcat(
             case["head_state"],
             ca.reshape(unknown["states"], 12, self.pieces) * np.repeat(STATE_SCALE, 3),

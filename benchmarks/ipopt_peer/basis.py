@@ -25,8 +25,8 @@ class Basis:
     The coefficients of an axis are the boundary conditions (position to jerk at both ends) and then
     the offsets of the waypoints from the smoothest trajectory. IPOPT's decision variables x contain
     the offsets, ordered by waypoint, and a few variables of the trajectory's end, which determine
-    the boundary conditions and the mean duration h of a piece. Offsets are called outer
-    coefficients, boundary conditions and h inner coefficients.
+    the boundary conditions and the mean duration h of a piece. Here the offsets are called
+    outer coefficients, and the boundary conditions and h inner coefficients.
 
     Args:
         planner: the `ExactHit` or `ExactCatch` whose settings and constant matrices are used.

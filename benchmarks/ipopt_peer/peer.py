@@ -138,7 +138,10 @@ class Peer:
     def iterates(
         self, setting: tuple[float, dict[str, Any], bool], batch: Batch
     ) -> list[np.ndarray]:
-        """Return for each case the n variables after each iteration of IPOPT, (steps + 1, n)."""
+        """Return for each case the n variables after each iteration of IPOPT, (steps + 1, n).
+
+        A setting is (tolerance, options of IPOPT, whether to use compiled C code).
+        """
         size = batch.starts.shape[1]
         program = self.programs[False]
         callback = _Recorder(size, program.num_constraints, batch.params.shape[1])

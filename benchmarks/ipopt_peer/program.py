@@ -230,7 +230,8 @@ class Program:
     def _point(self) -> tuple[Any, Any, Any, Any]:
         """Return symbols of the decision variables x and of the parameters, and the parts of x.
 
-        The parts are the unscaled variables of the end, and the offsets (M - 1, 3) for M pieces.
+        The parts are the unscaled variables of the trajectory's end, and the offsets (M - 1, 3) of
+        the waypoints from the smoothest trajectory, for M pieces.
         """
         num = self.problem.planner.num_offsets
         scale = self._basis.scale
@@ -250,7 +251,7 @@ class Program:
         return ca.Function("worst", [x, params], [ca.fmax(ca.mmax(limits), ca.mmax(at_ends))])
 
     def _nlp(self) -> Any:
-        """Build the objective and the constraints: each limit at all samples, then at the end."""
+        """Build objective and constraints: limits at samples, then limits at the path's end."""
         x, params, natural, offsets = self._point()
         outward, core, at_ends = self._ends(natural, params)
         columns, h = self._basis.join(outward, offsets)
@@ -317,7 +318,7 @@ class Program:
         of_samples, bends = self._bends(self._basis.sample(columns), h, params, multipliers)
         by_columns = self._basis.gradient(of_samples)
         full = self._basis.hessian(bends, self._bend_places)
-        # The following blocks add the second derivatives of the limits and of the snap energy.
+        # Second derivatives of the limits and of the snap energy, the integral of the squared snap.
         power, energy = self._power, of_f * self._offset_energy(offsets, h)
         bend = 2.0 * of_f * self._own / h**power
         outer, place = self._basis.outer, self._basis.place

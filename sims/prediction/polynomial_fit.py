@@ -60,8 +60,9 @@ def fit_polynomial(
 def _coefficients(root: Array, values: Array, span: Array) -> Array:
     """Solve R X = Y for the coefficients X, with `root` as the triangular R and `values` as Y.
 
-    X is returned for times in seconds instead of scaled times. A coefficient is zero where R's
-    diagonal is zero up to rounding, since observations do not determine this coefficient.
+    R and Y are for scaled times (time / `span`), but X is returned for times in seconds. A
+    coefficient is zero where R's diagonal is zero up to rounding, since observations do not
+    determine this coefficient.
     """
     found = jnp.zeros_like(values)
     rounding = (32.0 * jnp.finfo(root.dtype).eps) ** 2

@@ -67,14 +67,14 @@ class Alternatives:
     variance  centre_variance + velocity_variance |g(t - middle)|^2.
     """
 
-    chance: Array  # (K,), sum 1
-    turn_rate: Array  # (K,) [rad/s]
-    velocity: Array  # (K, 2) [m/s], at time `middle`
+    chance: Array  # (K,), probability of each path; the sum is 1
+    turn_rate: Array  # (K,) [rad/s], constant turn rate of each path
+    velocity: Array  # (K, 2) [m/s], velocity of each path at the time `middle`
     lever: Array  # (K, 2) [s], weighted mean of the displacements at the times of observation
     centre: Array  # (2,) [m], weighted mean of the observations
     middle: Array  # () [s], weighted mean of the times of observation
-    centre_variance: Array  # () [m^2]
-    velocity_variance: Array  # (K,) [m^2/s^2]
+    centre_variance: Array  # () [m^2], variance of a coordinate of `centre`
+    velocity_variance: Array  # (K,) [m^2/s^2], variance of a velocity component
 
 
 @struct.dataclass
@@ -193,7 +193,10 @@ def select(
 
 
 def _median(rates: Array, step: Array, chance: Array, of_zero: Array) -> Array:
-    """Return the median turn rate: zero has probability `of_zero`, each of `rates` a `chance`."""
+    """Return the median turn rate, if zero has probability `of_zero`, and each of `rates` `chance`.
+
+    The rates are `step` apart; each stands for the interval of this width around it.
+    """
     below = jnp.cumsum(chance) - chance
     right = jnp.sum(jnp.where(rates < 0.0, chance, 0.0)) <= 0.5  # whether the median is >= 0
     level = jnp.where(right, 0.5 - of_zero, 0.5)

@@ -24,7 +24,7 @@ _STEPS = 8  # number of Gauss-Newton iterations, over the turn rate alone
 class TurnFit(NamedTuple):
     """The path of one turn rate that fits L observations of a target best."""
 
-    rate: Array  # () [rad/s]
+    rate: Array  # () [rad/s], turn rate
     velocity: Pair  # each () [m/s], at the mean time of the observations
     lever: Pair  # each () [s], weighted mean of the arcs g at the times of observation
     power: Array  # () [s^2], weighted sum of |arc - lever|^2
@@ -120,8 +120,8 @@ def best_turn(seen: Centred, fastest: ArrayLike) -> TurnFit:
 def _search_rate(seen: Centred, spacing: Array) -> Array:
     """Search the best turn rate by Gauss-Newton (Kaufman's variable projection).
 
-    The search starts from the best of equally spaced rates around zero, and stays between the
-    neighbours of that rate.
+    The search starts from the best of the rates around zero that are `spacing` [rad/s] apart, and
+    stays between the neighbours of that rate.
     """
     rates = spacing * (jnp.arange(_RATES) - _RATES // 2)
     squares = jax.vmap(lambda rate: fit_rate(seen, rate).squares)(rates)

@@ -61,13 +61,13 @@ class Budget:
     plan takes longer than the planning budget starts late.
     """
 
-    sense: np.ndarray  # until the ball's flight is known
-    plan: np.ndarray  # wall time of planning
-    wait: np.ndarray  # from the end of planning until the arm starts
-    move: np.ndarray  # duration of the plan's motion
+    sense: np.ndarray  # [s], until the ball's flight is known
+    plan: np.ndarray  # [s], wall time of planning
+    wait: np.ndarray  # [s], from the end of planning until the arm starts
+    move: np.ndarray  # [s], duration of the plan's motion
     # From the end of the motion to the planned contact; negative if the motion ends later.
     stand: np.ndarray
-    rest: np.ndarray  # from the planned contact until the ball enters the inner box
+    rest: np.ndarray  # [s], from the planned contact until the ball enters the inner box
 
     @property
     def flight(self) -> np.ndarray:
@@ -240,7 +240,7 @@ def referee_leaves(cases: BlockCase) -> dict[str, np.ndarray]:
 
 
 def entry_times(cases: BlockCase) -> np.ndarray:
-    """Return when B balls enter the box around the arm, (B,) [s]; infinite for never."""
+    """Return when B balls enter the inner (protected) box, (B,) [s]; infinite for never."""
     with np.errstate(invalid="ignore"):  # NaN for balls that never rise as high as the box
         begin, end = times_inside(referee_leaves(cases), "inner", 0.0)
     return np.where(end >= 0.0, np.maximum(begin, 0.0), np.inf).min(axis=0)
@@ -257,7 +257,7 @@ def score(cases: BlockCase, plans: BlockPlan, flown: Executed, budget: Budget) -
     """Score B simulated motions: which balls are blocked, misses, and obstacle clearances.
 
     A ball is blocked if it reaches the face of the shield from in front, with its centre over the
-    face, before the ball's centre enters the inner box around the arm and before the ball touches
+    face, before the ball's centre enters the inner (protected) box and before the ball touches
     the arm. The miss is the distance of a blocked ball from the shield's centre. For other balls it
     is the distance where the ball crosses the shield's plane, or NaN if no crossing is in time.
 
@@ -322,8 +322,9 @@ def _strikes(
 ) -> np.ndarray:
     """Return whether B balls touch the arm's base or links 1 to 3 in S frames, (B, S) bool.
 
-    The wrist is left out, since its capsules protrude through the shield's face, while the real
-    links do not.
+    `turns` and `places` have the rotation and the position [m] of each link's frame. `links` has
+    each capsule's link, from 0, and -1 for the base. `ball` (3, B, S) [m] has the balls' centres.
+    The wrist is left out: its capsules protrude through the shield's face, the real links do not.
     """
     found = np.zeros(ball.shape[1:], bool)
     for k, link in enumerate(links):
@@ -340,9 +341,10 @@ def _strikes(
 def _least(
     case: dict[str, np.ndarray], links: Sequence[int], angles: np.ndarray, included: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the least clearances (B,) [m] of B arms from obstacles in the included frames.
+    """Return the least clearances (B,) [m] of B arms from obstacles in the frames of a mask.
 
-    Names of the nearest link and obstacle are returned, too. Without frames, the clearance is inf.
+    The mask is `included` (B, S) bool, and `angles` has the joint angles in S frames. Names of the
+    nearest link and obstacle are returned, too. The clearance is inf if the mask has no frame.
     """
     least, names = [], []
     for begin in range(0, len(included), _LANES):

@@ -31,13 +31,13 @@ def _make_box_part(box: Box, colour: str, opacity: float) -> Part:
 
 
 def _around(ends: np.ndarray, radius: float) -> np.ndarray:
-    """Return two opposite corners (2, 3) [m] of the box around an axis-aligned beam."""
+    """Return opposite corners (2, 3) [m] of a beam's box, from the ends of its axis (2, 3) [m]."""
     across = radius * (ends[0] == ends[1])
     return np.stack([ends.min(axis=0) - across, ends.max(axis=0) + across])
 
 
 def scenery(arm: Arm, has_pole: bool) -> tuple[Part, ...]:
-    """Return the drawn parts: the two boxes around the arm, beams, pedestal and pole."""
+    """Return the drawn parts: outer box, protected inner box, beams, pedestal and pole."""
     scene, (lower, upper) = paper_scene(), arm.base_box
     parts = [_make_box_part(scene.inner, GREEN, 0.1), _make_box_part(scene.outer, SKY, 0.07)]
     for ends, radius in zip(scene.beam_ends, scene.beam_radius, strict=True):
@@ -97,7 +97,7 @@ def joint_table(rows: Any) -> RateTable:
 
 
 def budget_figure(figure: Any, rows: Any) -> None:
-    """Draw one bar per ball: the times from its first sight until it enters the inner box."""
+    """Draw one bar per ball: the times from its first sight to its entry into the protected box."""
     axes = figure.add_subplot()
     number = min(len(rows), _BARS)
     flights = np.arange(number)

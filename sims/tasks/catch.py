@@ -60,7 +60,7 @@ _AFTER = 0.05  # [s], simulated time after the end of the last ball's horizon
 def _steadier(
     planner: Planner[CatchCase, CatchPlan],
 ) -> Planner[CatchCase, CatchPlan]:
-    """Raise the thrust at catches in guesses of the planner `exact`; keep other planners."""
+    """Return `exact` with a higher thrust at catches in initial guesses; keep other planners."""
     if isinstance(planner, DecidedPlanner) and isinstance(planner.planner, ExactCatch):
         own = dataclasses.replace(planner.planner, lift=LIFT)
         return dataclasses.replace(planner, planner=own)

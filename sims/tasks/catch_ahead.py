@@ -241,7 +241,7 @@ def within(cases: CatchCase, limits: dict[str, Any] | None) -> CatchCase:
 
 
 def bounds(loop: Loop, distance: tuple[float, float]) -> dict[str, Any]:
-    """Convert a pair of `LIMITS` to least thrust [m/s^2] and greatest body rate [rad/s]."""
+    """Convert fractions, an entry of `LIMITS`, to least thrust [m/s^2] and body rate [rad/s]."""
     model, gravity = loop.world.carrier.model, loop.world.gravity
     least, _ = model.thrust_bounds
     above, share = distance

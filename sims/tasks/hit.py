@@ -335,6 +335,6 @@ class HitFlight(BallFlightTask):
         return {"within_1_m": int((miss <= _FAR).sum()), "met": int(met.sum())}
 
     def findings(self, summary: Mapping[str, Any]) -> list[str]:
-        """Return a sentence: shares of balls within 1 m of the target, and of balls hit at all."""
+        """Return a sentence with two shares of balls: within 1 m of the target, and hit at all."""
         within, met = (percent(summary[name], summary["num"]) for name in ("within_1_m", "met"))
         return [f"{within} % within 1 m; the racket met the ball in {met} %."]

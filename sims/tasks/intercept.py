@@ -329,7 +329,11 @@ def plan_again(
 def _replace_plans(
     good: Array, old: tuple, found: InterceptPlan, left: InterceptCase, drive: DriveState
 ) -> tuple[DriveState, InterceptCase]:
-    """Replace the plans of the drives in the mask `good` by `found`; return drives and cases."""
+    """Replace the plans of the drives in the mask `good` (B,) by `found`; return drives and cases.
+
+    `old` has the current plans, their start times [s] and their cases. `left` has the cases of the
+    new plans.
+    """
 
     def pick(new: Array, before: Array) -> Array:
         return jnp.where(good.reshape(good.shape + (1,) * (new.ndim - 1)), new, before)
@@ -353,7 +357,11 @@ def _collect_drives(
     seen: list[tuple[Array, int]],
     number: np.ndarray,
 ) -> Driven:
-    """Collect the results of finished drives in NumPy arrays."""
+    """Collect the results of finished drives in NumPy arrays.
+
+    `parts` has the simulated frames of each planning period. An entry of `seen` is (target paths
+    as predicted in a period, number of its frames), and `number` (B,) counts executed plans.
+    """
     drive, parts, seen = jax.device_get((dataclasses.replace(drive, key=None), parts, seen))
     frames = jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1), *parts)
     start = np.asarray(truth.start)[:, None]

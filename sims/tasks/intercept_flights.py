@@ -222,7 +222,7 @@ def _add_height(points: np.ndarray, height: float) -> np.ndarray:
 
 
 def reach_layers(case: InterceptCase) -> list[tuple[float, np.ndarray]]:
-    """Return times [s], each with the P cells, as points (P, 2) [m], where the car could be."""
+    """Return pairs (time [s], grid points (P, 2) [m] at which the car could be at this time)."""
     search = SEARCHES["given"][0]
     found = jax.device_get(
         jax.jit(lambda case: search_reach(case, search, is_time_free=False))(case)

@@ -28,7 +28,7 @@ class Gains:
 class Course:
     """A motion of six joints with its start time, and how the joints brake after its end."""
 
-    motion: PiecewisePolynomial  # (M, D + 1, 6) [rad]
+    motion: PiecewisePolynomial  # (M, D + 1, 6) [rad], joint angles as M pieces of degree D
     begin: Array  # () [s], start time of the motion
     braking: Array  # (6,) [rad/s^2], deceleration of joints that still move when the motion ends
 

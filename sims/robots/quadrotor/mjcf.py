@@ -61,7 +61,8 @@ def _body(
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return mass [kg], centre of mass (3,) [m] and inertia (3, 3) [kg m^2] of a tree of bodies.
 
-    The inertia is about the centre of mass, in the frame `turn` (3, 3) of the root body.
+    The tree is the body with index `root` and all bodies attached to it. The inertia is about the
+    centre of mass, in the frame of the root body, whose rotation is `turn` (3, 3).
     """
     mass, centre = float(model.body_subtreemass[root]), data.subtree_com[root]
     total = np.zeros((3, 3))
