@@ -21,7 +21,7 @@ _FIRST_STD = 0.15  # standard deviation of actions before tanh at the start of t
 
 
 def _head(features: Array) -> Array:
-    """Apply the last layer; its first weights give the mean 0 and the deviation `_FIRST_STD`."""
+    """Apply the last layer; untrained, it gives the mean 0 and the deviation `_FIRST_STD`."""
     raw = float(np.log(np.expm1(_FIRST_STD - LEAST_STD)))
     first = lambda *_: jnp.repeat(jnp.array([0.0, raw]), PER_TARGET)  # noqa: E731
     return nn.Dense(2 * PER_TARGET, kernel_init=nn.initializers.zeros, bias_init=first)(features)

@@ -67,7 +67,7 @@ _EVAL_SEED = 4242  # seed of the evaluation cases, which no published figure use
 
 @dataclasses.dataclass(frozen=True)
 class Part:
-    """One part of a training: one call of Brax's PPO."""
+    """Settings of one part of a training, that is, of one call of Brax's PPO."""
 
     steps: int  # number of decisions
     # Number of planner iterations for each suite. If empty, rewards come from a rough estimate.

@@ -103,7 +103,7 @@ class NoRecovery(PlannerJaxError, ValueError):
 
 
 def install_line(extra: str) -> str:
-    """Return the command that installs an extra, into a checkout or beside an installed wheel."""
+    """Return the command that installs an extra (optional packages), in a checkout or elsewhere."""
     if (Path(__file__).parents[2] / "pyproject.toml").is_file():
         return f"pip install -c constraints.txt -e '.[{extra}]'"
     return f"pip install 'planner-jax[{extra}]'"

@@ -53,7 +53,7 @@ class Task:
     flight: str | None = None
     # Class with the settings of one case that a user specifies by a few numbers.
     single: str | None = None
-    # Options of `planner` in speed benchmarks.
+    # Keyword arguments with which speed benchmarks call `planner`.
     bench: Mapping[str, object] = dataclasses.field(default_factory=dict)
     contact: str | None = None  # dotted name of the contact times in a plan, such as "stroke.time"
     # Name of the planner whose plans are the reference for cost gaps, if no long search is.

@@ -199,7 +199,7 @@ def _call(
 
 
 def _result_shapes(mode: str, treedef: Treedef, num_columns: int) -> list[tuple[int, ...]]:
-    """Return the shapes of a mode's results for one segment of one lane (problem)."""
+    """Return the shapes of the kernel's results, by mode, for one segment of one lane (problem)."""
     shapes: list[tuple[int, ...]] = [(), ()]
     if mode != "values":
         shapes += [(num_columns, 3), ()]

@@ -97,7 +97,7 @@ class QuadrotorCase(Protocol):
 
     @property
     def limits(self) -> QuadrotorLimits:
-        """Limits of the quadrotor."""
+        """Limits of the quadrotor's motion, such as the greatest speed."""
         ...
 
     @property
@@ -112,7 +112,7 @@ class QuadrotorCase(Protocol):
 
 
 class Measure(enum.Enum):
-    """The formula of an excess in terms of the quantity q and its limit."""
+    """The formula of an excess: how far a limited quantity q, such as speed, exceeds its limit."""
 
     ABOVE = "q^2 / most^2 - 1"
     BELOW = "1 - q^2 / least^2"
@@ -120,11 +120,11 @@ class Measure(enum.Enum):
 
     @property
     def factor(self) -> float:
-        """Ratio of the excess to the relative excess of q, if both are small."""
+        """Ratio of the excess to the relative excess q / limit - 1, if both are small."""
         return 1.0 if self is Measure.PLAIN else 2.0
 
     def relative(self, excess: Array) -> Array:
-        """Convert the excess to the relative excess of q over its limit."""
+        """Convert an excess by this formula to the relative excess, such as q / limit - 1."""
         if self is Measure.ABOVE:
             return relative(excess)
         if self is Measure.BELOW:
@@ -144,7 +144,7 @@ def _rotor_excess(motion: Motion, gravity: Array, limits: QuadrotorLimits) -> tu
 
 @dataclasses.dataclass(frozen=True)
 class _Kind:
-    """One or more limits that belong to one field of `QuadrotorLimits`; the field may be None."""
+    """A kind of limits, such as of the speed, which belong to one field of `QuadrotorLimits`."""
 
     field: str  # field of `QuadrotorLimits` that is None for a quadrotor without these limits
     measures: tuple[Measure, ...]  # one for each excess
@@ -210,7 +210,7 @@ def relative_excess(limits: QuadrotorLimits, excess: Sequence[Array]) -> list[Ar
 def flight_along(
     maps: ProportionalMinco, nodes: int, case: QuadrotorCase, margin: float, hinge_width: float
 ) -> Along:
-    """Return the penalties of all limits along a flight, for `integrate_along`."""
+    """Return the definition of the penalties along a flight, for `integrate_along`."""
     factors = [measure.factor for measure in flight_measures(case.limits)]
     factors += [1.0] * num_limits(case.extras)
     margins = tuple(margin * factor for factor in factors)
@@ -221,7 +221,7 @@ def flight_along(
 
 
 def _groups(limits: QuadrotorLimits) -> tuple[tuple[tuple[int, int], ...], ...]:
-    """Group the derivatives (order, axis) of the motion that occur together in a limit."""
+    """Group the derivatives of the position, (order, axis), that occur together in a limit."""
     together: list[set[int]] = []
     for kind in _kinds(limits):
         joined = set(kind.orders).union(*(each for each in together if each & set(kind.orders)))

@@ -75,15 +75,15 @@ def _has_triton() -> bool:
 
 @dataclasses.dataclass
 class _Entry:
-    """A compiled function that has a kernel: the kernel's factory, and the function's shapes."""
+    """A compiled function that has a CUDA kernel: what makes the kernel, and array shapes."""
 
     path: str
     constants: tuple[Hashable, ...]
-    treedef: Treedef  # of the arguments
+    treedef: Treedef  # tree structure of the function's arguments
     shapes: list[Shape]  # of the leaves of arguments and results of one lane (problem)
 
 
-_ENTRIES: dict[str, _Entry] = {}  # by the names of compiled functions
+_ENTRIES: dict[str, _Entry] = {}  # by the names under which JAX compiles the functions
 
 
 def with_kernel(

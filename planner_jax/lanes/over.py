@@ -108,7 +108,7 @@ def _evaluate(closed: ClosedJaxpr, args: Sequence[_Value], lanes: int) -> list[_
 
 
 def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
-    """Evaluate one operation for all lanes (problems), by a kernel or a rule if there is one."""
+    """Evaluate one JAX operation for all lanes (problems), by a kernel or rule if there is one."""
     name = eqn.primitive.name
     if name in _CALLS:
         inner = eqn.params["jaxpr"] if "jaxpr" in eqn.params else eqn.params["call_jaxpr"]
@@ -136,7 +136,7 @@ def _outputs(eqn: JaxprEqn, inputs: list[_Value], lanes: int) -> list[_Value]:
 def _by_kernel(
     eqn: JaxprEqn, closed: ClosedJaxpr, kernel: kernels.Kernel, inputs: list[_Value], lanes: int
 ) -> list[_Value]:
-    """Evaluate a call by its kernel on CUDA, and by the function's operations elsewhere."""
+    """Evaluate a function's call by its CUDA kernel, and on other platforms by its operations."""
     pairs = zip(inputs, eqn.invars, strict=True)
     arrays = [_widen(value, shape_of(atom), lanes) for value, atom in pairs]
     shapes = [(*shape_of(atom), lanes) for atom in eqn.outvars]

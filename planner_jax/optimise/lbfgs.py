@@ -26,14 +26,14 @@ from planner_jax.optimise.settings import Evaluation, LbfgsConfig, Objective
 class Memory:
     """The last m steps of a search in n variables, and the changes of the gradient along them."""
 
-    steps: Array  # (m, n), s_k of [Liu1989], newest last
-    changes: Array  # (m, n), y_k
-    inverse_curvature: Array  # (m,), 1 / s.y; 0 where no pair is stored
+    steps: Array  # (m, n), s_k of [Liu1989], steps, newest last
+    changes: Array  # (m, n), y_k, changes of the gradient, newest last
+    inverse_curvature: Array  # (m,), 1 / s.y; 0 where no step is stored
 
 
 @struct.dataclass
 class LbfgsNumbers:
-    """The scalars in the state of one problem of the batch."""
+    """The scalars in the state of L-BFGS for one problem of the batch."""
 
     best: Evaluation  # objective at the best point; not finite before the first iteration
     reach: Array  # (), factor on the trial steps; it shrinks while no trial lowers the cost
@@ -43,7 +43,7 @@ class LbfgsNumbers:
 
 @struct.dataclass
 class LbfgsState:
-    """The state of one problem of the batch between two iterations."""
+    """The state of L-BFGS for one problem of the batch, between two iterations."""
 
     point: Array  # (n,)
     step: Array  # (n,), last step, which led to the point; 0 if there was none

@@ -231,7 +231,7 @@ def solve_batch(planner: "OptimisedPlanner", attempt: Round, cases: PyTree) -> P
 
 
 def _stages(attempt: Round) -> tuple[Stage, ...]:
-    """Return the searches of a round in order: preliminary stages, then the round's own search."""
+    """Return the searches of a round (attempt) in order: the preliminary ones, then its own."""
     return (*attempt.stages, Stage(attempt.solver, attempt.settings))
 
 

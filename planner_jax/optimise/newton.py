@@ -46,7 +46,7 @@ _LEAST = 1e-7  # least pivot, relative to the greatest entry of its matrix
 
 @struct.dataclass
 class NewtonNumbers:
-    """The scalars in the state of one problem of the batch."""
+    """The scalars in the state of Newton's method for one problem of the batch."""
 
     best: Evaluation  # at the best point; not finite before the first iteration
     damping: Array  # ()
@@ -57,7 +57,7 @@ class NewtonNumbers:
 
 @struct.dataclass
 class NewtonState:
-    """The state of one problem of the batch between two iterations."""
+    """The state of Newton's method for one problem of the batch, between two iterations."""
 
     point: Array  # (n,)
     best_point: Array  # (n,)

@@ -116,11 +116,11 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds of the planner, in order."""
+        """The rounds (attempts) of the planner, in order."""
         return self.rounds
 
     def load_attempt(self, attempt: Round, cases: PyTree) -> PyTree:
-        """Return a round whose numbers for L-BFGS are arguments of the compiled program."""
+        """Return a round (attempt) whose L-BFGS settings are arguments of the compiled program."""
         return load_round(attempt, jax.default_backend() != "cpu")
 
     def solve(self, case: PyTree, attempt: Round) -> PyTree:
@@ -142,11 +142,11 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
         return dataclasses.replace(self, **dict(settings))  # type: ignore[type-var]
 
     def with_solver(self, solver: Solver = _LONG) -> Self:
-        """Return a copy of the planner that makes one long search from the first guess."""
+        """Return a copy of the planner that makes one long search from its best first guess."""
         return self.with_settings((("rounds", (Round(solver=solver),)),))
 
     def with_polish(self, solver: NewtonConfig | None = None) -> Self:
-        """Return a copy of the planner whose first round continues with Newton's method.
+        """Return a copy of the planner whose first round (attempt) continues by Newton's method.
 
         `solver` has the settings of the method; by default it continues to the optimum.
         """
@@ -160,7 +160,7 @@ class OptimisedPlanner(Planner[CaseT, PlanT], abc.ABC):
     def with_effort(self, effort: str) -> Self:
         """Return a copy of the planner that lowers the cost further after every limit holds.
 
-        Only the first round is longer. The later rounds, for unsolved cases, are unchanged.
+        Only the first round (attempt) is longer. The later rounds are unchanged.
 
         Args:
             effort: "good" adds one iteration of Newton's method, "best" adds 8. Cases get more

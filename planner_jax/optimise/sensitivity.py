@@ -99,15 +99,15 @@ class Differentiated(OptimisedPlanner):
 
     @property
     def attempts(self) -> tuple[Round, ...]:
-        """The rounds of the inner planner."""
+        """The rounds (attempts) of the inner planner."""
         return self.planner.rounds
 
     def with_settings(self, settings: Settings) -> "Differentiated":
-        """Return the planner with other settings of the inner planner."""
+        """Return a copy with other values of some fields of the inner planner."""
         return dataclasses.replace(self, planner=self.planner.with_settings(settings))
 
     def prepare(self, case: PyTree) -> _Context:
-        """Return the context of the inner planner together with the case."""
+        """Return a case, and the data that the inner planner prepares for it."""
         return _Context(case=case, inner=self.planner.prepare(case))
 
     def guesses(self, context: _Context, num: int) -> Array:
@@ -115,7 +115,7 @@ class Differentiated(OptimisedPlanner):
         return self.planner.guesses(context.inner, num)
 
     def convert_point(self, point: Array, before: OptimisedPlanner) -> Array:
-        """Convert a point of `before`, which has other settings, to this planner's variables."""
+        """Convert a point (n,) of `before`, which has other settings, to own variables."""
         return self.planner.convert_point(point, cast(Differentiated, before).planner)
 
     def objective(self, point: Array, context: _Context) -> Evaluation:

@@ -124,7 +124,7 @@ Settings = tuple[tuple[str, object], ...]  # fields of a planner, and their valu
 @with_run_time_numbers()
 @dataclasses.dataclass(frozen=True)
 class Stage:
-    """A preliminary search on an easier problem; the round's next search starts at its result."""
+    """A preliminary search on an easier problem; its result is the start of the next search."""
 
     solver: Solver
     settings: Settings = ()
@@ -142,8 +142,8 @@ class Round(Attempt):
     """One attempt of a planner that minimises: its solver, settings and preliminary searches."""
 
     solver: Solver = LbfgsConfig()
-    settings: Settings = ()  # fields of the planner that this round changes
-    stages: tuple[Stage, ...] = ()  # searches before the round's own search, from easy to hard
+    settings: Settings = ()  # values of planner fields during this attempt
+    stages: tuple[Stage, ...] = ()  # searches before the search by `solver`, from easy to hard
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -158,7 +158,7 @@ class CountedLbfgs(LbfgsConfig):
 
 @cached_by_precision
 def load_round(attempt: Round, is_counted: bool) -> Round | Fixed:
-    """Convert a round to an argument of compiled programs; it is static if a search has no steps.
+    """Convert a round (attempt) to an argument of programs; static if a search has no steps.
 
     Rounds that differ only in L-BFGS's numbers of iterations and tolerances share one program. If
     `is_counted`, numbers of iterations up to `COUNTED` are static: a GPU then need not ask the host

@@ -33,7 +33,7 @@ class StartNetwork:
     biases: tuple[Array | np.ndarray, ...]  # (outputs,)
 
     def __call__(self, features: Array) -> Array:
-        """Return the correction (n,) of a guess, given the F features of a case."""
+        """Return the correction (n,) of a guessed starting point, from F features of its case."""
         cast = functools.partial(jnp.asarray, dtype=features.dtype)
         values = (features - cast(self.mean)) / cast(self.deviation)
         values = jnp.clip(values, -REACH, REACH)
@@ -45,8 +45,8 @@ class StartNetwork:
 
 
 def select_start(cost: Callable[[Array], Array], guess: Array, learned: Array) -> Array:
-    """Return the starting point (n,) of lower cost: the network's point or the guess."""
-    costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # at once, in one program
+    """Return the starting point (n,) of lower cost: `guess`, or as a network corrected it."""
+    costs = jax.vmap(cost)(jnp.stack([guess, learned]))  # evaluate both points at once
     return jnp.where(costs[1] < costs[0], learned, guess)
 
 

@@ -91,11 +91,11 @@ class Watch:
         if progress is not None and not callable(progress):
             raise ArgumentTypeError("progress", "callable, such as print", progress)
         self._start, self._limit, self._progress = time.monotonic(), time_limit, progress
-        self._reported = (0, 0.0)  # round and time of the last report
+        self._reported = (0, 0.0)  # number of the attempt, and time [s], of the last report
 
     @property
     def waits(self) -> bool:
-        """True if each step must be awaited, because its end time is compared or reported."""
+        """True if a time limit or progress reports require waiting for the end of each call."""
         return self._limit is not None or self._progress is not None
 
     @property
@@ -104,7 +104,7 @@ class Watch:
         return self._limit is not None and time.monotonic() - self._start >= self._limit
 
     def report(self, planner: Planner, attempt: Attempt, tried: int, cases: int) -> None:
-        """Report progress at the start and end of a round, and in between at most once a second."""
+        """Report progress at the start and end of an attempt, and else at most once a second."""
         if self._progress is None:
             return
         seconds, rounds = time.monotonic() - self._start, tuple(planner.attempts)

@@ -44,7 +44,7 @@ class DecidedPlanner(PlannerAround[CaseT, PlanT]):
         return self.planner.settle(cases.with_choice(choice), plan_of)
 
     def plan_by(self, drive: Drive, cases: PyTree) -> PyTree:
-        """Return the best plan among the proposed choices, for one case or each case of a batch."""
+        """Plan each case with the choices that the decision proposes; return its best plan."""
         alone = cases.batch_shape == ()
         if not drive.is_pure:
             self.decision.check(cases)

@@ -41,7 +41,7 @@ class Driver:
     def __call__(
         self, planner: Planner, cases: PyTree, attempts: Sequence[Attempt] | None = None
     ) -> tuple[PyTree, PyTree]:
-        """Return plans of one case or a batch, and numbers that are zero if all are solved."""
+        """Return plans, and an array or a number that is zero everywhere if all are solved."""
         if planner.kind is Kind.COMPOSITE:
             plans = planner.plan_by(self, cases)
             return plans, is_unsolved(plans.status)
@@ -59,7 +59,7 @@ class Driver:
     def plan_again(
         self, plan_of: Callable[[PyTree], PyTree], cases: PyTree, plans: PyTree, left: PyTree
     ) -> PyTree:
-        """Plan the cases where `left` (B,) is true again; keep each case's better plan."""
+        """Plan again the cases where `left` (B,) is true; return each case's better plan."""
         if self.is_pure:
             again = lambda plans: select(plan_of(cases), plans, left)  # noqa: E731
             return lax.cond(jnp.any(left), again, lambda plans: plans, plans)

@@ -226,7 +226,7 @@ def _beside_shield(case: dict, links: Sequence, capsules: list[_Capsule]) -> lis
 
 
 def _pole(case: dict) -> _Capsule:
-    """Return the pole as a long capsule; in cases without a pole its radius is minus infinity."""
+    """Return the vertical pole as a long capsule; without a pole, of radius minus infinity."""
     x, y = case["scene.pole"].T[..., None]
     first, second = (np.stack([x, y, np.full_like(x, end)]) for end in (-_POLE_HALF, _POLE_HALF))
     radius = np.where(case["scene.has_pole"] != 0.0, case["scene.pole_radius"], -np.inf)
@@ -248,7 +248,7 @@ def _base_box(case: dict) -> _Box:
 
 
 def _pair(one: _Capsule | _Box, other: _Capsule | _Box, name: str) -> _Pair:
-    """Return the pair of two solids, with a lower bound from the sphere around the first solid."""
+    """Pair two solids; the sphere around the first one gives a lower bound of their distance."""
 
     def exact(lane: np.ndarray, sample: np.ndarray) -> np.ndarray:
         return _distance(one.at(lane, sample), other.at(lane, sample))
@@ -267,9 +267,10 @@ def _distance(one: _Capsule | _Box, other: _Capsule | _Box) -> np.ndarray:
 
 
 def _least(pairs: list[_Pair], sampled: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the least distance of each of B plans over all pairs of solids and sampled times.
+    """Find each plan's least distance over `pairs` of solids, and over samples to evaluate.
 
-    Returns arrays (B,): the distance [m], the index of its sample, and the name of its pair.
+    `sampled` (B, S) is true for these samples. Returns arrays (B,): the distance [m], the index of
+    its sample, and the name of its pair.
     """
     num_lanes, num_samples = sampled.shape
     if not pairs:

@@ -118,7 +118,7 @@ def between_boxes(
 
 
 def _edges_to_box(middle, rotation, half, other) -> np.ndarray:
-    """Return for P pairs of boxes the least distance of the first's edges from the second."""
+    """Return the least distances (P,) [m] of the first boxes' edges from the second boxes."""
     edges = rotation * half  # (3, 3, P), three vectors along the edges, half as long as an edge
     starts = [
         middle + first * edges[:, (k + 1) % 3] + second * edges[:, (k + 2) % 3] - edges[:, k]
