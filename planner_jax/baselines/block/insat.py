@@ -196,7 +196,7 @@ def _fit_points(path: np.ndarray, end: np.ndarray, rests: bool) -> np.ndarray:
 
 @functools.cache
 def _fit_matrices(stop: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the spline basis at S samples (S, m), and the pseudo-inverse of its fitted columns."""
+    """Return the spline basis (S, m) at S samples, and the pseudo-inverse of columns 2 to stop."""
     of_points = basis(DEGREE, CONTROL_POINTS, _SHARES)
     return of_points, np.linalg.pinv(of_points[:, 2:stop])
 

@@ -189,7 +189,10 @@ class PathThenTime(PoseByPose):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None."""
+        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None.
+
+        `free` checks collisions, and `left` returns the remaining search time [s].
+        """
 
     def motion_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock

@@ -41,7 +41,7 @@ class RrtConnectBlock(PathThenTime):
     def path_to(
         self, case: BlockCase, free: FreeSpace, goal: Goal, left: Clock
     ) -> np.ndarray | None:
-        """Return joint angles (N, 6) [rad] along a collision-free path to the goal, or None."""
+        """Return a collision-free joint path (N, 6) [rad], or None; `left` gives the time left."""
         base, geometric = _ompl()
         space = base.RealVectorStateSpace(6)
         bounds = base.RealVectorBounds(6)

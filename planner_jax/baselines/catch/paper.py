@@ -159,12 +159,12 @@ class PaperCatch(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices that map end states and waypoint offsets to one segment."""
+        """Constant matrices: from end states and waypoints' deviations to one segment's motion."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
     def num_offsets(self) -> int:
-        """The number of waypoint variables of one segment."""
+        """The number of waypoint variables of one segment, the trajectory to one catch."""
         return 3 * (self.num_pieces - 1)
 
     def prepare(self, case: CatchCase) -> CatchContext:
@@ -207,7 +207,11 @@ class PaperCatch(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype)[None]).reshape(1, -1)
 
     def catches(self, natural: Array, context: CatchContext) -> Catch:
-        """Return N catches from their variables (N, 13), those after the waypoint offsets."""
+        """Return N catches from their unscaled variables `natural` (N, 13).
+
+        They are the logarithm of the segment's duration, the net's position relative to the ball,
+        and velocity, acceleration and jerk of the quadrotor.
+        """
         case, net = context.case, context.case.net
         durations = jnp.exp(natural[:, 0])
         times = jnp.cumsum(jnp.where(context.active, durations, 0.0))
@@ -240,7 +244,7 @@ class PaperCatch(OptimisedPlanner):
         return Chain(rows=rows, offsets=offsets, piece_durations=piece_durations), catch
 
     def _at_ends(self, chain: Chain, catch: Catch, context: CatchContext) -> Array:
-        """Return the cost () of snap, missed catches and total time, without limits' penalties."""
+        """Return the cost () of snap, missed catches and total time; `chain` has all segments."""
         at_catch = self.miss_weight * steep_hinge(catch.miss, context.case.net.radius)
         at_catch += self.angle_weight * steep_hinge(catch.angle_excess, self.hinge_width)
         energy = jax.vmap(lambda *segment: trajectory_energy(self.maps, *segment))(

@@ -154,9 +154,9 @@ class BatHit(OptimisedPlanner):
     hinge_width: float = 0.01  # width of the smooth penalties, in the unit of each limit
     # [s], durations before and after the transition in the initial guess; Bat-Lite uses the first.
     stage_times: tuple[float, float] = (0.7, 0.5)
-    first_angle: float = math.radians(60.0)  # [rad], elevation of the returned ball in the guess
-    first_thrust_z: float = 1.1  # vertical thrust at the impact in the guess, divided by gravity
-    first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s], in the guess
+    first_angle: float = math.radians(60.0)  # [rad], ball's elevation after the guessed hit
+    first_thrust_z: float = 1.1  # vertical thrust at the impact in the initial guess / gravity
+    first_racket_vel_yz: tuple[float, float] = (0.0, 1.0)  # [m/s], in the initial guess
     rounds: tuple[Round, ...] = (
         Round(
             starts=1,
@@ -179,7 +179,7 @@ class BatHit(OptimisedPlanner):
 
     @property
     def maps(self) -> ProportionalMinco:
-        """The constant matrices that map end states and waypoint offsets to the trajectory."""
+        """Constant matrices: from end states and waypoints' deviations to the trajectory."""
         return proportional_minco(_ORDER, (1.0,) * self.num_pieces)
 
     @property
@@ -225,7 +225,7 @@ class BatHit(OptimisedPlanner):
         return (natural / jnp.asarray(self.scale, dtype))[None]
 
     def primitive_waypoints(self, impact: Impact, case: HitCase) -> Array:
-        """Return the waypoints (W, 3) [m] of the guess, sampled from minimum-jerk primitives."""
+        """Return W waypoints (W, 3) [m] of the initial guess, on minimum-jerk trajectories."""
         head, tail, end = case.head_state[:3], impact.tail_state[:3], impact.stroke.time
         shares = np.arange(1, self.num_pieces) / self.num_pieces
         times = end * jnp.asarray(shares, end.dtype)

@@ -31,7 +31,7 @@ class HybridAstar:
     shortest path without obstacles.
     """
 
-    cell: float = 0.1  # [m], side of a cell
+    cell: float = 0.1  # [m], side of a square cell of the search grid
     headings: int = 72  # number of heading bins in a full turn
     turn_price: float = 0.05  # added cost [m] per metre driven at the greatest curvature
     # Weighted A* [Pohl1970]: the heuristic is multiplied by 1 + slack. The cost of a path is at

@@ -50,7 +50,7 @@ class Rules(NamedTuple):
     """The settings and limits of a search."""
 
     curvature: float  # [1/m], greatest curvature
-    cell: float  # [m], side of a cell
+    cell: float  # [m], side of a square cell of the search grid
     headings: int  # number of heading bins in a full turn
     price: float  # added cost [m] per metre driven at the greatest curvature
     slack: float  # the heuristic is multiplied by 1 + slack

@@ -186,7 +186,7 @@ def smoothing_cost(
         unit: () [m], unit of length in which the cost is computed.
         walls: standing obstacles.
         curvature: () [1/m], greatest curvature.
-        settings: weights, and the range `reach` of obstacles.
+        settings: weights, and `reach` [m], the distance up to which obstacles add to the cost.
     """
     steps = (points[1:] - points[:-1]) / unit
     before, after = steps[:-1], steps[1:]

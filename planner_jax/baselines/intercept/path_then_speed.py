@@ -140,7 +140,7 @@ class PathThenSpeed(Planner):
         return explain(case, reason, plan)
 
     def best_drive(self, case: InterceptCase, found: StaticPaths) -> InterceptPlan:
-        """Return the plan of least acceleration along one of the paths.
+        """Return the plan of least acceleration along one of the paths `found`.
 
         If no plan is solved, the plan with the smallest violation is returned.
         """

@@ -201,7 +201,7 @@ def solve_qp(
 def _search(
     normals: Numbers, is_free: Array, low: Array, high: Array, slack: Array, config: QpConfig
 ) -> _Search:
-    """Run the dual method, from no active bounds, until the point is optimal or no step is left."""
+    """Run the dual method, first without active bounds, until an optimum or no possible step."""
     num, size = normals.shape
     slots = min(config.active, size)
     dtype = normals.dtype

@@ -92,7 +92,10 @@ class PathSource:
     def guess(
         self, case: InterceptCase, found: Reachability, layer: Array, noise: PathNoise
     ) -> tuple[Array, Guess]:
-        """Draw a random path that arrives in time step `layer`; return its time [s] and motion."""
+        """Draw a random path through the cells `found`, which the car can reach, to the target.
+
+        It arrives in time step `layer`. Return its time [s] and an initial guess of the motion.
+        """
         grid = found.grid
         path = draw_cell_path(case, found, layer, noise, 0.0)
         time = (layer + 0.5) * grid.step

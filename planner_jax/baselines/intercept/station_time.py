@@ -98,7 +98,7 @@ def reference_line(
         is_allowed = jnp.abs(change) <= problem.acceleration_limit * (1.0 + 1e-5)
         return jnp.where(is_allowed, change**2 * step, jnp.inf)
 
-    change = charge(speed)  # (to, from)
+    change = charge(speed)  # (new speed, old speed)
     penalty = jnp.where(_find_forbidden_edges(problem, grid), jnp.inf, 0.0)  # (N, J + 1, S + 1)
 
     def shift_to_end(leaving: Array) -> Array:

@@ -186,5 +186,5 @@ def error_across(belief: EkfState, ball: BallState) -> Array:
 def _root(square: Array) -> Array:
     """Return the square root; 0 with the derivative 0 if rounding made `square` negative."""
     there = square > 0.0
-    # NaN marks a ball that was not seen. The product 0 * square is NaN then, and else 0.
+    # `square` is NaN if the ball was not seen; then 0 * square keeps NaN in the result.
     return jnp.where(there, jnp.sqrt(jnp.where(there, square, 1.0)), 0.0 * square)

@@ -95,8 +95,8 @@ def information(camera: Camera, noise: Noise, points: Array) -> Array:
     sharp = camera.focal / (depth * noise.pixel_std)
     blurred = 1.0 / depth_std(camera, noise, depth)
     none = jnp.zeros_like(depth)
-    # These are the rows of a matrix W that scales an error e in the camera frame: W e has the
-    # identity matrix as its covariance.
+    # `rows` are the rows of a matrix W that scales a position error e in the camera frame, such
+    # that W e has the identity matrix as its covariance.
     rows = [
         jnp.stack([sharp, none, -sharp * point_in_camera[..., 0] / depth], axis=-1),
         jnp.stack([none, sharp, -sharp * point_in_camera[..., 1] / depth], axis=-1),

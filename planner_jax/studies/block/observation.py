@@ -219,7 +219,8 @@ def cautious(
 def fit_errors(cases: BlockCase, fits: FlightFit) -> tuple[Array, Array]:
     """Return the position errors of fitted flights, halfway through the time for blocking the ball.
 
-    The ball can be blocked from its entry into the outer box until its entry into the inner box.
+    The ball can be blocked from its entry into the outer box around the arm until its entry into
+    the inner box, which is protected.
 
     Args:
         cases: a batch of B cases with the true balls.

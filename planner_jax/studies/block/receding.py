@@ -44,7 +44,7 @@ from planner_jax.task.block.replan import ReplanBlock, WarmBlock
 from planner_jax.trajectory.polynomial import PiecewisePolynomial, evaluate
 
 _NEAR = 0.02  # [m] A contact within this distance of the shield's centre needs no new motion.
-# Greatest relative excess over the limits of a contact with which a motion is still continued.
+# An arm continues its motion if the contact exceeds its limits by at most this fraction.
 _EXCESS = 0.05
 _LONG = 100.0  # [s] Duration of the standstill piece after a motion, longer than any flight.
 
@@ -55,7 +55,7 @@ class Aim:
 
     offset: float  # [m] greatest distance of the contact from the shield's centre
     at_rest: bool = False  # whether the arm must be at rest at the contact
-    edge: float = 0.0  # [m] length cut from both ends of the ball's usable path
+    edge: float = 0.0  # [m] cut from both ends of the path on which a ball may be met
 
 
 # Requirements on a contact in the order in which they are tried, the strictest first. Each is tried
@@ -251,7 +251,7 @@ class _Arms:
         if not good.any():
             return
         lanes, found = lanes[good], take(found, good)
-        # The first plans determine the numbers of pieces and powers of all arms' motions.
+        # The first plans determine how many polynomial pieces and coefficients all motions have.
         if not self.motions.any():
             still = _still(self.cases, found.motion.coeffs.shape[1:3])
             self.plans = dataclasses.replace(self.plans, motion=still)

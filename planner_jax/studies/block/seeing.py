@@ -24,7 +24,8 @@ class SeenPlan(BlockPlan):
     """The executed motion of an arm up to the true contact, and errors of the fitted flight.
 
     The error is the distance of the fitted ball from the true ball, normal to the true velocity. It
-    is taken halfway in time between the ball's entries into the outer and the inner box.
+    is taken halfway in time between the ball's entry into the outer box, in which the arm may meet
+    it, and its entry into the protected inner box.
     """
 
     sight: Array  # () int32, a `Sight`: whether the first fit had enough observations

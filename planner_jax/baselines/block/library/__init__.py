@@ -1,5 +1,5 @@
 """A library of stored arm motions that block balls [Natarajan2024, Algorithm 1].
 
-Two boxes around the arm are divided into cells. A motion is stored for each pair of an outer and an
-inner cell that a ball can pass.
+The faces of two boxes around the arm are divided into cells. A motion is stored for each pair of a
+cell of the outer and a cell of the inner box that a ball can pass.
 """

@@ -40,7 +40,8 @@ _HIGHEST = lax.Precision.HIGHEST
 # Weights of the squared changes of six joints by a warp. The wrist joints have low weights, since
 # they carry little mass; the last joint keeps its stored angles.
 _WEIGHTS = np.array([1.0, 1.0, 1.0, 0.3, 0.3, 0.0])
-# [rad^2], penalty of the squared distance between the motion's cells and the ball, in cell sizes.
+# [rad^2], penalty weight of a ball's squared distance, in cell sizes, from the centres of the cells
+# for which a motion was stored.
 _AWAY = 0.02
 _LATE = 10.0  # [rad^2], penalty of a relative excess of 1 over a joint limit
 _NEAR = 30.0  # [rad^2/m], penalty per metre that the distance from the pole is too small
@@ -69,7 +70,7 @@ class Warped:
     # (C, 6 K + 1): rates of 6 joints at K knots, times the duration [rad]; then contact time [s].
     points: Array
     penalty: Array  # (C,) [rad^2], squared warp plus penalties; infinite without a stored motion
-    is_open: Array  # (C,) bool, whether joint limits and the distance from the pole hold
+    is_open: Array  # (C,) bool, whether joint limits and the least pole distance are kept
 
 
 @struct.dataclass
@@ -78,8 +79,8 @@ class AdaptBlock(Planner):
 
     Arm, limits and scene must equal the library's, and the arm must stand at one of the library's
     start poses. Otherwise the status is BLOCKED, and the method `check` raises an error. The status
-    is OUT_OF_REACH for a ball that does not pass through both boxes, and INFEASIBLE if no motion
-    was found.
+    is OUT_OF_REACH for a ball that does not pass both boxes around the arm, and INFEASIBLE if no
+    motion was found.
     """
 
     stored: LibraryBlock
@@ -131,7 +132,11 @@ class AdaptBlock(Planner):
     def warp(
         self, case: BlockCase, flight: Flight, home: Array, poses: EndPoses, effort: Effort
     ) -> Warped:
-        """Warp motions stored for start pose `home` to end poses along the ball's trajectory."""
+        """Return stored motions, changed (warped) such that they end in poses that meet the ball.
+
+        `home` is the index of the motions' start pose, `poses` has eight end poses at each of
+        several points of the ball's trajectory, and `effort` has the numbers of motions.
+        """
         online, dtype = self.online, case.angles.dtype
         pieces, num = online.pieces, effort.points
         steps, away, found = self.neighbours(case, flight, home, effort.neighbours)
@@ -175,7 +180,7 @@ class AdaptBlock(Planner):
     def neighbours(
         self, case: BlockCase, flight: Flight, home: Array, num: int
     ) -> tuple[Array, Array, Array]:
-        """Return N = `num` motions stored for the cells around the cells that the ball passes.
+        """Return the N = `num` motions from start pose `home` whose cells are nearest to the ball.
 
         Returns:
             steps: (N, K, 6) [rad], rates of the joints at K knots of the motion, times its

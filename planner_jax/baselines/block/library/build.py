@@ -50,7 +50,7 @@ from planner_jax.task.block.scene import Scene
 # of cells that have a motion already, and all stored guesses for pairs without a motion. A repair
 # starts from the old motion and from `REPAIR_STARTS`.
 STARTS, REPAIR_STARTS = (2, 0, 1, 3, 4, 5), (2,)
-_WORTH = 0.03  # [s], least possible gain of the ball's entry time for which a search is made
+_WORTH = 0.03  # [s], a motion is improved only if the ball might come at least this much earlier
 _CHECKED_AT_ONCE = 1024  # number of stored motions whose distances are computed in one batch
 
 
@@ -78,7 +78,7 @@ class _Motions:
     point: np.ndarray
     # (P,) [s], earliest entry of a ball into the outer box; infinite without a motion.
     entry: np.ndarray
-    quickest: np.ndarray  # (P,) [s], entry time if no obstacle delayed the motion
+    quickest: np.ndarray  # (P,) [s], earliest entry if there were no obstacles
 
 
 def build(
@@ -99,7 +99,7 @@ def build(
         path: path of the library file.
         setting: arm, limits and scene, with NumPy leaves.
         homes: (H, 6) [rad], joint angles of one or more poses at which motions start.
-        layout: the division of both boxes into cells.
+        layout: the division of both boxes around the arm into cells.
         progress: show a progress bar on the standard error stream.
 
     Raises:
@@ -138,7 +138,7 @@ def repair(
     """Return the library for another scene, in which colliding motions are planned again.
 
     Args:
-        library: library of a scene with the same boxes.
+        library: library of a scene with the same boxes around the arm.
         scene: the new scene.
         retry: also plan for pairs of cells that have no motion.
         progress: show a progress bar on the standard error stream.
@@ -202,7 +202,7 @@ def plan_pairs(
         home: (6,) [rad], joint angles at which motions start.
         tunnel: tunnels (spaces between the two cells) of all pairs.
         pairs: (N,), numbers of the pairs to plan for.
-        old: (N, W), the pairs' table rows for another scene, used as initial guesses.
+        old: (N, W), the pairs' table rows, of length W, for another scene: the initial guesses.
     """
     straight = StraightPair(setting, host_leaf(home))
     bent = BentPair(setting, host_leaf(home))
@@ -289,7 +289,7 @@ def _rows_of(planner: PairPlanner, found: _Motions) -> np.ndarray:
 
 
 def _in_parts(array: np.ndarray) -> list[np.ndarray]:
-    """Split an array into equal parts along its first axis; pad the last part with its last row."""
+    """Split an array into parts of `_CHECKED_AT_ONCE` rows; repeat the last row to fill a part."""
     num = -(-len(array) // _CHECKED_AT_ONCE) * _CHECKED_AT_ONCE
     filled = array[np.minimum(np.arange(num), len(array) - 1)]
     return list(filled.reshape(-1, _CHECKED_AT_ONCE, *array.shape[1:]))
@@ -307,7 +307,7 @@ def _ends(setting: Setting, home: Array, steps: Array) -> tuple[Array, Array]:
 
 
 def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Return which of N stored motions keep the least distance from obstacles, (N,) bool."""
+    """Return which of N motions (table rows) keep the least distance from obstacles, (N,) bool."""
     online = OnlineBlock()
     if not len(rows):
         return np.zeros(0, bool)
@@ -322,14 +322,14 @@ def _is_free(setting: Setting, home: np.ndarray, rows: np.ndarray) -> np.ndarray
 
 @functools.partial(jax.jit, static_argnames="shares")
 def _nearest_on_motion(setting: Setting, home: Array, steps: Array, shares: tuple) -> Array:
-    """Return the least distance from obstacles along each of N motions, (N,) [m]."""
+    """Return the least obstacle distance (N,) [m] of N motions, at fractions of their durations."""
     at = lambda steps: angles_at(home, jnp.zeros_like(home), steps, shares)  # noqa: E731
     return _nearest(setting, jax.vmap(at)(steps))
 
 
 @jax.jit
 def _nearest(setting: Setting, angles: Array) -> Array:
-    """Return the arm's least distance from obstacles over S poses, for N sequences, (N,) [m]."""
+    """Return the least obstacle distance (N,) [m] of each of N sequences of S poses (N, S, 6)."""
     flat = least_clearances(setting.arm, setting.scene, angles.reshape(-1, 6))
     return jnp.min(flat.reshape(angles.shape[:2]), axis=1)
 
@@ -348,7 +348,7 @@ def _bar(total: int, unit: str, progress: bool) -> tqdm:
 
 
 class _Parts:
-    """The files of an unfinished library; each holds the motions of some pairs of cells."""
+    """The files of a library during its build; each has the motions for some pairs of cells."""
 
     def __init__(self, folder: Path, setting: Setting, homes: np.ndarray, layout: Layout):
         self._folder = folder

@@ -1,11 +1,12 @@
 """Cells on the faces of the two boxes around the arm, tunnels between cells, and their coverage.
 
-A ball passes one cell of the outer box and then one cell of the inner box. The two cells are a
-pair, with the number `outer * num_inner + inner` from the numbers of the two cells. The space
-between the cells is a tunnel. [Natarajan2024, Section IV-C] calls the boxes domes. The paper
-specifies neither the number of cells nor the faces that have cells; `LAYOUTS` has the layouts of
-this library. Cells are numbered face by face. All positions are in the robot's base frame, z up, in
-SI units.
+The inner box is protected from balls; in the outer box the arm may meet a ball. Cells are equal
+rectangles on the faces of both boxes. A ball passes one cell of the outer box and then one cell of
+the inner box. The two cells are a pair, with the number `outer * num_inner + inner` from the
+numbers of the two cells. The space between the cells is a tunnel. [Natarajan2024, Section IV-C]
+calls the boxes domes. The paper specifies neither the number of cells nor the faces that have
+cells; `LAYOUTS` has the layouts of this library. Cells are numbered face by face. All positions are
+in the robot's base frame, z up, in SI units.
 """
 
 import dataclasses
@@ -51,24 +52,24 @@ class Face:
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """The faces of the outer and of the inner box that have cells."""
+    """The faces of the outer and of the inner box around the arm that are divided into cells."""
 
     outer: tuple[Face, ...]
     inner: tuple[Face, ...]
 
     @property
     def num_outer(self) -> int:
-        """The number of cells of the outer box."""
+        """The number of cells of the outer box, in which the arm may meet a ball."""
         return sum(face.num for face in self.outer)
 
     @property
     def num_inner(self) -> int:
-        """The number of cells of the inner box."""
+        """The number of cells of the inner box, which is protected from balls."""
         return sum(face.num for face in self.inner)
 
     @property
     def num_pairs(self) -> int:
-        """The number of pairs of an outer and an inner cell, even if no ball can pass the pair."""
+        """The number of pairs of an outer and an inner cell, even if no ball can pass both."""
         return self.num_outer * self.num_inner
 
 
@@ -78,9 +79,9 @@ def _faces(names: str, cells: tuple[int, int]) -> tuple[Face, ...]:
     )
 
 
-# Divisions of the two boxes into cells. A, B and C have 5,760 pairs of cells, as the code of
-# [Natarajan2024]. D has cells on all sides that balls from ahead can reach. The default "full" also
-# has cells on the top of the outer box, for lobbed balls.
+# Divisions of both boxes around the arm into cells. A, B and C have 5,760 pairs of cells, as the
+# code of [Natarajan2024]. D has cells on all sides that balls from ahead can reach. The default
+# "full" also has cells on the top of the outer box, for lobbed balls.
 LAYOUTS = {
     "full": Layout(_faces("+x +y -y +z", (8, 8)), _faces("+x +y -y", (4, 7))),
     "A": Layout(_faces("+x +y -y", (8, 8)), _faces("+x +z", (3, 5))),
@@ -157,7 +158,7 @@ def cells_around(
 
 @struct.dataclass
 class Tunnels:
-    """The spaces (tunnels) between the two cells of each of P pairs; NumPy, float64."""
+    """The P spaces (tunnels), each from a cell of the outer to a cell of the inner box; float64."""
 
     outer: np.ndarray  # (P, 2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: np.ndarray  # (P, 2, 3) [m], corners of the inner cell, lowest and highest
@@ -170,7 +171,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
     A ball reaches an inner cell only from in front of that cell's face. The part of the outer cell
     behind the plane of this face is therefore cut off. If nothing remains of the outer cell, no
-    ball can pass the pair.
+    ball can pass both cells.
     """
     from_outer, _ = _corners(layout.outer, outer)
     to_inner, of_face = _corners(layout.inner, inner)
@@ -194,7 +195,7 @@ def tunnels(layout: Layout, inner: Box, outer: Box) -> Tunnels:
 
 
 def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]:
-    """Return lowest and highest corners (N, 2, 3) [m] of N cells, and indices of their faces."""
+    """Return two opposite corners (N, 2, 3) [m] of a box's N cells, and each cell's face (N,)."""
     lower, upper = np.asarray(box.lower, float), np.asarray(box.upper, float)
     found, of_face = [], []
     for place, face in enumerate(faces):
@@ -211,7 +212,7 @@ def _corners(faces: tuple[Face, ...], box: Box) -> tuple[np.ndarray, np.ndarray]
 
 
 def nominal_ball(outer: Array, inner: Array) -> tuple[BallState, Array]:
-    """Return a ball that flies from the centre of an outer cell to the centre of an inner cell.
+    """Return a ball that flies from the centre of an outer box's cell to that of an inner box's.
 
     Args:
         outer: (2, 3) [m], corners of the outer cell, lowest and highest.

@@ -86,7 +86,7 @@ def build_library(
 
 
 def show_library(path: str, *, map: str | None = None) -> None:
-    """Print which share of the pairs of cells has motions; draw it at the path `map`, if given."""
+    """Print which share of pairs of cells has motions; draw it in the file `map`, if given."""
     library = load_library(path)
     covered = coverage(library)
     _print(path, library, covered)
@@ -138,7 +138,7 @@ def repair_library(path: str, *, pole: Sequence[float], out: str, retry: bool = 
 
 
 def _print(path: str, library: Library, covered: Coverage) -> None:
-    """Print a library's cells, size, joint limits, pole, and share of pairs with a motion."""
+    """Print a library's cells, size, joint limits, pole, and share of cell pairs with a motion."""
     table, setting = library.table, library.setting
     faces = [
         " ".join(f"{face.name} {face.cells[0]}x{face.cells[1]}" for face in side)
@@ -173,7 +173,7 @@ def _print(path: str, library: Library, covered: Coverage) -> None:
 
 
 def coverage_map(figure: Figure, library: Library, covered: Coverage) -> None:
-    """Draw each cell's share of pairs with a motion, among its pairs that a ball can pass."""
+    """Draw for each cell which share of its pairs that a ball can pass has stored motions."""
     layout, scene = library.table.layout, library.setting.scene
     shape = (layout.num_outer, layout.num_inner)
     found = covered.found.any(axis=0).reshape(shape)

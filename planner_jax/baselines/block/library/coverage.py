@@ -23,14 +23,14 @@ from planner_jax.planning.plan import plan
 from planner_jax.referee.block import BlockVerdict, referee_blocks
 from planner_jax.task.block.case import ANYWHERE, BlockCase
 
-_SPEEDS = (7.0, 10.0)  # [m/s], range of the random balls' mean speed between the two boxes
+_SPEEDS = (7.0, 10.0)  # [m/s], range of random balls' mean speed from outer to inner box
 # [s], time between the end of the stored motion and the entry of a random ball into the outer box.
 _SPARE = 2e-3
 
 
 @dataclasses.dataclass(frozen=True)
 class Coverage:
-    """Which of P pairs of an outer and an inner cell have stored motions from H start poses."""
+    """Which motions a library has, from H start poses, for P pairs of cells that a ball passes."""
 
     is_feasible: np.ndarray  # (P,) bool, whether a ball can pass through both cells
     is_centred: np.ndarray  # (P,) bool, whether a ball can pass from the outer cell's centre
@@ -39,12 +39,12 @@ class Coverage:
     is_sure: np.ndarray
 
     def share(self, of: np.ndarray) -> np.ndarray:
-        """Return the fraction (H,) of the pairs in the mask `of` (P,) that have stored motions."""
+        """Return for each start pose the fraction (H,) of pairs in the mask `of` with a motion."""
         return (self.found & of).sum(axis=1) / of.sum()
 
 
 def coverage(library: Library) -> Coverage:
-    """Compute which pairs of cells have motions, and which motions block all balls of a pair."""
+    """Compute which pairs of cells have motions, and which motions block all balls through both."""
     scene, found = library.setting.scene, library.found
     tunnel = tunnels(library.table.layout, scene.inner, scene.outer)
     row = unpack_rows(np.asarray(library.table.rows))
@@ -61,7 +61,7 @@ def coverage(library: Library) -> Coverage:
 
 @jax.jit
 def _farthest(outer: Array, inner: Array, row: Row) -> Array:
-    """Return `farthest_crossing` of the shield for H start poses and P pairs, (H, P) [m]."""
+    """Return how far from the shield's centre balls cross its plane, by start pose and pair."""
 
     def one(outer: Array, inner: Array, row: Row) -> Array:
         sides = [row.normal, row.edge, jnp.cross(row.normal, row.edge)]
@@ -114,7 +114,11 @@ def check(library: Library, num: int, seed: int = 0, home: int = 0) -> Check:
 def _throw_balls(
     library: Library, tunnel: Tunnels, pairs: np.ndarray, rng: np.random.Generator, home: int
 ) -> BlockCase:
-    """Return cases of balls from random points of outer cells to random points of inner cells."""
+    """Return cases of balls through the pairs of cells with numbers `pairs` (B,).
+
+    Each ball flies from a random point of its outer cell to a random point of its inner cell. The
+    arm stands at the library's start pose with index `home`.
+    """
     num, setting = len(pairs), library.setting
     ends = []
     for corners in (tunnel.outer[pairs], tunnel.inner[pairs]):

@@ -3,7 +3,7 @@
     planner-jax block library 1
     {"fingerprint": ..., "layout": ..., "links": ..., "arrays": ..., "size": ...}
 
-The second line is JSON. It holds a hash of arm and scene, the faces of both boxes and their cells,
+The second line is JSON. It holds a hash of arm and scene, the cells of both boxes around the arm,
 the links to which the arm's collision capsules belong, the file's size, and type, shape and offset
 of every array by name. Blanks pad the second line to the first array. Arrays are little-endian, in
 C order, and start at multiples of 64 bytes.
@@ -37,7 +37,7 @@ _ALIGNED, _LONGEST = 64, 1 << 20  # [bytes], alignment of arrays; longest line o
 
 
 def save_library(path: str | os.PathLike, library: Library) -> None:
-    """Write a library to a file atomically, in the format of this module.
+    """Write a library of stored motions to a file atomically, in the format of this module.
 
     Raises:
         OSError: the file cannot be written.
@@ -112,7 +112,7 @@ def load_library(path: str | os.PathLike) -> Library:
 
 
 def _map_library(path: str | os.PathLike, header: dict[str, PyTree]) -> Library:
-    """Return the library that the header of a file describes, with memory-mapped rows."""
+    """Return the library that the header of a file describes, with memory-mapped motions."""
     arrays: dict[str, PyTree] = {}
     for name, (kind, shape, place) in header["arrays"].items():
         mapped = np.memmap(path, kind, "r", place, tuple(shape) or (1,))

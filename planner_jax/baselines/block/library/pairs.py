@@ -41,25 +41,27 @@ from planner_jax.task.block.motion import angles_at, bump_steps, step_weights
 # direction and shield normal, at the end of a stored motion. COARSE applies if no motion keeps
 # FINE, since a shield that blocks some balls of a pair of cells is better than no shield.
 FINE, COARSE = STRICT, (0.08, np.deg2rad(20.0))
-# [s], a ball may enter at most this time later than the quickest motion without obstacles allows.
+# [s], a ball may enter the outer box at most this time later than if there were no obstacles.
 _PATIENCE = 0.8
-# [rad], greatest angle of the shield's edge from horizontal, if it must block all balls of a pair.
+# [rad], greatest angle of the shield's edge from horizontal, if it must block all balls that pass
+# through the two cells of a pair.
 _ROLL = np.deg2rad(1.0)
-_TOUCHING = 10.0  # [s], added to the entry times of poses that collide, so that they come last
-# Least distance of a shield from both cells, as a fraction of the distance between the cells, for
-# the tolerances FINE and COARSE.
+# [s], added to the ball's entry time of end poses that collide, so that they are tried last.
+_TOUCHING = 10.0
+# Least distances of a shield from the two cells that the ball passes, as fractions of the distance
+# between these cells, for the tolerances FINE and COARSE.
 _NEAREST = (0.1, 0.02)
 
 
 @struct.dataclass
 class PairCase:
-    """A pair of an outer and an inner cell to plan a motion for, and an initial guess."""
+    """Two cells that a ball passes, to plan a motion for, and an initial guess of the motion."""
 
     outer: Array  # (2, 3) [m], corners of the outer cell's part in front of the inner cell
     inner: Array  # (2, 3) [m], corners of the inner cell
     is_coarse: Array  # () bool, whether blocking some balls of the pair suffices
-    best: Array  # () [s], earliest entry time found so far; infinite without a motion
-    start: Array  # () int32, index of a stored initial guess; with -1 the guess is `given`
+    best: Array  # () [s], earliest entry into the outer box so far; infinite if none
+    start: Array  # () int32, index of a stored initial guess; -1 selects the guess `given`
     # (6 K + 1,): rates of 6 joints at K knots, times the duration [rad]; then the duration [s].
     given: Array
 
@@ -83,7 +85,7 @@ class PairPlan(Plan):
 
 @struct.dataclass
 class PairPlanner(Planner):
-    """Base class of both planners for pairs of cells: arm, scene, and where motions start.
+    """Base class of the two planners whose motions block the balls through a pair of cells.
 
     The shield ends with a horizontal edge. Quarter turns of a square shield make no difference; the
     planner selects the one that turns the last joint least from the start pose `home`.
@@ -92,13 +94,13 @@ class PairPlanner(Planner):
     setting: Setting
     home: Array  # (6,) [rad], joint angles at which motions start
     online: OnlineBlock = struct.field(pytree_node=False, default=OnlineBlock())
-    points: int = struct.field(pytree_node=False, default=5)  # number of points of the centreline
+    points: int = struct.field(pytree_node=False, default=5)  # points tried between the cells
 
     case_type: ClassVar[type] = PairCase
     is_sequential: ClassVar[bool] = True
 
     def case_of(self, pair: PairCase, entry: Array) -> tuple[BlockCase, Flight]:
-        """Return case and flight of a ball through both cells' centres, which enters at `entry`."""
+        """Return the case and flight of a ball that enters the outer box at time `entry` () [s]."""
         ball, span = nominal_ball(pair.outer, pair.inner)
         gravity = jnp.asarray(GRAVITY, span.dtype)
         case = BlockCase(
@@ -168,8 +170,8 @@ class PairPlanner(Planner):
         """Return the quadratic model of a motion's cost and violation, for the least squares.
 
         The model is `OnlineBlock.model` plus a cost of the shield's roll, the angle modulo quarter
-        turns between its edge and the horizontal. The roll has no cost if blocking some balls of
-        the pair suffices (`is_coarse`).
+        turns between its edge and the horizontal. The roll has no cost if blocking some balls
+        that pass the two cells suffices (`is_coarse`).
         """
         online = self.online
         model = online.model(point, case, flight)
@@ -195,9 +197,10 @@ class PairPlanner(Planner):
         )
 
     def plan_at(self, pair: PairCase, point: Array, entry: Array, steps: Array) -> PairPlan:
-        """Return the plan of a motion `point` for a ball that enters at `entry` () [s].
+        """Return the plan of the motion `point` (6 K + 1,), encoded as `PairPlan.point`.
 
-        The plan's violation includes balls of the pair that would miss the shield.
+        The ball enters the outer box at time `entry` () [s]. The plan's violation includes balls
+        that pass the pair's two cells but would miss the shield.
         """
         case, flight = self.case_of(pair, entry)
         plan = self.online.finish(case, flight, point, steps)
@@ -220,7 +223,7 @@ class PairPlanner(Planner):
 class StraightPair(PairPlanner):
     """A planner that selects among motions with all joints in proportion (straight motions).
 
-    The plan is the first collision-free motion, in the order of the ball's possible entry times.
+    The plan is the first collision-free motion, ordered by when the ball may enter the outer box.
     """
 
     @property
@@ -267,13 +270,13 @@ class StraightPair(PairPlanner):
 
 
 def _entry(effort: Array) -> Array:
-    """Remove the penalty `_TOUCHING` of a collision from an entry time () [s]."""
+    """Return an entry time () [s] without the penalty `_TOUCHING` of poses that collide."""
     return jnp.where(effort > 0.5 * _TOUCHING, effort - _TOUCHING, effort)
 
 
 @dataclasses.dataclass(frozen=True)
 class Bends(Attempt):
-    """An attempt: rounds of least squares, each with another entry time of the ball."""
+    """An attempt: least-squares searches (rounds), each for a ball that comes at another time."""
 
     rounds: int = 4
     solver: LevenbergConfig = LevenbergConfig(
@@ -283,9 +286,10 @@ class Bends(Attempt):
 
 @struct.dataclass
 class BentPair(PairPlanner):
-    """A planner that avoids obstacles by the least squares of `OnlineBlock` from an initial guess.
+    """A planner that bends motions around obstacles by the least squares of `OnlineBlock`.
 
-    The planner bisects the time at which the ball enters the outer box. The lower bound is the time
+    The initial guess is a stored guess, or a motion in `PairCase.given`. The planner bisects the
+    time at which the ball enters the outer box around the arm. The lower bound is the time
     that the quickest motion without obstacles allows. The upper bound is the entry time of the best
     motion so far, or `_PATIENCE` after the lower bound if no motion has been found.
     """
@@ -298,7 +302,7 @@ class BentPair(PairPlanner):
         return (self.search,)
 
     def solve(self, pair: PairCase, attempt: Bends) -> PairPlan:
-        """Return the plan of one pair of cells: the result of the last successful round."""
+        """Return the plan of one pair of cells: the last successful search's result."""
         online, dtype = self.online, pair.best.dtype
         poses = self.poses(pair)
         order = jnp.argsort(poses.effort)

@@ -34,9 +34,10 @@ _SAME_START = 1e-4
 class LibraryBlock(Planner):
     """A planner that returns the motion stored for the two cells that a ball passes.
 
-    The cost is the motion's duration [s]. The arm must stand at a start pose of the library. If the
-    motion must end at standstill, it starts as soon as the arm may start, and the shield then waits
-    for the ball. Otherwise it starts so late that it ends at the contact.
+    Cells are rectangles on the faces of two boxes around the arm. The cost is the motion's duration
+    [s]. The arm must stand at a start pose of the library. If the motion must end at standstill, it
+    starts as soon as the arm may start, and the shield then waits for the ball. Otherwise it starts
+    so late that it ends at the contact.
 
     The status is OUT_OF_REACH if no motion is stored for a ball. It is BLOCKED if the arm does not
     stand at a start pose, or if arm, limits or scene differ from the library's; the method `check`

@@ -55,7 +55,7 @@ def fingerprint(setting: Setting) -> str:
 
 @struct.dataclass
 class Table:
-    """The stored motions from H start poses for P pairs of an outer and an inner cell."""
+    """The stored motions from H start poses, for P pairs of cells that a ball passes."""
 
     rows: Array | np.ndarray  # (H, P, 6 K + 10) float32, fields of `Row` for motions of K pieces
     homes: Array | np.ndarray  # (H, 6) [rad], joint angles at which the motions start
@@ -83,7 +83,7 @@ def pieces_of(rows: Array | np.ndarray) -> int:
 
 
 def pack_rows(row: Row) -> np.ndarray:
-    """Join the fields of rows into one array (..., 6 K + 10) float32, for motions of K pieces."""
+    """Join the fields of motions of K pieces into table rows (..., 6 K + 10), in float32."""
     steps, duration = np.asarray(row.steps), np.asarray(row.duration)
     flat = steps.reshape(*steps.shape[:-2], -1)
     parts = (flat, duration[..., None], row.middle, row.normal, row.edge)
@@ -198,7 +198,7 @@ def library_of(
 ) -> Library:
     """Create a library from H start poses `homes` (H, 6) [rad] and the motions that start there.
 
-    `rows` (H, P, W) has the motions for P pairs of cells, as rows of `pack_rows`.
+    `rows` (H, P, W) has the motions for P pairs of cells, as W numbers from `pack_rows`.
     """
     scene = setting.scene
     table = Table(rows=rows, homes=homes, inner=scene.inner, outer=scene.outer, layout=layout)
@@ -206,7 +206,7 @@ def library_of(
 
 
 def with_scene(library: Library, scene: Scene) -> Library:
-    """Return a library with the same motions and another scene that has the same boxes.
+    """Return a library with the same motions and another scene; its two boxes must be the same.
 
     Raises:
         ArgumentError: a box of the new scene differs from the library's box.
