@@ -61,7 +61,7 @@ def earliest_bound(scene: Scene) -> tuple[bool, float]:
 
 
 def _limit_steps(scene: Scene) -> np.ndarray:
-    """Return upper bounds (2 L,) [m] on the distance covered in each half of L layers of time.
+    """Return upper bounds (2 L,) [m] on the distance covered in each half of L time steps.
 
     This is the distance of the body's middle, which is b ahead of the rear axle. On a path of
     curvature kappa, its speed is sqrt(v^2 + (b v kappa)^2), where v is the speed of the rear axle.
@@ -103,7 +103,7 @@ def _grow(plane: int, distance: float, stride: int) -> int:
 
 
 def _draw_goal(scene: Scene, layer: int, origin: np.ndarray, count: np.ndarray, stride: int) -> int:
-    """Return the cells that are within the case's tolerance of the target at a layer of time.
+    """Return the cells that are within the case's tolerance of the target at a time step.
 
     The result is an integer with one bit for each cell.
     """

@@ -32,12 +32,12 @@ _FINE = CELL / FINER  # [m] Side of a cell of the grid for obstacles.
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    """One interception as plain numbers, with the target's position at the end of each layer."""
+    """One interception as plain numbers, and the target's position at each layer (time step)."""
 
     start: np.ndarray  # (3,) x [m], y [m] of the rear axle's middle and heading [rad]
     initial_speed: float  # [m/s]
     initial_curvature: float  # [1/m]
-    dt: float  # [s], length of a layer of time; the last of L layers ends at the case's time
+    dt: float  # [s], length of a layer (time step); the last of L layers ends at the case's time
     target: np.ndarray  # (L + 1, 2) [m], positions of the target at time 0 and after each layer
     tolerance: float  # [m], greatest distance of the body's middle from the target at the meeting
     end_heading: float  # [rad], required heading at the meeting
@@ -65,8 +65,8 @@ class Rules:
     # 1: one disc inside of the body, whose radius is half the body's width. 2: two discs that cover
     # the body.
     discs: int
-    # The limit on the heading change in a layer is a fractional number of steps. True: it is
-    # rounded up. False: fractions add up over the layers until they permit a whole step.
+    # The limit on the heading change in a layer (time step) is a fractional number of
+    # headings. True: it is rounded up. False: fractions add up until they permit a whole heading.
     turns_up: bool
 
 
@@ -80,7 +80,7 @@ class Reach:
 
     at_end: bool  # whether the target can be met at the case's time
     earliest: float  # [s], time of the first layer at which the target can be met, or infinity
-    # (2 n + 1, 5): time, x, y, heading and speed after each half of n layers, or None.
+    # (2 n + 1, 5): time, x, y, heading and speed after each half of n time steps, or None.
     path: np.ndarray | None
 
 
@@ -205,9 +205,9 @@ class Lattice:
 
         Returns:
             levels: (S,) [m/s], the S speed levels.
-            shifts: bit shifts of a straight move, indexed by half of a time layer, speed and
+            shifts: bit shifts of a straight move, indexed by half of a time step, speed and
                 heading.
-            turns: greatest numbers of heading steps of a turn, indexed by time layer and speed.
+            turns: greatest numbers of heading steps of a turn, indexed by time step and speed.
         """
         scene = self.scene
         level = scene.acceleration * scene.dt
@@ -267,7 +267,7 @@ class Lattice:
         ]
 
     def sets(self) -> Iterator[list[list[int]]]:
-        """Yield the reached cells after 0, 1, ... L layers of time.
+        """Yield the reached cells after 0, 1, ... L layers (time steps).
 
         Each item is indexed by speed level and heading. The cells are the bits of an integer.
         """
@@ -296,7 +296,7 @@ class Lattice:
         """Move all reached states straight ahead for half a layer, and remove those that collide.
 
         `planes` has the reached cells by speed level and heading, as bits of integers. `half` is
-        the number of half layers since time 0.
+        the number of half layers (half time steps) since time 0.
         """
         return [
             [
@@ -307,7 +307,7 @@ class Lattice:
         ]
 
     def meets(self, planes: list[list[int]], layer: int) -> list[tuple[int, int, int]]:
-        """Return reached states that meet the target after `layer` layers of time.
+        """Return reached states that meet the target after `layer` time steps.
 
         A state is (bit of the cell, index of the speed level, index of the heading). At most one
         state is returned for each speed level and heading.
@@ -334,7 +334,7 @@ class Lattice:
         return Reach(at_end=at_end, earliest=earliest, path=path)
 
     def _trace_back(self, kept: list, state: tuple[int, int, int]) -> np.ndarray:
-        """Return a path to a state, found backwards through the reached cells of n layers.
+        """Return a path to a state, found backwards through the reached cells of n time steps.
 
         `kept` has the items of `sets`. A state is (bit of the cell, index of the speed level, index
         of the heading). The rows of the path, (2 n + 1, 5), are described at `Reach.path`.
@@ -363,7 +363,7 @@ class Lattice:
         return np.array(rows[::-1])
 
     def _row(self, half: int, state: tuple[int, int, int]) -> list[float]:
-        """Return time [s], x, y [m], heading [rad], speed [m/s] of a state at a half layer."""
+        """Return time [s], x, y [m], heading [rad], speed [m/s] after `half` half steps."""
         bit, level, heading = state
         row, column = divmod(bit, self.stride)
         x, y = self.origin + CELL * np.array([column, row])
@@ -389,7 +389,7 @@ def _spread(row: list[int], turn: int) -> list[int]:
     `row` has for every heading the set of reached cells, as bits of an integer; `turn` is a number
     of headings. Each step of the loop doubles the number of headings whose sets are united.
     """
-    # In the loop, spread[h] is the union of the cells row[h], ..., row[h + width - 1].
+    # In the loop, spread[h] is the union of the sets of cells row[h], ..., row[h + width - 1].
     target, width, spread = 2 * turn + 1, 1, row
     while width < target:
         step = min(width, target - width)

@@ -60,7 +60,7 @@ SEARCHES = ("bound", "minimal", "strict")
 
 
 def scenes(cases: InterceptCase) -> list[Scene]:
-    """Convert cases to scenes: plain numbers, with the target's position at each layer of time."""
+    """Convert cases to scenes: plain numbers, with the target's position at each time step."""
     ends = np.asarray(cases.time, float)
     layers = np.maximum(np.ceil(ends / LAYER - 1e-6), 1).astype(int)
     times = ends[:, None] / layers[:, None] * np.arange(layers.max() + 1)

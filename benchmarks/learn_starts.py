@@ -105,7 +105,7 @@ def draw_hits(num: int, seed: int) -> pj.hit.HitCase:
 
 
 def draw_hard_hits(num: int, seed: int) -> pj.hit.HitCase:
-    """Draw `num` training cases of hard hits: half are planned late, half have weak limits."""
+    """Draw `num` training cases of hard hits: half are planned late, half have reduced limits."""
     random, serves = np.random.default_rng(seed), pj.hit.generate_serves(num, seed)
     parts = []
     for k, rows in enumerate(np.array_split(np.arange(num), _CHUNKS)):

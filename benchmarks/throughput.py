@@ -126,7 +126,7 @@ class _Timed:
 
 
 def _time_calls(planner: Any, host: Any, devices: list, repeat: int) -> _Timed:
-    """Plan the batch `host` once, and then `repeat` times when compiled; return the durations.
+    """Plan the batch `host` once, which compiles, and `repeat` times more; return durations.
 
     Each device holds an equal part of the batch.
     """

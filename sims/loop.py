@@ -132,7 +132,7 @@ def _pose_problems(
 
 @functools.partial(jax.jit, static_argnames=("pilot", "number"))
 def _search_plans(pilot: Pilot, number: int, asked: Any) -> Any:
-    """Run search `number` of the pilot on the B planning problems `asked`; return B plans."""
+    """Run the task's search number `number` on the B planning problems `asked`; return B plans."""
     return jax.vmap(pilot.searches[number])(asked)
 
 
@@ -166,7 +166,7 @@ def _fly(
 def _with_plans(
     pilot: Pilot, flights: FlightState, outlook: Outlook, asked: Any, found: tuple[Any, ...]
 ) -> FlightState:
-    """Replace plans of flights by the searches' results `found`, where the pilot accepts these."""
+    """Replace plans of flights by the plans `found`, where the task's `Pilot` accepts them."""
 
     def one(flight: FlightState, outlook: Outlook, asked: Any, found: tuple) -> FlightState:
         plan, good = pilot.choose(asked, outlook, found)

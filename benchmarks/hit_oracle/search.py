@@ -34,7 +34,8 @@ REFINED_BELOW = 0.06
 # The pieces of a solution are halved only if its excess is at least this much below the excess of
 # every solution for which halving has failed.
 NEW_BELOW = 0.001
-# A case is abandoned after HOPELESS_STARTS starting points if every excess is > HOPELESS_ABOVE.
+# A case is abandoned after 4 starting points if the trajectory from each of them exceeds some
+# limit by more than 10 %.
 HOPELESS_ABOVE, HOPELESS_STARTS = 0.1, 4
 MOST_TIGHTENINGS = 5  # Maximum number of times that limits of a solution are tightened.
 INFEASIBLE_ABOVE = 0.01  # A case counts as infeasible if its least excess is above this value.

@@ -46,7 +46,7 @@ class CatchPilot:
     # Name of the method that decides order and times of the catches, or "policy:FILE". With "given"
     # the order and times of the current plan stay, and only the trajectory is planned from scratch.
     decide: str = "greedy"
-    redecide: float = 100.0  # [Hz], rate of new decisions, divides the replanning rate; 0 for never
+    redecide: float = 100.0  # [Hz], rate of new decisions; divides the replanning rate; 0: never
     search: Round = Round(starts=1, solver=LbfgsConfig(max_steps=25))  # search after a new decision
     passage = staticmethod(passage)
 

@@ -51,7 +51,7 @@ SUCCESS = 0.3  # [m], greatest distance from the target of a successful drive at
 TOUCH = 1e-3  # [m], least penetration that counts as a contact, as in the referee
 _SHORTEST = 0.3  # [s], least time to the meeting at which the car replans
 _LEAST_STD = 1e-3  # [m], least standard deviation that the prediction assumes of an observation
-_CAUTION = 2.0  # number of standard deviations by which predicted movers are enlarged
+_CAUTION = 2.0  # number of standard deviations by which predicted obstacles are enlarged
 _POINTS = 9  # number of points of a predicted path in a recording
 
 

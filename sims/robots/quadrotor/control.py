@@ -85,7 +85,8 @@ def control(
     ahead, faster = reference.pos - state.pos, reference.vel - half * reference.acc - state.vel
     pull = net_thrust(reference.acc, gravity)
     back = gains.position * ahead + gains.velocity * faster
-    # The feedback is bounded, since a large error would tilt a weak thrust in any direction.
+    # The feedback is bounded: if the planned thrust is small, a large feedback could turn the
+    # commanded thrust in any direction.
     most = gains.share * jnp.sqrt(jnp.sum(pull**2))
     back *= jnp.minimum(most / jnp.sqrt(jnp.maximum(jnp.sum(back**2), 1e-6)), 1.0)
     acc = reference.acc + back
