@@ -148,7 +148,7 @@ class Progress:
         self.add(number, decisions, {"suites": suites})
 
     def add(self, number: int, decisions: int, row: Mapping[str, Any]) -> None:
-        """Add a row for part `number` after `decisions` decisions, and rewrite the file."""
+        """Add a row for part (PPO run) `number` after `decisions` decisions; rewrite the file."""
         self.rows.append({"part": number, "decisions": decisions, **row})
         RunFolder(self._folder).write_text(FILE, to_text(self.rows))
 

@@ -7,7 +7,7 @@ from planner_jax.core.choices import require, require_memory, require_seed
 from planner_jax.runs.settings import option, require_count
 from planner_jax.task.catch.spec import SUITES
 
-_MOST_DECISIONS = 1e12  # greatest accepted number of decisions of a part
+_MOST_DECISIONS = 1e12  # greatest accepted number of decisions in one part of a training
 _CASE_BYTES = 20_000  # [bytes] estimated memory of one case in a batch
 NETWORK_NAMES = ("attention", "mlp")  # names of the policy networks that can be trained
 # Default weights of the terms of the reward, which `environment.evaluate_actions` defines.

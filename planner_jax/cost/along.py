@@ -177,7 +177,7 @@ def _values(
 def _slopes(
     along: Along, columns: Array, durations: Array, parameters: PyTree
 ) -> tuple[Array, ...]:
-    """Return penalties, greatest excesses, and derivatives of penalties by columns, durations."""
+    """Return penalties, greatest excesses, and penalties' derivatives by columns and durations."""
     value = lambda c, h: _values(along, c, h, parameters)  # noqa: E731
     penalties, pull_back, worst = jax.vjp(value, columns, durations, has_aux=True)
     return penalties, worst, *pull_back(jnp.ones_like(penalties))

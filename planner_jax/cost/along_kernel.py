@@ -137,7 +137,7 @@ def call_on_grid(
 def along_kernel(
     along: Along, mode: str, *, interpret: bool = False
 ) -> Callable[[Treedef, Sequence[Array]], Sequence[Array] | None]:
-    """Make the kernel for a mode of `MODES`; with `interpret` it runs without a GPU, for tests.
+    """Make the CUDA kernel for one of `MODES`, which name its results; `interpret` needs no GPU.
 
     The mode "curvature" takes a point and a direction. The direction's parameters may be None.
     """

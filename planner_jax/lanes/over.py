@@ -78,7 +78,7 @@ def over_lanes(function: Callable[..., Results]) -> Callable[..., Results]:
 
 
 def _widen(value: _Value, shape: tuple[int, ...], lanes: int) -> Array:
-    """Return a value as an array (*shape, lanes); repeat a value that all lanes have in common."""
+    """Return a value as an array (*shape, lanes); repeat it if all lanes (problems) share it."""
     if isinstance(value, _Lanes):
         return value.array
     return jnp.broadcast_to(jnp.asarray(value)[..., None], (*shape, lanes))

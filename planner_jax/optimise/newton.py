@@ -211,7 +211,7 @@ def _lanczos(
 
 
 def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Array]:
-    """Return the elimination pivots of (a tridiagonal matrix + shift * I), none close to zero."""
+    """Return the pivots, none near 0, of a tridiagonal matrix (off-diagonal `beside`) + shift I."""
     scale = functools.reduce(jnp.maximum, [jnp.abs(each) for each in (*diagonal, *beside)])
     least = _LEAST * scale + 1e-30
     found = []
@@ -224,10 +224,10 @@ def _pivots(diagonal: list[Array], beside: list[Array], shift: Array) -> list[Ar
 
 
 def _lowest(diagonal: list[Array], beside: list[Array]) -> Array:
-    """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if none is negative.
+    """Return a lower bound of a tridiagonal matrix's least eigenvalue, or 0 if it is >= 0.
 
-    An interval that contains it is bisected: if elimination of (matrix - x I) has a negative pivot,
-    an eigenvalue is below x (Sturm sequence).
+    An interval around the eigenvalue is bisected: if elimination of (matrix - x I) has a negative
+    pivot, an eigenvalue is below x (Sturm sequence).
     """
     around = [jnp.abs(each) for each in beside]
     zero = jnp.zeros_like(diagonal[0])

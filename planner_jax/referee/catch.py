@@ -182,7 +182,7 @@ def _read(cases, plans) -> dict[str, np.ndarray]:
 
 
 def _ends(durations: np.ndarray, num: int) -> np.ndarray:
-    """Return the catch times [s] of plans whose pieces form `num` groups, one for each catch."""
+    """Return times [s] of catches: ends of `num` equal groups of pieces, one for each catch."""
     each = durations.shape[1] // num
     return np.cumsum(durations, axis=1)[:, each - 1 :: each]
 

@@ -94,7 +94,7 @@ class Dataset:
         self.write(0, encode(rows, {}))
 
     def damages(self, num: int | None = None) -> dict[Path, str]:
-        """Return the damage of each damaged file, by path; also if there are not `num` rows."""
+        """Return why files are damaged, by path, or that there are not `num` rows in total."""
         found, counted = {}, 0
         for place, path in enumerate(self.files()):
             try:
